@@ -1,0 +1,43 @@
+"""Physical and project-wide constants, each with its unit and source."""
+
+from enum import IntEnum
+
+SPEED_OF_LIGHT_M_S = 299_792_458.0
+"""Speed of light in vacuum [m/s] (exact, SI)."""
+
+CARRIER_FREQUENCY_HZ = 28e9
+"""Carrier frequency of the paper's experiments [Hz]."""
+
+GAIN_FLOOR_DB = -150.0
+"""Smallest omnidirectional path gain, and the gain of an outage [dB] (paper, eq. 5)."""
+
+DEFAULT_HEIGHT_M = 1.5
+"""Height of transmitters and receivers where none is given [m] (the paper's reference trace)."""
+
+DEFAULT_WALL_HEIGHT_M = 3.0
+"""Height to which plans are extruded where none is given [m]."""
+
+DRYWALL_PERMITTIVITY = 2.94
+"""Relative permittivity of layered drywall at 28 GHz (the paper's Wireless InSite material)."""
+
+DRYWALL_CONDUCTIVITY_S_M = 0.1226
+"""Conductivity of layered drywall at 28 GHz [S/m] (the paper's Wireless InSite material)."""
+
+WALL_THICKNESS_M = 0.1
+"""Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""
+
+
+class LinkState(IntEnum):
+    """State of a radio link (paper, Section II-B)."""
+
+    OUTAGE = 0
+    LOS = 1
+    NLOS = 2
+
+
+class CellState(IntEnum):
+    """State of a map cell."""
+
+    FREE = 0
+    WALL = 1
+    UNKNOWN = 2

@@ -1,0 +1,347 @@
+"""The answer: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
+
+import json
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.features import LinkFeatures, link_features
+from sionna_partial.map_files import load_map
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.predictor import LinkPrediction, Predictor
+from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number
+from sionna_partial.trace import Progress, trace_links
+
+MAX_RECEIVERS = 2_000_000
+"""Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
+
+MIN_LEG_M = 0.01
+"""Sionna RT drops path legs shorter than this, so that no receiver stands nearer to the transmitter or a wall [m]."""
+
+WALL_PARTS = 6
+"""`wall_parts` says for 6 x 6 parts of each cell where walls are, so that pictures show walls thinner than a cell."""
+
+NO_RECEIVER = 255
+"""Value of the integer variables where no receiver can stand."""
+
+DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
+COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
+
+_LINK_FLAGS = {
+    "flag_values": np.array([*LinkState, NO_RECEIVER], dtype=np.uint8),
+    "flag_meanings": " ".join([*(state.name.lower() for state in LinkState), "no_receiver"]),
+}
+_CELL_FLAGS = {
+    "flag_values": np.array([*CellState], dtype=np.uint8),
+    "flag_meanings": " ".join(state.name.lower() for state in CellState),
+}
+_YES_NO = {"flag_values": np.array([0, 1], dtype=np.int8), "flag_meanings": "no yes"}
+
+ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
+    "p_los": {"long_name": "probability of line of sight, given that the receiver is indoors", "units": "1"},
+    "p_nlos": {"long_name": "probability of paths without line of sight, given that it is indoors", "units": "1"},
+    "p_outage": {"long_name": "probability of outage, given that the receiver is indoors", "units": "1"},
+    "link_state": {"long_name": "likeliest link state", **_LINK_FLAGS},
+    "gain_mean_db": {"long_name": "mean omnidirectional path gain, an outage counting -150 dB", "units": "dB"},
+    "gain_std_db": {"long_name": "standard deviation of the omnidirectional path gain", "units": "dB"},
+    "gain_los_mean_db": {"long_name": "mean path gain given line of sight", "units": "dB"},
+    "gain_los_std_db": {"long_name": "standard deviation of the path gain given line of sight", "units": "dB"},
+    "gain_nlos_mean_db": {"long_name": "mean path gain given no line of sight", "units": "dB"},
+    "gain_nlos_std_db": {"long_name": "standard deviation of the path gain given no line of sight", "units": "dB"},
+    "p_indoor": {"long_name": "probability that the receiver is indoors", "units": "1"},
+    "partial_link_state": {"long_name": "link state traced on the known part of the map", **_LINK_FLAGS},
+    "partial_gain_db": {"long_name": "path gain traced on the known part of the map", "units": "dB"},
+    "unobserved_distance_m": {"long_name": "length of the direct line in unknown cells", "units": "m"},
+    "distance_m": {"long_name": "distance from the transmitter", "units": "m"},
+    "observed": {"long_name": "whether the map knows this cell", **_YES_NO},
+    "valid": {"long_name": "whether a receiver can stand here", **_YES_NO},
+    "cell_state": {"long_name": "state of the map at the receiver", **_CELL_FLAGS},
+    "wall_parts": {
+        "long_name": "walls within the cell",
+        "comment": f"Bit {WALL_PARTS} * row + column is set where that one of {WALL_PARTS} x {WALL_PARTS} parts of "
+        "the cell holds a wall; row 0 has the smallest y, column 0 the smallest x.",
+    },
+}
+"""The variables of a coverage map on (y, x), and their CF attributes."""
+
+
+@dataclass(frozen=True)
+class _Receivers:
+    """Receivers at the centres of a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
+
+    x_m: NDArray[np.float64]
+    y_m: NDArray[np.float64]
+    cell_state: NDArray[np.uint8]
+    valid: NDArray[np.bool_]
+    rx_m: NDArray[np.float64]
+
+
+def predict_map(
+    scene: PartialMap | str | Path,
+    tx: ArrayLike,
+    *,
+    rx_height_m: float = DEFAULT_HEIGHT_M,
+    spacing_m: float = 0.15,
+    predictor: Predictor | str | Path | None = None,
+    scene_settings: SceneSettings | None = None,
+    trace_settings: TraceSettings | None = None,
+    progress: Progress | None = None,
+) -> xr.Dataset:
+    """Predict link state and path gain, with their uncertainty, everywhere on a map.
+
+    The known part of the map is traced, and the predictor makes distributions of what the trace found and of how much
+    was not observed (paper, Section III). On a complete map the trace itself is the answer.
+
+    Probabilities and gains are those of a receiver that is indoors, as in the paper; `p_indoor` says how likely
+    that is. No receiver stands inside a wall, within 1 cm of one, or at the transmitter (nearer than 1 cm, or than
+    the distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
+    variables are NaN and link states 255.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        The map, or whatever `load_map` reads.
+    tx : (3,) or (2,) array-like
+        Transmitter position [m]; 1.5 m high where no z is given. It may stand in unknown space.
+    rx_height_m : float
+        Height of the receivers [m].
+    spacing_m : float
+        Distance between receivers [m]. Their grid starts half of it inside the lower-left corner of the map.
+    predictor : None, "paper", path or Predictor
+        None is the shipped default, a path one that you saved. Not used on a complete map.
+    scene_settings : SceneSettings, optional
+    trace_settings : TraceSettings, optional
+    progress : callable, optional
+        Called as ``progress(share_done, message)``.
+
+    Returns
+    -------
+    xarray.Dataset
+        On (y, x), in metres: the variables of `ATTRIBUTES`, and the settings, versions and predictor in attributes.
+
+    Raises
+    ------
+    MapError
+        If the map cannot be read.
+    PositionError
+        For a transmitter where none can stand, or if no receiver can stand anywhere.
+    SettingsError
+        For a height, spacing or frequency out of range.
+    PredictorError
+        If the predictor cannot be read.
+    BackendError
+        If LLVM or Sionna RT cannot be used.
+    """
+    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    trace_settings, scene_settings = trace_settings or TraceSettings(), scene_settings or SceneSettings()
+    scene_settings.material.require_frequency(trace_settings.frequency_hz)
+    tx_m = _transmitter(partial, tx)
+    receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
+    model = None if partial.is_complete else _predictor(predictor)
+    report = progress or (lambda share, message: None)
+    links = trace_links(
+        partial,
+        tx_m,
+        receivers.rx_m,
+        settings=trace_settings,
+        scene_settings=scene_settings,
+        progress=lambda share, message: report(0.8 * share, message),
+    )
+    report(0.8, "measuring unobserved distances")
+    phi = link_features(partial, links)
+    report(0.9, f"predicting {len(receivers.rx_m)} links")
+    variables = _variables(partial, receivers, phi, model)
+    variables["wall_parts"] = _wall_parts(partial, receivers, spacing_m)
+    attributes = {
+        **_provenance(partial, model, scene_settings, trace_settings),
+        "transmitter_m": tx_m,
+        "rx_height_m": float(rx_height_m),
+        "spacing_m": float(spacing_m),
+    }
+    report(1.0, "done")
+    return _label(receivers, variables, attributes)
+
+
+def require_coverage(coverage: xr.Dataset) -> None:
+    """Raise a SettingsError unless `coverage` has what `predict_map` gives.
+
+    Parameters
+    ----------
+    coverage : xarray.Dataset
+        From `predict_map`, or read from its NetCDF file.
+    """
+    remedy = "give the xarray.Dataset that predict_map returned, or load it from its .nc file."
+    kind = type(coverage).__name__
+    if not isinstance(coverage, xr.Dataset):
+        raise SettingsError(f"coverage is of type {kind}: {remedy}")
+    missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
+    missing += [name for name in ("x", "y") if name not in coverage.coords]
+    missing += [name for name in ("transmitter_m", "spacing_m", "frequency_hz") if name not in coverage.attrs]
+    if missing or not coverage["valid"].size:
+        raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
+
+
+def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
+    with suppress(ValueError):
+        if np.shape(tx) == (2,):
+            tx = np.append(np.asarray(tx, dtype=np.float64), DEFAULT_HEIGHT_M)
+    tx_m = partial.require_positions("tx", tx)
+    if tx_m.ndim != 1:
+        raise PositionError(f"tx has shape {tx_m.shape}: give one transmitter (3,), and call once for each.")
+    return tx_m
+
+
+def _predictor(predictor: Predictor | str | Path | None) -> Predictor:
+    if isinstance(predictor, Predictor):
+        return predictor
+    return Predictor.load() if predictor is None else Predictor.load(predictor)
+
+
+def _receivers(
+    partial: PartialMap, tx_m: NDArray[np.float64], rx_height_m: float, spacing_m: float, frequency_hz: float
+) -> _Receivers:
+    """Place the receivers, and mask those that cannot be there."""
+    height_m = partial.wall_height_m
+    require_number("rx_height_m", rx_height_m, 0.0, height_m, open_low=True)
+    require(rx_height_m < height_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {height_m:g} m.")
+    x_m, y_m = _grid_axes(partial, spacing_m)
+    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
+    nearest_m = max(MIN_LEG_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4 * math.pi))
+    valid = np.linalg.norm(points - tx_m, axis=-1) >= nearest_m
+    for shift in (-MIN_LEG_M, MIN_LEG_M):
+        for other in (-MIN_LEG_M, MIN_LEG_M):
+            valid &= partial.state_at(points[..., :2] + (shift, other)) != CellState.WALL
+    if not valid.any():
+        raise PositionError(
+            f"none of the {valid.size} receivers can stand: all are inside walls or at the transmitter; "
+            f"spacing_m = {spacing_m:g}, give a smaller one."
+        )
+    return _Receivers(x_m, y_m, partial.state_at(points), valid, points[valid])
+
+
+def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the x (nx,) and y (ny,) of all cell centres that lie on the map [m]."""
+    low = partial.resolution_m / 10
+    require_number("spacing_m", spacing_m, low, 1e6)
+    x0, y0, x1, y1 = partial.bounds_m
+    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
+    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
+    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
+    enough = math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
+    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {1.01 * enough:.2g} or more."
+    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
+    return x0 + (np.arange(nx) + 0.5) * spacing_m, y0 + (np.arange(ny) + 0.5) * spacing_m
+
+
+def _variables(
+    partial: PartialMap, receivers: _Receivers, phi: LinkFeatures, model: Predictor | None
+) -> dict[str, NDArray[Any]]:
+    """Predict, and lay all results out on the grid."""
+    prediction = LinkPrediction.of_trace(phi) if model is None else model.predict(phi)
+    free = receivers.cell_state[receivers.valid] == CellState.FREE
+    values = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)}
+    values |= {
+        "p_indoor": np.where(free, 1.0, 0.0 if model is None else model.predict_indoor(phi)),
+        "partial_gain_db": phi.gain_db,
+        "unobserved_distance_m": phi.unobserved_distance_m,
+        "distance_m": phi.distance_m,
+    }
+    likeliest = np.argmax([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
+    states = {"link_state": likeliest, "partial_link_state": phi.link_state}
+    layers = {name: _spread(value, receivers.valid, np.float32(np.nan)) for name, value in values.items()}
+    layers |= {name: _spread(value, receivers.valid, np.uint8(NO_RECEIVER)) for name, value in states.items()}
+    return layers | {
+        "observed": receivers.cell_state != CellState.UNKNOWN,
+        "valid": receivers.valid,
+        "cell_state": receivers.cell_state,
+    }
+
+
+def _spread(values: NDArray[Any], valid: NDArray[np.bool_], fill: np.generic) -> NDArray[Any]:
+    """Put the values (N,) of the valid receivers on the grid (ny, nx)."""
+    layer = np.full(valid.shape, fill)
+    layer[valid] = values
+    return layer
+
+
+def _wall_parts(partial: PartialMap, receivers: _Receivers, spacing_m: float) -> NDArray[np.int64]:
+    """Say, bit by bit, which parts of each receiver's cell hold a wall."""
+    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
+    walls = walls.cumsum(axis=1, dtype=np.int32)
+    ny, nx = partial.shape
+    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
+    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
+    for row, (bottom, top) in enumerate(
+        _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
+    ):
+        for column, (left, right) in enumerate(columns):
+            strip = walls[top] - walls[bottom]
+            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
+    return bits
+
+
+def _part_spans(
+    centre_m: NDArray[np.float64], origin_m: float, resolution_m: float, count: int, spacing_m: float
+) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Give the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
+    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
+    step = spacing_m / resolution_m / WALL_PARTS
+    return [
+        (
+            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
+            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
+        )
+        for part in range(WALL_PARTS)
+    ]
+
+
+def _provenance(
+    partial: PartialMap, model: Predictor | None, scene_settings: SceneSettings, trace_settings: TraceSettings
+) -> dict[str, Any]:
+    """Global attributes that say where the numbers come from. No time of day: equal input gives equal files."""
+    versions = {}
+    for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    source = ", ".join(f"{package} {number}" for package, number in versions.items())
+    return {
+        "Conventions": "CF-1.11",
+        "title": "Predicted radio coverage of a partially observed environment",
+        "source": source,
+        "history": "sionna_partial.predict_map",
+        "references": "Yin et al., Wireless Channel Prediction in Partially Observed Environments",
+        "frequency_hz": float(trace_settings.frequency_hz),
+        "gain_floor_db": GAIN_FLOOR_DB,
+        "map_resolution_m": partial.resolution_m,
+        "map_wall_height_m": partial.wall_height_m,
+        "map_observed_fraction": partial.observed_fraction,
+        "map_complete": int(partial.is_complete),
+        "scene_settings": json.dumps(asdict(scene_settings), sort_keys=True),
+        "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
+        "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
+        "predictor_sha256": "" if model is None else model.sha256,
+    }
+
+
+def _label(receivers: _Receivers, variables: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> xr.Dataset:
+    axes = {
+        name: (
+            name,
+            values,
+            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
+            {"_FillValue": None},
+        )
+        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
+    }
+    layers = {name: (("y", "x"), variables[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    return xr.Dataset(layers, coords=axes, attrs=dict(attributes))

@@ -1,0 +1,36 @@
+"""Exceptions raised for input that cannot give a trustworthy answer."""
+
+
+class SionnaPartialError(Exception):
+    """Base of every error that this package raises on purpose.
+
+    The message names the field, the value that was given and the remedy.
+    """
+
+
+class MapError(SionnaPartialError, ValueError):
+    """A map file or array that cannot be read as a floor plan."""
+
+
+class PositionError(SionnaPartialError, ValueError):
+    """A transmitter or receiver where no radio can stand."""
+
+
+class SettingsError(SionnaPartialError, ValueError):
+    """A setting outside its allowed range."""
+
+
+class SceneError(SionnaPartialError, ValueError):
+    """A scene folder that is missing, damaged or unsafe to load."""
+
+
+class PredictorError(SionnaPartialError, ValueError):
+    """A predictor file that is missing, damaged or of another kind, or data that cannot train one."""
+
+
+class OutputError(SionnaPartialError, OSError):
+    """An output that could not be written; nothing half written is left behind."""
+
+
+class BackendError(SionnaPartialError, RuntimeError):
+    """A native library (LLVM, Sionna RT) that is missing or does not work."""

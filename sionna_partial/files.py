@@ -1,0 +1,188 @@
+"""Output that is written whole or not at all."""
+
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+from sionna_partial.errors import OutputError, SionnaPartialError
+
+SCENE_FILES = ("scene.xml", "map.yaml")
+"""Files that tell an exported scene folder from any other."""
+
+_REMEDIES = {
+    errno.EACCES: "choose a folder that you may write to, or change its permissions.",
+    errno.EPERM: "choose a folder that you may write to, or change its permissions.",
+    errno.EROFS: "this disk is read-only; choose a folder on another one.",
+    errno.ENOSPC: "the disk is full; free some space or choose another disk.",
+    errno.EDQUOT: "your quota is used up; free some space or choose another disk.",
+    errno.ENOTDIR: "a part of the path is a file; choose another folder.",
+    errno.EEXIST: "a part of the path is a file; choose another folder.",
+    errno.EISDIR: "this path is a folder; give the name of a file.",
+    errno.ENAMETOOLONG: "choose a shorter name.",
+}
+
+
+@contextmanager
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a library a path to write to, and put the file in its place when all went well.
+
+    The temporary path has the name of `path`, in a hidden folder beside it: side files of the library vanish with
+    that folder. Missing parent folders are made, and removed again on failure.
+
+    Parameters
+    ----------
+    path : path-like
+        Where the file shall be. A file that is there is replaced.
+
+    Yields
+    ------
+    pathlib.Path
+        Where to write it.
+
+    Raises
+    ------
+    OutputError
+        If writing fails; `path` is then as it was before.
+    """
+    target = Path(path)
+    with _workplace(target, target.parent) as place:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        temporary = place / target.name
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, target)
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
+    """Open a file that appears at `path` only when it has been written completely.
+
+    Parameters
+    ----------
+    path : path-like
+        Where the file shall be. A file that is there is replaced.
+    mode : {"wb", "w"}
+        Bytes, or text (UTF-8, line ends as written).
+
+    Yields
+    ------
+    file object
+
+    Raises
+    ------
+    OutputError
+        If writing fails; `path` is then as it was before.
+    """
+    encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
+    with atomic_path(path) as temporary, temporary.open(mode, encoding=encoding, newline=newline) as stream:
+        yield stream
+
+
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Open a scene folder that appears at `path` only when it has been written completely.
+
+    A missing folder appears in one step. In an empty folder, or in an exported scene folder (it holds `scene.xml` and
+    `map.yaml`), every entry that the new scene has takes the place of the old one, and other files are kept. If one
+    cannot be replaced, all are put back.
+
+    Parameters
+    ----------
+    path : path-like
+        Where the folder shall be.
+
+    Yields
+    ------
+    pathlib.Path
+        The folder to write into.
+
+    Raises
+    ------
+    OutputError
+        If writing fails, or if `path` is a file or a folder with other content; `path` is then as it was before.
+    """
+    target = Path(path)
+    with _workplace(target, target.parent, inside=True) as place:
+        folder = place / "new"
+        folder.mkdir()
+        yield folder
+        for file in folder.rglob("*"):
+            if file.is_file():
+                _sync(file)
+        if target.is_dir():
+            _swap_entries(folder, target, place / "old")
+        else:
+            os.replace(folder, target)
+
+
+@contextmanager
+def _workplace(target: Path, parent: Path, *, inside: bool = False) -> Iterator[Path]:
+    """Make a hidden folder in `parent` (or in `target` if that is a folder and `inside`), and remove it in the end."""
+    made: list[Path] = []
+    place: Path | None = None
+    try:
+        if inside:
+            _require_scene_or_empty(target)
+            parent = target if target.is_dir() else parent
+        made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+        place = parent / f".tmp-{secrets.token_hex(8)}"
+        place.mkdir(parents=True)
+        yield place
+    except BaseException as error:
+        _clean(place, made)
+        if isinstance(error, OSError) and not isinstance(error, SionnaPartialError):
+            raise _output_error(target, error) from error
+        raise
+    _clean(place, [])
+
+
+def _clean(place: Path | None, made: list[Path]) -> None:
+    if place is not None:
+        shutil.rmtree(place, ignore_errors=True)
+    for folder in made:
+        with suppress(OSError):
+            folder.rmdir()
+
+
+def _output_error(target: Path, error: OSError) -> OutputError:
+    remedy = _REMEDIES.get(error.errno or 0, "check the path and the disk.")
+    reason = error.strerror or str(error)
+    return OutputError(f"path = '{target}' could not be written ({reason}): {remedy}")
+
+
+def _require_scene_or_empty(target: Path) -> None:
+    if target.is_dir():
+        if any(target.iterdir()) and not all((target / name).is_file() for name in SCENE_FILES):
+            raise OutputError(
+                f"path = '{target}' is a folder with other content than an exported scene "
+                f"({' and '.join(SCENE_FILES)}): choose a new or an empty folder."
+            )
+    elif os.path.lexists(target):
+        raise OutputError(f"path = '{target}' is a file: choose a new or an empty folder.")
+
+
+def _swap_entries(new: Path, target: Path, aside: Path) -> None:
+    """Move every entry of `new` into `target`, those that were there to `aside`; undo everything on failure."""
+    aside.mkdir()
+    with ExitStack() as undo:
+        for name in sorted(entry.name for entry in new.iterdir()):
+            if os.path.lexists(target / name):
+                os.replace(target / name, aside / name)
+                undo.callback(os.replace, aside / name, target / name)
+            os.replace(new / name, target / name)
+            undo.callback(os.replace, target / name, new / name)
+        undo.pop_all()
+
+
+def _sync(file: Path) -> None:
+    descriptor = os.open(file, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,334 @@
+"""Maps in and out: files, NumPy arrays, and the maps of simulators and SLAM."""
+
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import binary_dilation
+
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.errors import MapError, OutputError
+from sionna_partial.files import SCENE_FILES, atomic_write
+from sionna_partial.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.ros_map import read_ros_map, states_from_percent, write_ros_map
+
+ACCEPTED = "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), or an exported scene (folder or scene.xml)"
+"""What load_map reads."""
+
+HABITAT_INVALID, HABITAT_BORDER = 0, 2
+"""Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
+
+HABITAT_COVERED = (6, 9)
+"""Drawings that may cover what is not navigable: target and target bounding box (habitat-lab, maps.py)."""
+
+
+def load_map(path: str | os.PathLike[str], *, strict: bool = False, wall_height_m: float | None = None) -> PartialMap:
+    """Read a map from a file or an exported scene folder.
+
+    Parameters
+    ----------
+    path : path-like
+        A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image), an `.npz` of `save_map`, or an
+        exported scene: its folder or its `scene.xml`.
+    strict : bool
+        Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
+        transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
+        wall.
+    wall_height_m : float or None
+        Wall height [m] in place of the file's.
+
+    Returns
+    -------
+    PartialMap
+        In world axes: the origin's yaw is honoured. Quarter turns are exact; for any other yaw the map is turned onto
+        cells of half the size.
+
+    Raises
+    ------
+    MapError
+        If there is no such file, or it is damaged, of another kind or out of range.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise MapError(f"path = {path!r} is not a path: give {ACCEPTED}.")
+    source, suffix = Path(path), Path(path).suffix.lower()
+    if os.path.isdir(source) or (suffix == ".xml" and os.path.exists(source)):
+        return _read_scene_map(source, wall_height_m)
+    if not os.path.isfile(source):
+        raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
+    if suffix in (".yaml", ".yml"):
+        return read_ros_map(source, strict=strict, wall_height_m=wall_height_m)
+    if suffix == ".npz":
+        return _read_npz(source, wall_height_m)
+    if suffix in (".pgm", ".png", ".bmp"):
+        raise MapError(
+            f"path = '{source}' is a bare image without resolution and origin: "
+            f"give its YAML, such as '{source.with_suffix('.yaml')}'."
+        )
+    raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+
+
+def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mapping[str, object] | None = None) -> None:
+    """Write a map so that `load_map` returns an equal one.
+
+    Parameters
+    ----------
+    partial : PartialMap
+        The map.
+    path : path-like
+        `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem) or `.npz`.
+    extra : mapping or None
+        Further keys for the YAML.
+
+    Raises
+    ------
+    OutputError
+        For another suffix, or if writing fails; nothing half written is left behind.
+    """
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix in (".yaml", ".yml"):
+        write_ros_map(partial, target, extra)
+    elif suffix == ".npz":
+        content: dict[str, Any] = {
+            "state": partial.state,
+            "resolution_m": partial.resolution_m,
+            "origin_m": partial.origin_m,
+            "wall_height_m": partial.wall_height_m,
+        }
+        if partial.interior_cells is not None:
+            content["interior_cells"] = partial.interior_cells
+        with atomic_write(target) as stream:
+            np.savez_compressed(stream, **content)
+    else:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose .yaml, .yml or .npz.")
+
+
+def map_from_array(
+    array: ArrayLike,
+    resolution_m: float,
+    *,
+    origin_m: tuple[float, float] = (0.0, 0.0),
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
+) -> PartialMap:
+    """Make a map of an array of CellState integers.
+
+    Parameters
+    ----------
+    array : (ny, nx) integers
+        FREE 0, WALL 1, UNKNOWN 2. Row 0 holds the smallest y (turn an image with `numpy.flipud`); columns run along x.
+    resolution_m : float
+        Edge of a cell [m].
+    origin_m : (float, float)
+        World x and y of the lower-left corner of cell [0, 0] [m].
+    wall_height_m : float
+        Height of walls and ceiling [m].
+
+    Returns
+    -------
+    PartialMap
+
+    Raises
+    ------
+    MapError
+        For anything else than a two-dimensional array of these integers, or a number out of range.
+    """
+    return PartialMap(_numbers("array", array, "iub"), resolution_m, origin_m, wall_height_m)
+
+
+def map_from_occupancy(
+    data: ArrayLike,
+    resolution_m: float,
+    *,
+    origin_m: tuple[float, float] = (0.0, 0.0),
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
+    occupied_percent: float = 65,
+    free_percent: float = 25,
+) -> PartialMap:
+    """Make a map of a ROS `nav_msgs/OccupancyGrid`.
+
+    Parameters
+    ----------
+    data : (height, width) integers
+        -1 (or 255, its unsigned form) unknown, else the occupancy in percent, 0 to 100: the message's `data`,
+        reshaped to `(info.height, info.width)`. Row 0 holds the smallest y, as ROS has it.
+    resolution_m : float
+        The message's `info.resolution` [m].
+    origin_m : (float, float)
+        x and y of the message's `info.origin` [m]; its orientation has to be the identity.
+    wall_height_m : float
+        Height of walls and ceiling [m].
+    occupied_percent, free_percent : float
+        From this value a cell is wall; up to this value it is free (the defaults of nav2's map_saver).
+
+    Returns
+    -------
+    PartialMap
+
+    Raises
+    ------
+    MapError
+        For other values, or a number out of range.
+    """
+    values = _numbers("data", data, "iu")
+    outside = ((values < -1) | (values > 100)) & (values != 255)
+    if outside.any():
+        raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
+    if not 0 <= free_percent < occupied_percent <= 100:
+        raise MapError(
+            f"free_percent = {free_percent!r} and occupied_percent = {occupied_percent!r} are not allowed: "
+            "give 0 <= free_percent < occupied_percent <= 100."
+        )
+    state = states_from_percent(values, occupied_percent, free_percent)
+    return PartialMap(state, resolution_m, origin_m, wall_height_m)
+
+
+def map_from_habitat(
+    top_down: ArrayLike,
+    fog_of_war: ArrayLike,
+    resolution_m: float,
+    *,
+    origin_m: tuple[float, float] = (0.0, 0.0),
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
+) -> PartialMap:
+    """Make a map of Habitat's top-down map and its fog-of-war mask.
+
+    Habitat's 0 means "not navigable", which is not free, and the mask reveals no such cell. A revealed navigable cell
+    is free; a revealed border cell is wall, and so is a not navigable cell that shares an edge with a revealed
+    navigable one, because the view ended there. What agent, path and start have been drawn over is navigable;
+    what a target has been drawn over is unknown, as is everything else.
+
+    Parameters
+    ----------
+    top_down : (rows, columns) integers
+        `info["top_down_map"]["map"]`, or `habitat.utils.visualizations.maps.get_topdown_map`. Rows run along Habitat's
+        +z, columns along +x. In world axes x is Habitat's x and y is -z, so that row 0 holds the LARGEST y.
+    fog_of_war : (rows, columns) integers or booleans
+        `info["top_down_map"]["fog_of_war_mask"]`: not 0 where the agent has seen.
+    resolution_m : float
+        Metres per pixel.
+    origin_m : (float, float)
+        World x and y of the lower-left corner: `(lower[0], -(lower[2] + rows * resolution_m))` for the lower bound
+        of Habitat's `pathfinder.get_bounds()` [m].
+    wall_height_m : float
+        Height of walls and ceiling [m].
+
+    Returns
+    -------
+    PartialMap
+
+    Raises
+    ------
+    MapError
+        For arrays of other or unequal shapes, or a number out of range.
+    """
+    value, seen = _numbers("top_down", top_down, "iu"), _numbers("fog_of_war", fog_of_war, "iub") != 0
+    _require_equal_shapes("fog_of_war", seen, "top_down", value)
+    if value.min() < 0 or value.max() > 255:
+        raise MapError(f"top_down holds values {value.min()} to {value.max()}: give Habitat's map, 0 to 255.")
+    blocked, border = value == HABITAT_INVALID, value == HABITAT_BORDER
+    free = seen & ~blocked & ~border & ~np.isin(value, HABITAT_COVERED)
+    state = np.full(value.shape, CellState.UNKNOWN, dtype=np.uint8)
+    state[free] = CellState.FREE
+    state[(seen & border) | (blocked & binary_dilation(free))] = CellState.WALL
+    return PartialMap(np.flipud(state), resolution_m, origin_m, wall_height_m)
+
+
+def map_from_slam(
+    obstacle: ArrayLike,
+    explored: ArrayLike,
+    resolution_m: float,
+    *,
+    origin_m: tuple[float, float] = (0.0, 0.0),
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
+    threshold: float = 0.5,
+) -> PartialMap:
+    """Make a map of the obstacle and explored channels of Active Neural SLAM.
+
+    Parameters
+    ----------
+    obstacle, explored : (ny, nx) numbers in [0, 1]
+        Probability that a cell holds an obstacle, and that it has been explored (`map[0]` and `map[1]`). Row 0 holds
+        the smallest y, as Active Neural SLAM has it (row from y, column from x).
+    resolution_m : float
+        Edge of a cell [m].
+    origin_m : (float, float)
+        World x and y of the lower-left corner of cell [0, 0] [m].
+    wall_height_m : float
+        Height of walls and ceiling [m].
+    threshold : float
+        From this value a channel holds.
+
+    Returns
+    -------
+    PartialMap
+        Explored obstacles are wall, the rest of what is explored is free, all else is unknown.
+
+    Raises
+    ------
+    MapError
+        For arrays of other or unequal shapes or with other values, or a number out of range.
+    """
+    channels = {"obstacle": _numbers("obstacle", obstacle, "iubf"), "explored": _numbers("explored", explored, "iubf")}
+    _require_equal_shapes("explored", channels["explored"], "obstacle", channels["obstacle"])
+    for name, channel in channels.items():
+        if not ((channel >= 0) & (channel <= 1)).all():
+            raise MapError(f"{name} holds values outside [0, 1] (or NaN): give probabilities or booleans.")
+    if not 0 < threshold <= 1:
+        raise MapError(f"threshold = {threshold!r} is not allowed: give a number in (0, 1].")
+    state = np.where(channels["obstacle"] >= threshold, CellState.WALL, CellState.FREE)
+    state = np.where(channels["explored"] >= threshold, state, CellState.UNKNOWN)
+    return PartialMap(state.astype(np.uint8), resolution_m, origin_m, wall_height_m)
+
+
+def _numbers(name: str, array: ArrayLike, kinds: str) -> NDArray[Any]:
+    """Return a two-dimensional array of one of the dtype kinds, or raise a MapError."""
+    try:
+        values = np.asarray(array)
+    except ValueError as error:
+        raise MapError(f"{name} is not a rectangular array: give a two-dimensional array (ny, nx).") from error
+    if values.ndim != 2 or values.size == 0:
+        raise MapError(
+            f"{name} has shape {values.shape}: give a two-dimensional array (ny, nx) with at least one cell."
+        )
+    if values.dtype.kind not in kinds:
+        wanted = "numbers" if "f" in kinds else "integers"
+        raise MapError(f"{name} has dtype {values.dtype}: give {wanted}.")
+    return values
+
+
+def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDArray[Any]) -> None:
+    if array.shape != like.shape:
+        raise MapError(f"{name} has shape {array.shape} and {other} {like.shape}: give arrays of one shape.")
+
+
+def _read_scene_map(source: Path, wall_height_m: float | None) -> PartialMap:
+    folder = source if source.is_dir() else source.parent
+    for name in SCENE_FILES:
+        if not (folder / name).is_file():
+            raise MapError(
+                f"path = '{source}' is no exported scene: there is no {name} in '{folder}'; give {ACCEPTED}."
+            )
+    return read_ros_map(folder / "map.yaml", wall_height_m=wall_height_m, confined=True)
+
+
+def _read_npz(source: Path, wall_height_m: float | None) -> PartialMap:
+    try:
+        with zipfile.ZipFile(source) as archive:
+            size = archive.getinfo("state.npy").file_size
+        if size > MAX_CELLS + 1000:
+            raise MapError(f"path = '{source}' holds more than {MAX_CELLS:,} cells: cut the map or coarsen it.")
+        with np.load(source, allow_pickle=False) as content:
+            state, resolution_m = content["state"], content["resolution_m"].item()
+            origin_m, height = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
+            interior = int(content["interior_cells"]) if "interior_cells" in content else None
+    except MapError:
+        raise
+    except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files
+        raise MapError(
+            f"path = '{source}' is damaged or was not written by save_map ({error}): save it again."
+        ) from error
+    return PartialMap(state, resolution_m, origin_m, height if wall_height_m is None else wall_height_m, interior)

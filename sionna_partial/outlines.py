@@ -1,0 +1,198 @@
+"""PartialMap -> wall outlines: few straight segments through the centres of the boundary wall cells."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.wall_cells import wall_cells
+from sionna_partial.wall_chains import Chain, WallGraph, wall_chains
+from sionna_partial.wall_graph import wall_graph
+from sionna_partial.wall_lines import fit_runs
+
+_REACH_CELLS = 1.0
+_OFFSET_CELLS = 0.6
+_ROUNDS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Outlines:
+    """Wall outlines in the map's local frame, whose origin is the lower-left corner of the grid.
+
+    Parameters
+    ----------
+    vertices_m : (V, 2) float64 array
+        Ends of the segments [m]. Segments that meet share a vertex; every vertex is used.
+    segments : (S, 2) int64 array
+        Indices into `vertices_m` of the two ends of every segment.
+    """
+
+    vertices_m: NDArray[np.float64]
+    segments: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """A chain's corners (n,), as indices into its points, and the straight runs between them."""
+
+    corners: NDArray[np.int64]
+    starts: NDArray[np.int64]
+    lines: NDArray[np.float64]
+
+
+def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.2) -> Outlines:
+    """Outline the walls of a map.
+
+    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Only WALL cells,
+    and the gaps of a cell or two between them, bear outlines.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    tolerance_cells : float
+        Largest distance of an outline from the lattice line through the cell centres [cells]. From 0.5 on, the
+        staircase of a tilted wall becomes one straight line.
+    bridge_gap_m : float
+        Longest gap in a seen wall that is closed [m]; never more than two cells.
+
+    Returns
+    -------
+    Outlines
+        Segments meet only at shared vertices.
+    """
+    walls = wall_cells(partial, bridge_gap_m)
+    graph = wall_graph(partial, walls.cells, bridge_gap_m)
+    chains = wall_chains(graph)
+    places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
+    fits = [_fit(places, shift, chain, tolerance_cells) for chain in chains]
+    plain: set[int] = set()
+    for _ in range(_ROUNDS):
+        lines = _polylines(graph, places, chains, fits, plain)
+        crossing = _crossing_chains(lines)
+        if not crossing - plain:
+            break
+        plain |= crossing
+    return _assemble(lines, partial.resolution_m)
+
+
+def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Vectors [cells] from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
+    peeled = np.pad(peeled, 2)
+    column, row = points.T // 2 + 2
+    towards = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+    beside = np.stack([peeled[row + dy, column + dx] for dx, dy in towards.tolist()], axis=1)
+    return beside @ towards / (1 + beside.sum(axis=1, keepdims=True))
+
+
+def _fit(places: NDArray[np.float64], shift: NDArray[np.float64], chain: Chain, tolerance: float) -> _Fit:
+    """Straight runs of a chain, moved to the middle of walls two cells thick."""
+    points = places[chain.points]
+    step = np.diff(points, axis=0)
+    turn = step[1:, 0] * step[:-1, 1] != step[1:, 1] * step[:-1, 0]
+    corners = np.concatenate([[0], np.nonzero(turn)[0] + 1, [len(points) - 1]])
+    starts, lines = fit_runs(points[corners], tolerance)
+    first = corners[starts]
+    mean = np.add.reduceat(shift[chain.points], first) / np.diff(np.append(first, len(points)))[:, None]
+    normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
+    lines[:, :2] += (mean * normal).sum(axis=1, keepdims=True) * normal
+    return _Fit(corners, starts, lines)
+
+
+def _polylines(
+    graph: WallGraph, places: NDArray[np.float64], chains: list[Chain], fits: list[_Fit], plain: set[int]
+) -> list[NDArray[np.float64]]:
+    """Vertices [cells] of every chain; chains in `plain` keep their lattice corners."""
+    nodes = _place_nodes(graph, places, chains, fits, plain)
+    lines = []
+    for index, (chain, fit) in enumerate(zip(chains, fits, strict=True)):
+        at = np.array([k for k, point in enumerate(chain.points) if point in nodes], dtype=np.int64)
+        fixed = {int(k): nodes[chain.points[k]] for k in at}
+        breaks = fit.corners if index in plain else fit.corners[fit.starts]
+        route = []
+        for k in sorted({*fixed, *breaks.tolist(), len(chain.points) - 1}):
+            if k in fixed:
+                route.append(fixed[k][None])
+            elif index in plain:
+                route.append(places[chain.points[k]][None])
+            else:
+                route.append(_meet(fit, chain, places, k))
+        if chain.closed and len(chain.points) - 1 not in fixed:
+            route[0] = route[-1][-1:]
+        lines.append(np.round(np.concatenate(route), 6))
+    return lines
+
+
+def _place_nodes(
+    graph: WallGraph, places: NDArray[np.float64], chains: list[Chain], fits: list[_Fit], plain: set[int]
+) -> dict[int, NDArray[np.float64]]:
+    """Places [cells] of chain ends and junctions: where the lines that meet there come closest."""
+    is_node = graph.degree != 2
+    lines: dict[int, list[NDArray[np.float64]]] = {}
+    pinned: set[int] = set()
+    for index, (chain, fit) in enumerate(zip(chains, fits, strict=True)):
+        bounds = np.append(fit.corners[fit.starts], len(chain.points) - 1)
+        for k in np.nonzero(is_node[chain.points])[0].tolist():
+            before, after = np.searchsorted(bounds, k) - 1, np.searchsorted(bounds, k, side="right") - 1
+            runs = {max(before, 0), min(after, len(fit.lines) - 1)}
+            lines.setdefault(chain.points[k], []).extend(fit.lines[sorted(runs)])
+            if index in plain:
+                pinned.add(chain.points[k])
+    return {
+        point: places[point] if point in pinned else _closest(np.array(through), places[point])
+        for point, through in lines.items()
+    }
+
+
+def _closest(lines: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Point of least squared distance to lines (k, 4), near `place`; `place` itself if that is too far away."""
+    normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
+    offset = (normal * (lines[:, :2] - place)).sum(axis=1)
+    moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
+    return place + moved if np.hypot(*moved) <= _REACH_CELLS else place
+
+
+def _meet(fit: _Fit, chain: Chain, places: NDArray[np.float64], k: int) -> NDArray[np.float64]:
+    """Vertices (1 or 2, 2) where the run that ends at point k of a chain meets the next."""
+    place = places[chain.points[k]]
+    corner = int(np.searchsorted(fit.corners, k))
+    after = int(np.searchsorted(fit.starts, corner, side="right")) - 1 if corner < len(fit.corners) - 1 else 0
+    pair = fit.lines[[after - 1, after]]
+    direction = pair[:, 2:]
+    cross = direction[0, 0] * direction[1, 1] - direction[0, 1] * direction[1, 0]
+    feet = pair[:, :2] + ((place - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
+    if abs(cross) > 0.05:
+        normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+        meeting = np.linalg.solve(normal, (normal * pair[:, :2]).sum(axis=1))
+        if np.hypot(*(meeting - place)) <= _REACH_CELLS:
+            return meeting[None]
+    if np.hypot(*(feet[1] - feet[0])) > _OFFSET_CELLS:
+        return feet
+    return feet.mean(axis=0)[None]
+
+
+def _crossing_chains(lines: list[NDArray[np.float64]]) -> set[int]:
+    """Chains with a segment that meets another away from a shared vertex."""
+    owner = np.repeat(np.arange(len(lines)), [len(line) - 1 for line in lines])
+    if not len(owner):
+        return set()
+    pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
+    owner, pairs = owner[(pairs[:, 0] != pairs[:, 1]).any(axis=1)], pairs[(pairs[:, 0] != pairs[:, 1]).any(axis=1)]
+    segments = shapely.linestrings(pairs)
+    first, second = shapely.STRtree(segments).query(segments, predicate="intersects")
+    first, second = first[first < second], second[first < second]
+    same = (pairs[first][:, :, None] == pairs[second][:, None]).all(axis=3).any(axis=(1, 2))
+    touch = shapely.intersection(segments[first], segments[second])
+    bad = ~same | (shapely.get_type_id(touch) != 0)
+    return set(owner[first[bad]].tolist()) | set(owner[second[bad]].tolist())
+
+
+def _assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines:
+    if not lines:
+        return Outlines(np.zeros((0, 2)), np.zeros((0, 2), dtype=np.int64))
+    pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
+    vertices, inverse = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
+    segments = np.unique(np.sort(inverse.reshape(-1, 2), axis=1), axis=0)
+    segments = segments[segments[:, 0] != segments[:, 1]]
+    return Outlines(vertices * resolution_m, segments.astype(np.int64))

@@ -1,0 +1,236 @@
+"""PartialMap: what a robot knows of a floor plan, cell by cell."""
+
+import itertools
+from dataclasses import dataclass
+from numbers import Integral
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.errors import MapError, PositionError
+
+MAX_CELLS = 100_000_000
+"""Largest number of cells of a map: more is a unit error or a map that should be cut."""
+
+_BORDER_CELLS = 1e-6
+"""Distance within which a point is on the border of a cell [cells]."""
+
+_FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np.uint8)
+_RANK = np.argsort(_FREEST)
+
+
+@dataclass(frozen=True, eq=False)
+class PartialMap:
+    """A floor plan of free, wall and unknown cells on a regular grid.
+
+    World axes: x right, y up, z up, in metres. Everything outside the grid is unknown.
+
+    Parameters
+    ----------
+    state : (ny, nx) uint8 array of CellState
+        Row 0 holds the smallest y. Kept read-only.
+    resolution_m : float
+        Edge of a cell [m], between 1 mm and 10 m.
+    origin_m : (float, float)
+        World x and y of the lower-left corner of the lower-left cell [m].
+    wall_height_m : float
+        Height of walls and ceiling [m].
+    interior_cells : int or None
+        Number of free cells of the complete home, where a simulation knows it.
+
+    Raises
+    ------
+    MapError
+        For an array of another shape or with other values, or a number out of range.
+    """
+
+    state: NDArray[np.uint8]
+    resolution_m: float
+    origin_m: tuple[float, float] = (0.0, 0.0)
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M
+    interior_cells: int | None = None
+
+    def __post_init__(self) -> None:
+        state = np.asarray(self.state)
+        _check_state(state)
+        state = np.array(state, dtype=np.uint8)
+        state.setflags(write=False)
+        object.__setattr__(self, "state", state)
+        object.__setattr__(self, "resolution_m", _number("resolution_m", self.resolution_m, 1e-3, 10.0))
+        if np.shape(self.origin_m) != (2,):
+            raise MapError(f"origin_m = {self.origin_m!r}: give the (x, y) of the lower-left corner in metres.")
+        origin = tuple(_number("origin_m", value, -1e8, 1e8) for value in self.origin_m)
+        object.__setattr__(self, "origin_m", origin)
+        object.__setattr__(self, "wall_height_m", _number("wall_height_m", self.wall_height_m, 0.1, 100.0))
+        cells = self.interior_cells
+        if cells is not None and not (isinstance(cells, Integral) and cells >= 0):
+            raise MapError(
+                f"interior_cells = {cells!r} is not allowed: give the number of free cells of the home, or None."
+            )
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, PartialMap):
+            return NotImplemented
+        return (
+            np.array_equal(self.state, other.state)
+            and self.resolution_m == other.resolution_m
+            and self.origin_m == other.origin_m
+            and self.wall_height_m == other.wall_height_m
+            and self.interior_cells == other.interior_cells
+        )
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns (ny, nx)."""
+        ny, nx = self.state.shape
+        return ny, nx
+
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """World (x_min, y_min, x_max, y_max) of the grid [m]."""
+        (x, y), (ny, nx) = self.origin_m, self.shape
+        return x, y, x + nx * self.resolution_m, y + ny * self.resolution_m
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
+
+        A map without free cells is not complete.
+        """
+        free, unknown = self.state == CellState.FREE, self.state == CellState.UNKNOWN
+        touches = (
+            (free[1:] & unknown[:-1]).any()
+            or (free[:-1] & unknown[1:]).any()
+            or (free[:, 1:] & unknown[:, :-1]).any()
+            or (free[:, :-1] & unknown[:, 1:]).any()
+        )
+        return bool(free.any() and not touches)
+
+    @property
+    def observed_fraction(self) -> float:
+        """Share of the interior that has been seen, in [0, 1].
+
+        Free cells over `interior_cells` where that is known; else 1 for a complete map, and the share of known
+        cells in the grid for any other.
+        """
+        if self.interior_cells is not None:
+            return min(1.0, float((self.state == CellState.FREE).sum()) / max(1, self.interior_cells))
+        if self.is_complete:
+            return 1.0
+        return float((self.state != CellState.UNKNOWN).mean())
+
+    def cell_index(self, points_m: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Row and column of the cells that hold world points.
+
+        Parameters
+        ----------
+        points_m : (..., 2 or 3) array
+            World positions [m]; z is ignored.
+
+        Returns
+        -------
+        row, column : (...) int arrays
+            May lie outside the grid.
+        """
+        points = np.asarray(points_m, dtype=float)
+        column = np.floor((points[..., 0] - self.origin_m[0]) / self.resolution_m + 1e-9).astype(np.intp)
+        row = np.floor((points[..., 1] - self.origin_m[1]) / self.resolution_m + 1e-9).astype(np.intp)
+        return row, column
+
+    def state_at(self, points_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """CellState at world points (..., 2 or 3) [m]; UNKNOWN outside the grid.
+
+        A point on the border of several cells is in the freest of them: FREE before UNKNOWN before WALL. Sensors and
+        planners place radios on the corners of cells, beside a wall, and these are not inside it.
+        """
+        cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m
+        padded = np.pad(self.state, 1, constant_values=CellState.UNKNOWN)
+        ny, nx = self.shape
+        freest = np.full(cells.shape[:-1], _RANK[CellState.WALL])
+        for shift_x, shift_y in itertools.product((-_BORDER_CELLS, _BORDER_CELLS), repeat=2):
+            column = np.clip(np.floor(cells[..., 0] + shift_x) + 1, 0, nx + 1).astype(np.intp)
+            row = np.clip(np.floor(cells[..., 1] + shift_y) + 1, 0, ny + 1).astype(np.intp)
+            freest = np.minimum(freest, _RANK[padded[row, column]])
+        return _FREEST[freest]
+
+    def require_positions(self, name: str, points_m: object) -> NDArray[np.float64]:
+        """Check radio positions and return them as an array.
+
+        Parameters
+        ----------
+        name : str
+            What the points are, for the message ("tx", "rx").
+        points_m : (3,) or (N, 3) array-like
+            World positions [m].
+
+        Returns
+        -------
+        (3,) or (N, 3) float64 array
+
+        Raises
+        ------
+        PositionError
+            For another shape, a value that is not finite, or a point outside the map, inside a wall, or not between
+            floor and ceiling. Unknown cells are allowed (the paper asks for them).
+        """
+        try:
+            points = np.asarray(points_m, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise PositionError(f"{name} = {points_m!r} is not numeric: give x, y, z in metres.") from error
+        if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
+            raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
+        x0, y0, x1, y1 = self.bounds_m
+        height = self.wall_height_m
+        flat = points.reshape(-1, 3)
+        finite = ~np.any(~np.isfinite(flat), axis=1)
+        placed = np.where(finite[:, None], flat, 0.0)
+        x, y, z = placed.T
+        faults: tuple[tuple[NDArray[np.bool_], str, str], ...] = (
+            (~finite, "is not finite", "give finite numbers in metres."),
+            (
+                (x < x0) | (x > x1) | (y < y0) | (y > y1),
+                f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m",
+                "move it inside, or extend the map with unknown cells.",
+            ),
+            (
+                (z <= 0.0) | (z >= height),
+                f"is not between floor and ceiling (0 to {height:g} m)",
+                "change its height z or the map's wall_height_m.",
+            ),
+            (self.state_at(placed) == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
+        )
+        for fault, what, remedy in faults:
+            if fault.any():
+                index = int(np.argmax(fault))
+                which = name if points.ndim == 1 else f"{name}[{index}]"
+                more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
+                place = tuple(float(v) for v in flat[index])
+                raise PositionError(f"{which} = {place}{more} {what}: {remedy}")
+        return points
+
+
+def _check_state(state: NDArray[np.generic]) -> None:
+    if state.ndim != 2 or state.size == 0:
+        raise MapError(f"state has shape {state.shape}: give a two-dimensional array (ny, nx) with at least one cell.")
+    if state.dtype.kind not in "iub":
+        raise MapError(f"state has dtype {state.dtype}: use CellState integers FREE 0, WALL 1, UNKNOWN 2.")
+    if state.size > MAX_CELLS:
+        ny, nx = state.shape
+        raise MapError(
+            f"state has {ny} x {nx} cells, more than {MAX_CELLS:,}: cut the map to the building or coarsen it."
+        )
+    if state.min() < 0 or state.max() > max(CellState):
+        raise MapError(
+            f"state has values {state.min()} to {state.max()}: use CellState integers FREE 0, WALL 1, UNKNOWN 2."
+        )
+
+
+def _number(name: str, value: object, low: float, high: float) -> float:
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = float("nan")
+    if not low <= number <= high:
+        raise MapError(f"{name} = {value!r} is not allowed: give a number of metres in [{low:g}, {high:g}].")
+    return number

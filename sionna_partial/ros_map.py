@@ -1,0 +1,354 @@
+"""ROS map_server maps: a YAML file and an image, read as nav2_map_server reads them, and written."""
+
+import math
+import reprlib
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from PIL import Image
+
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.errors import MapError
+from sionna_partial.files import atomic_write
+from sionna_partial.map_turn import turn_grid
+from sionna_partial.partial_map import MAX_CELLS, PartialMap
+
+MODES = ("trinary", "scale", "raw")
+"""Ways in which map_server reads an image."""
+
+UNKNOWN_SHADE = 205
+"""Shade that map savers give to unknown cells [of 255]."""
+
+OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
+"""Thresholds of the maps that are written (map_server's; the shade 205 stays unknown)."""
+
+MAX_YAML_BYTES = 1_000_000
+"""Largest map YAML that is read: more is another file [bytes]."""
+
+MAX_YAW_RAD = 6.2832
+"""Largest yaw of a map's origin: one turn, as people round it; more is meant in degrees [rad]."""
+
+_short = reprlib.Repr()
+_short.maxstring, _short.maxother, _short.maxlevel = 200, 200, 2
+
+
+class MapWarning(UserWarning):
+    """A map file that was not read to the letter, because unknown cells would have read as free or wall."""
+
+
+@dataclass(frozen=True)
+class _Sheet:
+    """The checked content of a map YAML."""
+
+    source: Path
+    image: Path
+    mode: str
+    resolution_m: float
+    origin: tuple[float, float, float]
+    negate: bool
+    occupied_thresh: float
+    free_thresh: float
+    wall_height_m: float
+    interior_cells: int | None
+
+
+@dataclass(frozen=True)
+class _Pixels:
+    """A decoded image, row 0 at the top.
+
+    An opaque pixel of grey shade s (0 to 255) has the level s * `per_shade` + `opaque`, at most `full`.
+    """
+
+    level: NDArray[np.uint16]
+    per_shade: int = 1
+    opaque: int = 0
+    alpha: NDArray[np.uint8] | None = None
+
+    @property
+    def full(self) -> int:
+        return 255 * self.per_shade + self.opaque
+
+
+def read_ros_map(
+    path: Path, *, strict: bool = False, wall_height_m: float | None = None, confined: bool = False
+) -> PartialMap:
+    """Read a ROS map_server YAML and its image.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The YAML file.
+    strict : bool
+        Read every pixel as map_server does, even where unknown cells become free or wall that way.
+    wall_height_m : float or None
+        Wall height [m] in place of the YAML's `wall_height`.
+    confined : bool
+        Refuse an image outside the YAML's folder.
+
+    Returns
+    -------
+    PartialMap
+
+    Raises
+    ------
+    MapError
+        For a YAML or an image that is missing, damaged, or out of range.
+    """
+    sheet = _read_sheet(path, confined=confined)
+    pixels = _read_pixels(sheet)
+    state = _classify(pixels, sheet)
+    if sheet.mode == "trinary" and not strict:
+        _keep_unknown(state, pixels, sheet)
+    placed, resolution_m, origin_m = turn_grid(np.flipud(state), sheet.resolution_m, sheet.origin)
+    height = sheet.wall_height_m if wall_height_m is None else wall_height_m
+    interior = sheet.interior_cells
+    if interior is not None:
+        interior *= round(sheet.resolution_m / resolution_m) ** 2
+    return PartialMap(placed, resolution_m, origin_m, height, interior)
+
+
+def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
+    """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map.
+
+    Parameters
+    ----------
+    partial : PartialMap
+        The map.
+    path : pathlib.Path
+        The YAML file.
+    extra : mapping or None
+        Further keys for the YAML.
+
+    Raises
+    ------
+    OutputError
+        If writing fails; both files are then as they were before.
+    """
+    image = path.with_suffix(".pgm")
+    sheet: dict[str, object] = {
+        "image": image.name,
+        "mode": "trinary",
+        "resolution": partial.resolution_m,
+        "origin": [*partial.origin_m, 0.0],
+        "negate": 0,
+        "occupied_thresh": OCCUPIED_THRESHOLD,
+        "free_thresh": FREE_THRESHOLD,
+        "wall_height": partial.wall_height_m,
+    }
+    if partial.interior_cells is not None:
+        sheet["interior_cells"] = int(partial.interior_cells)
+    shades = np.empty(len(CellState), dtype=np.uint8)
+    shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
+    ny, nx = partial.shape
+    with atomic_write(path, "w") as text, atomic_write(image) as picture:
+        yaml.safe_dump({**sheet, **(extra or {})}, text, sort_keys=False, default_flow_style=None)
+        text.flush()
+        picture.write(b"P5\n%d %d\n255\n" % (nx, ny))
+        picture.write(np.flipud(shades[partial.state]).tobytes())
+
+
+def states_from_percent(
+    percent: NDArray[np.integer], occupied_percent: float, free_percent: float
+) -> NDArray[np.uint8]:
+    """CellState of ROS occupancy values, as nav2's map_saver draws them.
+
+    Parameters
+    ----------
+    percent : integer array
+        0 to 100; any other value is unknown.
+    occupied_percent, free_percent : float
+        From this value a cell is wall; up to this value it is free.
+
+    Returns
+    -------
+    uint8 array of CellState, of the same shape
+    """
+    state = np.full(percent.shape, CellState.UNKNOWN, dtype=np.uint8)
+    state[(percent >= 0) & (percent <= free_percent)] = CellState.FREE
+    state[(percent <= 100) & (percent >= occupied_percent)] = CellState.WALL
+    return state
+
+
+def _refuse(sheet: Path, field: str, value: object, remedy: str) -> MapError:
+    return MapError(f"{sheet}: {field} = {_short.repr(value)} is not allowed: {remedy}")
+
+
+def _read_sheet(path: Path, *, confined: bool) -> _Sheet:
+    raw = _read_yaml(path)
+    occupied = _number(path, raw, "occupied_thresh", 0.0, 1.0)
+    free = _number(path, raw, "free_thresh", 0.0, 1.0)
+    if free >= occupied:
+        raise _refuse(path, "free_thresh", free, f"give less than occupied_thresh, which is {occupied:g}.")
+    mode = raw.get("mode", "trinary")
+    if not isinstance(mode, str) or mode.lower() not in MODES:
+        raise _refuse(path, "mode", mode, f"choose one of {', '.join(MODES)}.")
+    negate = _required(path, raw, "negate")
+    if not isinstance(negate, int) or negate not in (0, 1):
+        raise _refuse(path, "negate", negate, "give 0 (dark is wall) or 1 (bright is wall).")
+    interior = raw.get("interior_cells")
+    if interior is not None and (not isinstance(interior, int) or isinstance(interior, bool) or interior < 0):
+        raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
+    height = {"wall_height": DEFAULT_WALL_HEIGHT_M, **raw}
+    return _Sheet(
+        source=path,
+        image=_image_path(path, _required(path, raw, "image"), confined=confined),
+        mode=mode.lower(),
+        resolution_m=_number(path, raw, "resolution", 1e-3, 10.0, "metres per cell (not cells per metre)"),
+        origin=_origin(path, _required(path, raw, "origin")),
+        negate=bool(negate),
+        occupied_thresh=occupied,
+        free_thresh=free,
+        wall_height_m=_number(path, height, "wall_height", 0.1, 100.0, "metres"),
+        interior_cells=interior,
+    )
+
+
+def _read_yaml(path: Path) -> dict[Any, Any]:
+    try:
+        with path.open("rb") as stream:
+            text = stream.read(MAX_YAML_BYTES + 1)
+    except OSError as error:
+        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
+    if len(text) > MAX_YAML_BYTES:
+        raise MapError(f"path = '{path}' has more than {MAX_YAML_BYTES:,} bytes: give the YAML of a ROS map.")
+    try:
+        raw = yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise MapError(f"path = '{path}' is not valid YAML ({reason}): correct it or save the map again.") from error
+    if not isinstance(raw, dict):
+        raise MapError(
+            f"path = '{path}' holds {_short.repr(raw)} in place of keys such as image, resolution and origin: "
+            "give the YAML that a ROS map_saver wrote."
+        )
+    return raw
+
+
+def _required(path: Path, raw: Mapping[Any, Any], key: str) -> Any:
+    if key not in raw:
+        raise MapError(f"{path}: {key} is missing: add it, as in the YAML that a ROS map_saver writes.")
+    return raw[key]
+
+
+def _number(path: Path, raw: Mapping[Any, Any], key: str, low: float, high: float, unit: str = "") -> float:
+    value = _required(path, raw, key)
+    number = _float(value)
+    if not low <= number <= high:
+        what = f" of {unit}" if unit else ""
+        raise _refuse(path, key, value, f"give a number{what} in [{low:g}, {high:g}].")
+    return number
+
+
+def _float(value: object) -> float:
+    """Return the number that is meant, NaN for none. YAML 1.1 takes 5e-2 for a text."""
+    try:
+        return math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
+def _origin(path: Path, value: object) -> tuple[float, float, float]:
+    numbers = [_float(number) for number in value] if isinstance(value, list) else []
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+        raise _refuse(path, "origin", value, "give [x, y, yaw] of the lower-left corner, in metres and radians.")
+    x, y, yaw = numbers
+    if abs(yaw) > MAX_YAW_RAD:
+        raise _refuse(path, "origin", value, "its third number is the yaw in radians, one turn at most (not degrees).")
+    return x, y, yaw
+
+
+def _image_path(path: Path, value: object, *, confined: bool) -> Path:
+    if not isinstance(value, str) or not value or "\0" in value:
+        raise _refuse(path, "image", value, "give the file name of the map image.")
+    if confined and (Path(value).is_absolute() or ".." in Path(value).parts):
+        raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
+    image = path.parent / value
+    try:
+        found = image.is_file()
+    except OSError:
+        found = False
+    if not found:
+        raise _refuse(path, "image", value, f"there is no file '{image}'; put the image there or correct the name.")
+    return image
+
+
+def _read_pixels(sheet: _Sheet) -> _Pixels:
+    image = _decode(sheet)
+    if image.mode.startswith("I"):
+        return _Pixels(np.asarray(image).astype(np.uint16), per_shade=257)
+    transparent = image.has_transparency_data
+    if image.mode in ("1", "L") and not transparent:
+        return _Pixels(np.asarray(image.convert("L")).astype(np.uint16))
+    channels = np.asarray(image.convert("RGBA" if transparent else "RGB"))
+    # Alpha counts as a fourth channel in trinary mode alone (nav2 map_io.cpp, loadMapFromFile).
+    four = transparent and sheet.mode == "trinary"
+    level = channels[..., : 4 if four else 3].sum(axis=-1, dtype=np.uint16)
+    return _Pixels(level, 3, 255 if four else 0, channels[..., 3] if transparent else None)
+
+
+def _decode(sheet: _Sheet) -> Image.Image:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            image = Image.open(sheet.image, formats=("PPM", "PNG", "BMP"))
+        with image:
+            too_large = image.width * image.height > MAX_CELLS
+            if not too_large:
+                image.load()
+    except Image.DecompressionBombError:
+        too_large = True
+    except Exception as error:  # decoders fail in many ways on damaged files
+        remedy = f"it is damaged or not a PGM, PNG or BMP ({error}); save the map again."
+        raise _refuse(sheet.source, "image", str(sheet.image), remedy) from error
+    if too_large:
+        remedy = f"it has more than {MAX_CELLS:,} cells; cut the map to the building or coarsen it."
+        raise _refuse(sheet.source, "image", str(sheet.image), remedy)
+    if image.mode == "F":
+        raise _refuse(sheet.source, "image", str(sheet.image), "it holds floating-point shades; save a PGM or PNG.")
+    return image
+
+
+def _classify(pixels: _Pixels, sheet: _Sheet) -> NDArray[np.uint8]:
+    """Read every pixel to the letter of nav2's loadMapFromFile; what lies between the thresholds is unknown."""
+    shade = np.arange(pixels.full + 1) / pixels.full
+    if sheet.mode == "raw":
+        occupied, free = np.rint(100 * sheet.occupied_thresh), np.rint(100 * sheet.free_thresh)
+        table = states_from_percent(np.rint(255 * shade).astype(int), occupied, free)
+    else:
+        occupancy = shade if sheet.negate else 1.0 - shade
+        table = np.full(occupancy.shape, CellState.UNKNOWN, dtype=np.uint8)
+        table[occupancy > sheet.occupied_thresh] = CellState.WALL
+        table[occupancy < sheet.free_thresh] = CellState.FREE
+    state = table[pixels.level]
+    if sheet.mode == "scale" and pixels.alpha is not None:
+        state[pixels.alpha < 255] = CellState.UNKNOWN
+    return state
+
+
+def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> None:
+    """Keep, in place, what map savers and painters mean by unknown: fully transparent pixels, and the shade 205.
+
+    With a free_thresh above 0.196 (older nav2 wrote 0.25), or with an alpha channel, 205 reads as free. It is
+    kept unknown where more cells would be lost that way than would be unknown.
+    """
+    shade = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE
+    lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)
+    if lost.sum() > (state == CellState.UNKNOWN).sum():
+        state[lost] = CellState.UNKNOWN
+        _warn(sheet, f"{int(lost.sum())} cells of shade {shade} would read as free (free_thresh {sheet.free_thresh:g})")
+    if pixels.alpha is not None:
+        clear = (pixels.alpha == 0) & (state != CellState.UNKNOWN)
+        if clear.any():
+            state[clear] = CellState.UNKNOWN
+            _warn(sheet, f"{int(clear.sum())} transparent cells would read as free or wall")
+
+
+def _warn(sheet: _Sheet, what: str) -> None:
+    message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
+    warnings.warn(message, MapWarning, stacklevel=5)

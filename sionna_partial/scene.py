@@ -1,0 +1,259 @@
+"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one place that writes scenes."""
+
+import os
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
+from sionna_partial.files import atomic_folder
+from sionna_partial.llvm import load_llvm
+from sionna_partial.map_files import save_map
+from sionna_partial.outlines import wall_outlines
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+
+FAR_M = 1000.0
+"""Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
+
+SIONNA_LOAD_GHZ = 3.5
+"""Frequency at which Sionna RT evaluates the materials of a scene while it loads it [GHz]."""
+
+
+@dataclass(frozen=True)
+class SceneGeometry:
+    """What is extruded: walls, floor and ceiling of a map, in its local frame.
+
+    The local frame has its origin at the lower-left corner of the grid, on the floor.
+
+    Parameters
+    ----------
+    vertices_m : (V, 2) float64 array
+        Ends of the wall outlines [m].
+    segments : (S, 2) int64 array
+        Walls, as indices into `vertices_m`.
+    floor_m : (R, 4) float64 array
+        Rectangles x0, y0, x1, y1 of floor and ceiling [m]; they do not overlap.
+    height_m : float
+        Height of walls and ceiling [m].
+    material : Material
+        Material of everything.
+    origin_m : (float, float)
+        World x and y of the local frame's origin [m].
+    """
+
+    vertices_m: NDArray[np.float64]
+    segments: NDArray[np.int64]
+    floor_m: NDArray[np.float64]
+    height_m: float
+    material: Material
+    origin_m: tuple[float, float]
+
+
+def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
+    """Turn a map into walls, floor and ceiling.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    settings : SceneSettings, optional
+        Tolerances, floor extent and material.
+
+    Returns
+    -------
+    SceneGeometry
+    """
+    settings = settings or SceneSettings()
+    outlines = wall_outlines(
+        partial, tolerance_cells=settings.outline_tolerance_cells, bridge_gap_m=settings.bridge_gap_m
+    )
+    return SceneGeometry(
+        vertices_m=outlines.vertices_m,
+        segments=outlines.segments,
+        floor_m=_rectangles(_floor_cells(partial, settings.floor_extent)) * partial.resolution_m,
+        height_m=partial.wall_height_m,
+        material=settings.material,
+        origin_m=partial.origin_m,
+    )
+
+
+def export_scene(
+    partial: PartialMap,
+    folder: str | os.PathLike[str],
+    settings: SceneSettings | None = None,
+    *,
+    frequency_hz: float = CARRIER_FREQUENCY_HZ,
+) -> Path:
+    """Write a map as a scene folder that stock Sionna RT loads.
+
+    The folder holds `scene.xml`, `meshes/walls.ply`, `meshes/floor.ply` and `meshes/ceiling.ply` (those that are not
+    empty), and the map itself as `map.yaml` and `map.pgm`, from which `load_map` reads it back. Scene coordinates are
+    the map's world coordinates less `scene_offset` in `map.yaml`: [0, 0], or the lower-left corner of a map that
+    reaches farther than `FAR_M` from the origin.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    folder : path-like
+        New or empty folder, or an exported scene that is replaced.
+    settings : SceneSettings, optional
+        Tolerances, floor extent and material.
+    frequency_hz : float
+        Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
+
+    Returns
+    -------
+    pathlib.Path
+        The folder.
+
+    Raises
+    ------
+    SettingsError
+        For a frequency that the material does not cover.
+    OutputError
+        If writing fails; nothing half written is left behind.
+    """
+    settings = settings or SceneSettings()
+    settings.material.require_frequency(frequency_hz)
+    geometry = build_scene(partial, settings)
+    far = max(abs(value) for value in partial.bounds_m) > FAR_M
+    offset_m = partial.origin_m if far else (0.0, 0.0)
+    with atomic_folder(folder) as place:
+        write_scene(geometry, place, offset_m=offset_m, frequency_hz=frequency_hz)
+        save_map(partial, place / "map.yaml", extra={"scene_offset": list(offset_m)})
+    return Path(folder)
+
+
+def write_scene(
+    geometry: SceneGeometry,
+    folder: Path,
+    *,
+    offset_m: tuple[float, float],
+    frequency_hz: float = CARRIER_FREQUENCY_HZ,
+) -> Path:
+    """Write `scene.xml` and its meshes into an existing folder.
+
+    Wall i is made of the triangles 2 i and 2 i + 1; walls that meet share vertices, so that they form wedges.
+
+    Parameters
+    ----------
+    geometry : SceneGeometry
+    folder : pathlib.Path
+    offset_m : (float, float)
+        World x and y that become the scene's origin [m]; `geometry.origin_m` gives local coordinates.
+    frequency_hz : float
+        Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
+
+    Returns
+    -------
+    pathlib.Path
+        `scene.xml`.
+    """
+    shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
+    (folder / "meshes").mkdir(exist_ok=True)
+    scene = ET.Element("scene", version="2.1.0")
+    _add_material(scene, geometry.material, frequency_hz)
+    for name, (vertices, faces) in _meshes(geometry).items():
+        if len(faces):
+            mesh = trimesh.Trimesh(vertices + shift, faces, process=False)
+            mesh.export(folder / "meshes" / f"{name}.ply")
+            shape = ET.SubElement(scene, "shape", type="ply", id=name)
+            ET.SubElement(shape, "string", name="filename", value=f"meshes/{name}.ply")
+            ET.SubElement(shape, "boolean", name="face_normals", value="true")
+            ET.SubElement(shape, "ref", name="bsdf", id="material")
+    ET.indent(scene)
+    path = folder / "scene.xml"
+    ET.ElementTree(scene).write(path, encoding="utf-8")
+    return path
+
+
+def _loads_by_name(itu: str) -> bool:
+    """Whether Sionna RT loads an ITU material by its name (2.2.0 has no display colour for vacuum, and fails)."""
+    return itu != "vacuum" and any(low <= SIONNA_LOAD_GHZ <= high for low, high in ITU_BANDS_GHZ[itu])
+
+
+def _add_material(scene: ET.Element, material: Material, frequency_hz: float) -> None:
+    if material.itu is not None and _loads_by_name(material.itu):
+        bsdf = ET.SubElement(scene, "bsdf", type="itu-radio-material", id="material")
+        ET.SubElement(bsdf, "string", name="type", value=material.itu)
+    else:
+        permittivity, conductivity = material.relative_permittivity, material.conductivity_s_m
+        if material.itu is not None:
+            permittivity, conductivity = _itu_constants(material.itu, frequency_hz)
+        bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id="material")
+        ET.SubElement(bsdf, "float", name="relative_permittivity", value=repr(float(permittivity)))
+        ET.SubElement(bsdf, "float", name="conductivity", value=repr(float(conductivity)))
+    ET.SubElement(bsdf, "float", name="thickness", value=repr(float(material.thickness_m)))
+
+
+def _itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
+    """Relative permittivity and conductivity [S/m] of an ITU material (ITU-R P.2040-3, eq. 28 and 29)."""
+    load_llvm()
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    frequency_ghz = frequency_hz / 1e9
+    bands = ITU_MATERIALS_PROPERTIES[name].items()
+    a, b, c, d = next(factors for (low, high), factors in bands if low <= frequency_ghz <= high)
+    return a * frequency_ghz**b, c * frequency_ghz**d
+
+
+def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    """Vertices (V, 3) [m] and triangles (F, 3) of each mesh, in the local frame."""
+    low = np.column_stack([geometry.vertices_m, np.zeros(len(geometry.vertices_m))])
+    high = low + [0.0, 0.0, geometry.height_m]
+    (a, b), count = geometry.segments.T, len(low)
+    walls = np.stack([a, b, b + count, a, b + count, a + count], axis=1).reshape(-1, 3)
+    corners, triangles = _triangles(geometry.floor_m)
+    floor = np.column_stack([corners, np.zeros(len(corners))])
+    ceiling = floor + [0.0, 0.0, geometry.height_m]
+    return {
+        "walls": (np.concatenate([low, high]), walls),
+        "floor": (floor, triangles),
+        "ceiling": (ceiling, triangles[:, ::-1]),
+    }
+
+
+def _triangles(rectangles_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Corners (V, 2) and counterclockwise triangles (F, 3) of an area.
+
+    Triangles share whole edges: an edge inside the area must not look like the rim of a screen, which diffracts.
+    """
+    area = shapely.simplify(shapely.union_all(shapely.box(*rectangles_m.T)), 0.0)
+    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
+    rings = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3]
+    corners, index = np.unique(rings.reshape(-1, 2), axis=0, return_inverse=True)
+    triangles = index.reshape(-1, 3)
+    return corners, triangles[np.lexsort(triangles.T)].astype(np.int64)
+
+
+def _floor_cells(partial: PartialMap, extent: str) -> NDArray[np.bool_]:
+    """Cells (ny, nx) that floor and ceiling cover."""
+    if extent == "none":
+        return np.zeros(partial.shape, dtype=bool)
+    if extent == "map":
+        return np.ones(partial.shape, dtype=bool)
+    free = partial.state == CellState.FREE
+    beside = ndimage.binary_dilation(free, structure=np.ones((3, 3)))
+    return free | (beside & (partial.state == CellState.WALL))
+
+
+def _rectangles(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Cover the cells of a mask exactly by few rectangles x0, y0, x1, y1 in cells: equal runs of rows merge."""
+    ny, nx = mask.shape
+    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(step == 1)
+    end = np.nonzero(step == -1)[1]
+    order = np.lexsort((row, end, start))
+    row, start, end = row[order], start[order], end[order]
+    new = np.ones(len(row), dtype=bool)
+    new[1:] = (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)
+    first = np.nonzero(new)[0]
+    last = np.append(first[1:], len(row)) - 1 if len(row) else first
+    rectangles = np.stack([start[first], row[first], end[first], row[last] + 1], axis=1)
+    return rectangles[np.lexsort((rectangles[:, 0], rectangles[:, 1]))]

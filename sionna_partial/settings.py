@@ -1,0 +1,222 @@
+"""One frozen dataclass of settings for each stage, checked when it is built."""
+
+import math
+from dataclasses import dataclass, field
+from numbers import Integral, Real
+from typing import Literal
+
+from sionna_partial.constants import (
+    CARRIER_FREQUENCY_HZ,
+    DRYWALL_CONDUCTIVITY_S_M,
+    DRYWALL_PERMITTIVITY,
+    WALL_THICKNESS_M,
+)
+from sionna_partial.errors import SettingsError
+
+ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
+    "vacuum": ((0.001, 100.0),),
+    "concrete": (
+        (1.0, 100.0),
+        (110.0, 330.0),
+    ),
+    "brick": (
+        (1.0, 40.0),
+        (110.0, 330.0),
+    ),
+    "plasterboard": (
+        (1.0, 100.0),
+        (110.0, 330.0),
+        (100.0, 400.0),
+    ),
+    "wood": (
+        (0.001, 100.0),
+        (110.0, 330.0),
+        (100.0, 400.0),
+    ),
+    "glass": (
+        (0.1, 100.0),
+        (220.0, 450.0),
+        (100.0, 400.0),
+    ),
+    "clear_acrylic": ((110.0, 330.0),),
+    "ceiling_board": (
+        (1.0, 100.0),
+        (220.0, 450.0),
+        (100.0, 400.0),
+    ),
+    "chipboard": (
+        (1.0, 100.0),
+        (100.0, 200.0),
+    ),
+    "plywood": (
+        (1.0, 40.0),
+        (110.0, 330.0),
+        (100.0, 400.0),
+    ),
+    "marble": (
+        (1.0, 60.0),
+        (110.0, 330.0),
+        (100.0, 400.0),
+    ),
+    "floorboard": (
+        (50.0, 100.0),
+        (220.0, 300.0),
+        (300.0, 400.0),
+        (400.0, 450.0),
+        (100.0, 400.0),
+    ),
+    "vinyl_tile": ((1.0, 40.0),),
+    "carpet_tile": ((1.0, 40.0),),
+    "asphalt_concrete": ((1.0, 40.0),),
+    "metal": ((1.0, 100.0),),
+    "very_dry_ground": ((1.0, 10.0),),
+    "medium_dry_ground": ((1.0, 10.0),),
+    "wet_ground": ((1.0, 10.0),),
+}
+"""ITU-R P.2040-3 materials and the frequency bands of their models [GHz], as Sionna RT has them."""
+
+
+def require(condition: bool, name: str, value: object, remedy: str) -> None:
+    """Raise a SettingsError that names the setting, its value and the remedy unless `condition` holds."""
+    if not condition:
+        raise SettingsError(f"{name} = {value!r} is not allowed: {remedy}")
+
+
+def require_number(name: str, value: object, low: float, high: float, *, open_low: bool = False) -> None:
+    """Raise a SettingsError unless `value` is a finite number in [low, high], or (low, high] with `open_low`."""
+    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    inside = (low < number if open_low else low <= number) and number <= high
+    require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].")
+
+
+@dataclass(frozen=True)
+class Material:
+    """Radio material of walls, floor and ceiling.
+
+    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one with constant permittivity and
+    conductivity. The default is the paper's layered drywall.
+
+    Parameters
+    ----------
+    relative_permittivity : float
+        Real relative permittivity, at least 1. Ignored for an ITU material.
+    conductivity_s_m : float
+        Conductivity [S/m], at least 0. Ignored for an ITU material.
+    thickness_m : float
+        Slab thickness in the reflection and transmission coefficients [m].
+    itu : str or None
+        Name of an ITU material (a key of `ITU_BANDS_GHZ`).
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range or an unknown ITU name.
+    """
+
+    relative_permittivity: float = DRYWALL_PERMITTIVITY
+    conductivity_s_m: float = DRYWALL_CONDUCTIVITY_S_M
+    thickness_m: float = WALL_THICKNESS_M
+    itu: str | None = None
+
+    def __post_init__(self) -> None:
+        require_number("relative_permittivity", self.relative_permittivity, 1.0, 1e6)
+        require_number("conductivity_s_m", self.conductivity_s_m, 0.0, 1e9)
+        require_number("thickness_m", self.thickness_m, 0.0, 10.0, open_low=True)
+        known = ", ".join(ITU_BANDS_GHZ)
+        require(self.itu is None or self.itu in tuple(ITU_BANDS_GHZ), "itu", self.itu, f"choose one of {known}.")
+
+    def require_frequency(self, frequency_hz: float) -> None:
+        """Raise a SettingsError if the material's model does not cover `frequency_hz`."""
+        if self.itu is None:
+            return
+        bands = ITU_BANDS_GHZ[self.itu]
+        covered = any(low <= frequency_hz / 1e9 <= high for low, high in bands)
+        spans = " or ".join(f"{low:g}-{high:g} GHz" for low, high in bands)
+        require(
+            covered,
+            "frequency_hz",
+            frequency_hz,
+            f"ITU material {self.itu!r} is defined for {spans}; choose a frequency there or a custom Material.",
+        )
+
+
+@dataclass(frozen=True)
+class SceneSettings:
+    """How a map becomes a scene.
+
+    Parameters
+    ----------
+    material : Material
+        Material of walls, floor and ceiling.
+    outline_tolerance_cells : float
+        Largest distance of a simplified wall outline from the lattice outline [cells].
+    bridge_gap_m : float
+        Longest gap that is closed in a seen wall [m]; at most two cells are bridged, whatever this allows.
+    floor_extent : {"observed", "map", "none"}
+        What floor and ceiling span: the observed area (nothing comes from unknown cells), the whole map, or nothing.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+    """
+
+    material: Material = field(default_factory=Material)
+    outline_tolerance_cells: float = 0.5
+    bridge_gap_m: float = 0.2
+    floor_extent: Literal["observed", "map", "none"] = "observed"
+
+    def __post_init__(self) -> None:
+        require(isinstance(self.material, Material), "material", self.material, "give a Material.")
+        require_number("outline_tolerance_cells", self.outline_tolerance_cells, 0.0, 2.0)
+        require_number("bridge_gap_m", self.bridge_gap_m, 0.0, 1.0)
+        extents = ("observed", "map", "none")
+        require(self.floor_extent in extents, "floor_extent", self.floor_extent, f"choose one of {extents}.")
+
+
+@dataclass(frozen=True)
+class TraceSettings:
+    """What the ray tracer computes.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Carrier frequency [Hz].
+    max_depth : int
+        Largest number of interactions on a path, 0 (line of sight alone) to 10.
+    diffraction, refraction, diffuse_reflection : bool
+        Further interactions beside line of sight and specular reflection. They are found by shooting rays (Sionna
+        RT's own candidate generator), which is slower than the exact beams that find specular paths.
+    samples_per_tx : int
+        Number of rays shot from the transmitter where rays are shot.
+    seed : int
+        Seed of the rays where rays are shot.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+    """
+
+    frequency_hz: float = CARRIER_FREQUENCY_HZ
+    max_depth: int = 6
+    diffraction: bool = False
+    refraction: bool = False
+    diffuse_reflection: bool = False
+    samples_per_tx: int = 1_000_000
+    seed: int = 42
+
+    def __post_init__(self) -> None:
+        require_number("frequency_hz", self.frequency_hz, 1e6, 1e12)
+        for name, low, high in (("max_depth", 0, 10), ("samples_per_tx", 1, 100_000_000), ("seed", 0, 2**31 - 1)):
+            value = getattr(self, name)
+            require(isinstance(value, Integral) and not isinstance(value, bool), name, value, "give a whole number.")
+            require_number(name, value, low, high)
+        for name in ("diffraction", "refraction", "diffuse_reflection"):
+            value = getattr(self, name)
+            require(isinstance(value, bool), name, value, "give True or False.")
+
+    @property
+    def specular_only(self) -> bool:
+        """Whether only line of sight and specular reflection are traced."""
+        return not (self.diffraction or self.refraction or self.diffuse_reflection)

@@ -1,0 +1,198 @@
+"""The one door to the path solver: scene + transmitter + receivers -> TracedLinks."""
+
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.beams import specular_candidates, trace_beams
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.errors import PositionError
+from sionna_partial.map_files import load_map
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.scene import SceneGeometry, build_scene, write_scene
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.solver import SceneSolver, SolvedPaths, concatenate_paths
+
+Progress = Callable[[float, str], None]
+"""Called with the share of the work done, in [0, 1], and what is being done."""
+
+
+@dataclass(frozen=True)
+class TracedLinks:
+    """Every traced path from one transmitter to N receivers.
+
+    Paths are listed one after the other, ordered by receiver and then by delay; P is their number.
+
+    Parameters
+    ----------
+    tx : (3,) float64 array
+        Transmitter position [m].
+    rx : (N, 3) float64 array
+        Receiver positions [m].
+    link_state : (N,) uint8 array of LinkState
+    gain_db : (N,) float64 array
+        Omnidirectional path gain [dB], at least -150 (paper, eq. 5).
+    path_rx : (P,) int32 array
+        Index of the receiver that each path ends at.
+    a : (P,) complex128 array
+        Complex path gain (isotropic antennas, vertical polarisation).
+    delay_s : (P,) float64 array
+        Propagation delay [s].
+    departure_rad, arrival_rad : (P, 2) float64 arrays
+        Zenith and azimuth of departure at the transmitter and of arrival at the receiver [rad].
+    interactions : (P, D) uint8 array
+        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
+    vertices_m : (P, D, 3) float64 array
+        Places of the interactions [m]; NaN where there is none.
+    settings : TraceSettings
+    scene_settings : SceneSettings
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    link_state: NDArray[np.uint8]
+    gain_db: NDArray[np.float64]
+    path_rx: NDArray[np.int32]
+    a: NDArray[np.complex128]
+    delay_s: NDArray[np.float64]
+    departure_rad: NDArray[np.float64]
+    arrival_rad: NDArray[np.float64]
+    interactions: NDArray[np.uint8]
+    vertices_m: NDArray[np.float64]
+    settings: TraceSettings
+    scene_settings: SceneSettings
+
+
+def trace_links(
+    scene: PartialMap | str | Path,
+    tx: ArrayLike,
+    rx: ArrayLike,
+    *,
+    settings: TraceSettings | None = None,
+    scene_settings: SceneSettings | None = None,
+    progress: Progress | None = None,
+) -> TracedLinks:
+    """Trace every path from one transmitter to N receivers with Sionna RT.
+
+    Line of sight and specular reflections are complete: candidates come from exact beams and are verified by Sionna
+    RT's image method. With diffraction, refraction or diffuse reflection switched on, Sionna RT shoots rays instead,
+    one receiver at a time, which is slow and finds most paths, not all. The answer for a receiver does not depend on
+    the other receivers.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        What is known of the building; unknown space is free (paper, Section III-B).
+    tx : (3,) array-like
+        Transmitter position [m].
+    rx : (N, 3) array-like
+        Receiver positions [m]; N may be 0.
+    settings : TraceSettings, optional
+    scene_settings : SceneSettings, optional
+    progress : callable, optional
+        Called as ``progress(share_done, message)``.
+
+    Returns
+    -------
+    TracedLinks
+
+    Raises
+    ------
+    PositionError
+        For a transmitter or receiver that is not finite, outside the map or inside a wall.
+    SettingsError
+        For a frequency that the material does not cover.
+    BackendError
+        If LLVM or Sionna RT cannot be used.
+    """
+    settings, scene_settings = settings or TraceSettings(), scene_settings or SceneSettings()
+    scene_settings.material.require_frequency(settings.frequency_hz)
+    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    tx_m, rx_m = _positions(partial, tx, rx)
+    report = progress or (lambda share, message: None)
+    report(0.0, "building the scene")
+    geometry = build_scene(partial, scene_settings)
+    shift = np.array([*geometry.origin_m, 0.0])
+    with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
+        xml = write_scene(geometry, Path(folder), offset_m=geometry.origin_m, frequency_hz=settings.frequency_hz)
+        parts = list(_solve_blocks(geometry, xml, settings, tx_m - shift, rx_m - shift, report))
+    paths = concatenate_paths(parts, settings.max_depth)
+    order = np.lexsort((paths.delay_s, paths.path_rx))
+    link_state, gain_db = _link_summary(paths, len(rx_m))
+    return TracedLinks(
+        tx=tx_m,
+        rx=rx_m,
+        link_state=link_state,
+        gain_db=gain_db,
+        path_rx=paths.path_rx[order],
+        a=paths.a[order],
+        delay_s=paths.delay_s[order],
+        departure_rad=paths.departure_rad[order],
+        arrival_rad=paths.arrival_rad[order],
+        interactions=paths.interactions[order],
+        vertices_m=paths.vertices_m[order] + shift,
+        settings=settings,
+        scene_settings=scene_settings,
+    )
+
+
+def _positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Check the positions and give the transmitter as (3,), the receivers as (N, 3)."""
+    tx_m = partial.require_positions("tx", tx)
+    if tx_m.ndim != 1:
+        raise PositionError(f"tx has shape {tx_m.shape}: give one transmitter (3,), and call once for each.")
+    rx_m = np.zeros((0, 3)) if np.size(rx) == 0 else partial.require_positions("rx", rx)
+    if rx_m.ndim != 2:
+        raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
+    return tx_m, rx_m
+
+
+def _solve_blocks(
+    geometry: SceneGeometry,
+    xml: Path,
+    settings: TraceSettings,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    report: Progress,
+) -> Iterator[SolvedPaths]:
+    """Solve the paths in scene coordinates, block by block."""
+    if len(rx_m) == 0:
+        return
+    report(0.02, "starting Sionna RT")
+    solver = SceneSolver(xml, settings, tx_m, rx_m)
+    if not settings.specular_only:
+        for done, paths in enumerate(solver.shoot()):
+            yield paths
+            report(0.1 + 0.9 * (done + 1) / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
+        return
+    walls_m = geometry.vertices_m[geometry.segments]
+    report(0.05, f"tracing beams among {len(walls_m)} walls")
+    beams = trace_beams(walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
+    blocks = specular_candidates(
+        beams,
+        walls_m,
+        tx_m,
+        rx_m,
+        height_m=geometry.height_m,
+        horizontal=len(geometry.floor_m) > 0,
+        max_depth=settings.max_depth,
+    )
+    for candidates, share_done in blocks:
+        yield solver.verify(candidates)
+        report(0.1 + 0.9 * share_done, "verifying paths")
+
+
+def _link_summary(paths: SolvedPaths, count: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Link state (count,) and omnidirectional path gain (count,) [dB] of all receivers (paper, eq. 5)."""
+    power = np.abs(paths.a) ** 2
+    total = np.bincount(paths.path_rx, weights=power, minlength=count)
+    with np.errstate(divide="ignore"):
+        gain_db = np.maximum(10.0 * np.log10(total), GAIN_FLOOR_DB)
+    link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
+    direct = (paths.interactions == 0).all(axis=1)
+    link_state[paths.path_rx[direct]] = LinkState.LOS
+    return link_state, gain_db

@@ -1,0 +1,173 @@
+"""PartialMap -> the wall cells that outlines run through: holes filled, ragged faces smoothed, short gaps closed."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sionna_partial.constants import CellState
+from sionna_partial.partial_map import PartialMap
+
+MAX_GAP_CELLS = 2
+"""Longest gap in a wall that is closed [cells]."""
+
+MAX_FREE_GAP_M = 0.11
+"""Longest gap of FREE cells that is closed [m]: nobody passes there; log-odds mapping erases single wall cells."""
+
+MIN_RUN_CELLS = 3
+"""How far a wall must go on, on both sides of a gap, for the gap to be one in a seen wall [cells]."""
+
+PINHOLE_CELLS = 6
+"""Largest hole in a wall that is filled [cells]."""
+
+_SQUARE = np.ones((3, 3), dtype=bool)
+_POST_CELLS = 3
+
+
+@dataclass(frozen=True)
+class CleanWalls:
+    """Wall cells that bear outlines.
+
+    Parameters
+    ----------
+    cells : (ny, nx) bool array
+    peeled : (ny, nx) bool array
+        Cells that face FREE ones and were taken off walls two cells thick: the outline lies between both layers.
+    """
+
+    cells: NDArray[np.bool_]
+    peeled: NDArray[np.bool_]
+
+
+def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
+    """Clean the wall cells of a map.
+
+    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length on walls of two or
+    more cells are levelled; gaps of at most two cells in straight walls are closed (gaps of FREE cells up to
+    `MAX_FREE_GAP_M`); walls two cells thick are thinned to the cells that face FREE ones. Thin walls, posts and
+    specks stay.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    bridge_gap_m : float
+        Longest gap that is closed [m].
+
+    Returns
+    -------
+    CleanWalls
+    """
+    wall = _fill_pinholes(partial.state == CellState.WALL)
+    free = partial.state == CellState.FREE
+    for _ in range(2):
+        for view in _orientations(wall):
+            _fill_notches(view)
+        for view in _orientations(wall):
+            _shave_bumps(view)
+    for cells, is_free in ((wall, free), (wall.T, free.T)):
+        _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
+    return _thin(wall, free)
+
+
+def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
+    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(step == 1)
+    return row, start, np.nonzero(step == -1)[1]
+
+
+def _orientations(mask: NDArray[np.bool_]) -> Iterator[NDArray[np.bool_]]:
+    """Views of a mask with each of its four sides at row 0."""
+    yield from (mask, mask[::-1], mask.T, mask.T[::-1])
+
+
+def _fill_pinholes(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    label, count = ndimage.label(np.pad(~wall, 1, constant_values=True))
+    size = np.bincount(label.ravel(), minlength=count + 1)
+    size[[0, label[0, 0]]] = PINHOLE_CELLS + 1
+    return wall | (size <= PINHOLE_CELLS)[label[1:-1, 1:-1]]
+
+
+def _fill_notches(wall: NDArray[np.bool_]) -> None:
+    """Fill, in place, notches of one or two cells in faces that look towards larger rows."""
+    row, start, end = row_runs(~wall)
+    keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 2)
+    for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
+        if wall[i - 2 : i, a - 1 : b + 1].all():
+            wall[i, a:b] = True
+
+
+def _shave_bumps(wall: NDArray[np.bool_]) -> None:
+    """Remove, in place, bumps of one or two cells from faces that look towards larger rows."""
+    row, start, end = row_runs(wall)
+    keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 2)
+    for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
+        if wall[i - 2 : i, a - 1 : b + 1].all() and not wall[i + 1 : i + 2, a - 1 : b + 1].any():
+            wall[i, a:b] = False
+
+
+def _close_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], resolution_m: float, bridge_gap_m: float) -> None:
+    """Close, in place, short horizontal gaps between walls that are longer than they are thick."""
+    row, start, end = row_runs(wall)
+    gap = np.where(row[1:] == row[:-1], start[1:] - end[:-1], 0)
+    longest = min(MAX_GAP_CELLS, int(bridge_gap_m / resolution_m + 1e-6))
+    run = np.minimum(end - start, wall.shape[1])
+    beside = np.minimum(run[1:], run[:-1])
+    index = np.nonzero((gap > 0) & (gap <= longest) & (beside >= MIN_RUN_CELLS))[0]
+    seen = np.array([free[row[k], end[k] : start[k + 1]].any() for k in index], dtype=bool)
+    index = index[~(seen & (gap[index] * resolution_m > MAX_FREE_GAP_M))]
+    filled = np.zeros_like(wall)
+    for k in index:
+        filled[row[k], end[k] : start[k + 1]] = True
+    label, _ = ndimage.label(filled)
+    thickness = [0] + [rows.stop - rows.start for rows, _ in ndimage.find_objects(label)]
+    for k in index:
+        if beside[k] >= thickness[label[row[k], end[k]]]:
+            wall[row[k], end[k] : start[k + 1]] = True
+
+
+def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> CleanWalls:
+    """Thin walls of two cells to one, keeping the cells that face FREE ones where only one side does."""
+    label, _ = ndimage.label(wall, structure=_SQUARE)
+    small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
+    kept = _thick(wall) | np.array(small, dtype=bool)[label]
+    facing = ndimage.binary_dilation(free, structure=_SQUARE)
+    thinned = np.pad(wall, 1)
+    for removable in (np.pad(~kept & ~facing, 1), np.pad(~kept, 1)):
+        for dy, dx in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            side = ~np.roll(thinned, (-dy, -dx), (0, 1))
+            _peel(thinned, removable & side & _in_block(thinned))
+    return CleanWalls(thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing)
+
+
+def _thick(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells of walls of three cells or more, also where a tilted one holds no square of three by three."""
+    squares = ndimage.binary_opening(wall, structure=_SQUARE)
+    crosses = ndimage.binary_opening(wall, structure=ndimage.generate_binary_structure(2, 1))
+    label, count = ndimage.label(crosses, structure=_SQUARE)
+    solid = np.zeros(count + 1, dtype=bool)
+    solid[label[squares]] = True
+    solid[0] = False
+    return squares | solid[label]
+
+
+def _in_block(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells that belong to a full block of two by two wall cells."""
+    return ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
+
+
+def _peel(wall: NDArray[np.bool_], candidates: NDArray[np.bool_]) -> None:
+    """Remove, in place, the candidates whose removal neither parts the wall nor opens it nor shortens it."""
+    rows, columns = np.nonzero(candidates)
+    for parity in range(4):
+        mine = (rows % 2 * 2 + columns % 2) == parity
+        row, column = rows[mine], columns[mine]
+        ring = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
+        around = np.stack([wall[row + dy, column + dx] for dy, dx in ring])
+        empty = ~around
+        corners = [empty[k] & ~(empty[k] & empty[k + 1] & empty[(k + 2) % 8]) for k in (0, 2, 4, 6)]
+        simple = np.sum(corners, axis=0) == 1
+        gone = simple & (around.sum(axis=0) >= 2)
+        wall[row[gone], column[gone]] = False

@@ -1,0 +1,93 @@
+"""Wall cells -> a graph of lattice edges through the centres of the boundary cells."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.wall_bridges import find_bridges
+from sionna_partial.wall_chains import WallGraph
+
+_KEY = 1 << 32
+
+
+def wall_graph(partial: PartialMap, wall: NDArray[np.bool_], bridge_gap_m: float) -> WallGraph:
+    """Connect the centres of boundary wall cells.
+
+    Edges join wall cells that touch by a side, unless both blocks of two by two cells beside the edge are full, and
+    by a corner where a block holds just these two. Short gaps between facing wall ends are bridged, and spurs of one
+    cell are cut off. Single cells become squares.
+
+    Parameters
+    ----------
+    partial : PartialMap
+        The map, for its FREE and UNKNOWN cells.
+    wall : (ny, nx) bool array
+        Cleaned wall cells.
+    bridge_gap_m : float
+        Longest gap that is bridged [m].
+
+    Returns
+    -------
+    WallGraph
+    """
+    posts = _lone_cells(wall)
+    graph = _cut_spurs(_index(_lattice_edges(wall), posts))
+    bridges = find_bridges(graph, partial, bridge_gap_m)
+    ends = graph.points[np.concatenate([graph.edges, bridges])]
+    lone = posts[~np.isin(_key(posts), _key(ends))]
+    return _index(np.concatenate([ends, _squares(lone)]), np.zeros((0, 2), dtype=np.int64))
+
+
+def _lattice_edges(wall: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Edges (E, 2, 2) of the outline, from x, y to x, y in half cells."""
+    w = np.pad(wall, 1)
+    block = w[:-1, :-1] & w[:-1, 1:] & w[1:, :-1] & w[1:, 1:]
+    across = w[:, :-1] & w[:, 1:]
+    across[1:-1] &= ~(block[:-1] & block[1:])
+    upright = w[:-1] & w[1:]
+    upright[:, 1:-1] &= ~(block[:, :-1] & block[:, 1:])
+    rising = w[:-1, :-1] & w[1:, 1:] & ~w[:-1, 1:] & ~w[1:, :-1]
+    falling = ~w[:-1, :-1] & ~w[1:, 1:] & w[:-1, 1:] & w[1:, :-1]
+    kinds = ((across, 0, 0, 1, 0), (upright, 0, 0, 0, 1), (rising, 0, 0, 1, 1), (falling, 1, 0, 0, 1))
+    parts = []
+    for mask, x0, y0, x1, y1 in kinds:
+        row, column = np.nonzero(mask)
+        parts.append(np.stack([column + x0, row + y0, column + x1, row + y1], 1).reshape(-1, 2, 2))
+    return 2 * np.concatenate(parts).astype(np.int64) - 1
+
+
+def _lone_cells(wall: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Centres (n, 2) [half cells] of wall cells that touch no other."""
+    around = ndimage.convolve(wall.astype(np.uint8), np.ones((3, 3), dtype=np.uint8), mode="constant")
+    row, column = np.nonzero(wall & (around == 1))
+    return 2 * np.stack([column, row], 1).astype(np.int64) + 1
+
+
+def _squares(centres: NDArray[np.int64]) -> NDArray[np.int64]:
+    corners = centres[:, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return np.stack([corners, np.roll(corners, -1, axis=1)], 2).reshape(-1, 2, 2)
+
+
+def _key(points: NDArray[np.int64]) -> NDArray[np.int64]:
+    return points[..., 1] * _KEY + points[..., 0]
+
+
+def _index(ends: NDArray[np.int64], more: NDArray[np.int64]) -> WallGraph:
+    """Graph of edges given by their ends (E, 2, 2), and of points without edges."""
+    key = _key(np.concatenate([ends.reshape(-1, 2), more]))
+    unique, inverse = np.unique(key, return_inverse=True)
+    edges = np.sort(inverse[: 2 * len(ends)].reshape(-1, 2), axis=1)
+    edges = np.unique(edges, axis=0) if len(edges) else edges
+    return WallGraph(np.stack([unique % _KEY, unique // _KEY], 1), edges.astype(np.int64))
+
+
+def _cut_spurs(graph: WallGraph) -> WallGraph:
+    """Remove edges that stick out of a junction, unless nothing else is there."""
+    degree = graph.degree
+    ends = degree[graph.edges]
+    spur = (ends.min(axis=1) == 1) & (ends.max(axis=1) >= 3)
+    junction = np.where(ends[:, 0] > ends[:, 1], graph.edges[:, 0], graph.edges[:, 1])
+    spurs = np.bincount(junction[spur], minlength=len(degree))
+    spur &= spurs[junction] < degree[junction]
+    return _index(graph.points[graph.edges[~spur]], graph.points[degree == 0])

@@ -1,0 +1,220 @@
+"""Output is written whole or not at all."""
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from sionna_partial.errors import MapError, OutputError
+from sionna_partial.files import atomic_folder, atomic_path, atomic_write
+
+
+def tree(folder: Path) -> dict[str, bytes | None]:
+    """Every entry below a folder, hidden ones too: content of files, None for folders."""
+    return {
+        str(entry.relative_to(folder)): entry.read_bytes() if entry.is_file() else None for entry in folder.rglob("*")
+    }
+
+
+def test_write_bytes_and_text(tmp_path: Path) -> None:
+    with atomic_write(tmp_path / "a.bin") as stream:
+        stream.write(b"\x00\xff")
+        assert not (tmp_path / "a.bin").exists()
+    with atomic_write(tmp_path / "a.txt", "w") as stream:
+        stream.write("20 °C\r\n")
+    assert tree(tmp_path) == {"a.bin": b"\x00\xff", "a.txt": "20 °C\r\n".encode()}
+
+
+def test_write_makes_parents_and_replaces(tmp_path: Path) -> None:
+    for content in (b"first", b"second"):
+        with atomic_write(tmp_path / "new" / "deep" / "a.bin") as stream:
+            stream.write(content)
+    assert tree(tmp_path) == {"new": None, "new/deep": None, "new/deep/a.bin": b"second"}
+
+
+def test_files_have_the_usual_permissions(tmp_path: Path) -> None:
+    (tmp_path / "usual").touch()
+    with atomic_write(tmp_path / "atomic"):
+        pass
+    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "usual").stat().st_mode
+
+
+def test_path_keeps_the_name_and_drops_side_files(tmp_path: Path) -> None:
+    with atomic_path(tmp_path / "map.tif") as temporary:
+        assert temporary.name == "map.tif"
+        assert temporary.parent.parent == tmp_path
+        temporary.write_bytes(b"picture")
+        temporary.with_suffix(".tif.aux.xml").write_bytes(b"side file")
+    assert tree(tmp_path) == {"map.tif": b"picture"}
+
+
+@pytest.mark.parametrize("failure", [MapError("no map"), KeyboardInterrupt()])
+def test_failure_of_the_caller_leaves_nothing_and_passes_through(tmp_path: Path, failure: BaseException) -> None:
+    (tmp_path / "a.bin").write_bytes(b"old")
+    for target in ("a.bin", "new/deep/b.bin"):
+        with pytest.raises(type(failure)), atomic_write(tmp_path / target) as stream:  # noqa: PT012
+            stream.write(b"half")
+            raise failure
+    assert tree(tmp_path) == {"a.bin": b"old"}
+
+
+def test_full_device(tmp_path: Path) -> None:
+    """A write to /dev/full fails as one to a full disk does."""
+    message = r"path = '.*out/a\.nc' could not be written \(No space left on device\): the disk is full"
+    with (  # noqa: PT012
+        pytest.raises(OutputError, match=message),
+        atomic_path(tmp_path / "out" / "a.nc") as temporary,
+    ):
+        temporary.symlink_to("/dev/full")
+        temporary.write_bytes(b"some")
+    assert tree(tmp_path) == {}
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [
+        (errno.ENOSPC, "the disk is full; free some space or choose another disk."),
+        (errno.EDQUOT, "your quota is used up; free some space or choose another disk."),
+        (errno.EACCES, "choose a folder that you may write to, or change its permissions."),
+        (errno.EPERM, "choose a folder that you may write to, or change its permissions."),
+        (errno.EROFS, "this disk is read-only; choose a folder on another one."),
+        (errno.EIO, "check the path and the disk."),
+    ],
+)
+@pytest.mark.parametrize("call", ["replace", "fsync"])
+def test_failing_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, number: int, remedy: str) -> None:
+    (tmp_path / "a.bin").write_bytes(b"old")
+
+    def fail(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, call, fail)
+    with pytest.raises(OutputError) as caught, atomic_write(tmp_path / "a.bin") as stream:
+        stream.write(b"new")
+    path = tmp_path / "a.bin"
+    assert str(caught.value) == f"path = '{path}' could not be written ({os.strerror(number)}): {remedy}"
+    assert tree(tmp_path) == {"a.bin": b"old"}
+
+
+def test_error_without_number(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"\(odd library\): check the path"), atomic_path(tmp_path / "a"):
+        raise OSError("odd library")
+
+
+@pytest.mark.parametrize("opened", [atomic_write, atomic_path, atomic_folder])
+def test_file_in_the_way(tmp_path: Path, opened: object) -> None:
+    (tmp_path / "file").write_bytes(b"old")
+    target = tmp_path / "file" / "below" / "a.bin"
+    with pytest.raises(OutputError, match="a part of the path is a file; choose another folder"), opened(target):  # type: ignore[operator]
+        pytest.fail("must not be entered")
+    assert tree(tmp_path) == {"file": b"old"}
+
+
+def test_folder_in_the_way(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="this path is a folder; give the name of a file"), atomic_write(tmp_path):
+        pytest.fail("must not be entered")
+
+
+def test_name_too_long(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="choose a shorter name"), atomic_write(tmp_path / ("a" * 300)):
+        pytest.fail("must not be entered")
+    with pytest.raises(OutputError, match="choose a shorter name"), atomic_write(tmp_path / ("a" * 300) / "b"):
+        pytest.fail("must not be entered")
+    assert tree(tmp_path) == {}
+
+
+def test_no_file_written(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="No such file"), atomic_path(tmp_path / "a"):
+        pass
+
+
+SCENE = {"map.yaml": b"map", "scene.xml": b"scene", "meshes/walls.ply": b"walls"}
+
+
+def write_scene(folder: Path, mark: bytes, names: tuple[str, ...] = tuple(SCENE)) -> None:
+    for name in names:
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(mark + SCENE[name])
+
+
+def scene_tree(mark: bytes) -> dict[str, bytes | None]:
+    return {"meshes": None, **{name: mark + content for name, content in SCENE.items()}}
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_folder_appears_whole(tmp_path: Path, existing: bool) -> None:
+    target = tmp_path / "deep" / "scene"
+    if existing:
+        target.mkdir(parents=True)
+    with atomic_folder(target) as folder:
+        write_scene(folder, b"new ")
+        assert not (target / "scene.xml").exists()
+    assert tree(target) == scene_tree(b"new ")
+    assert [entry.name for entry in (tmp_path / "deep").iterdir()] == ["scene"]
+
+
+def test_exported_scene_is_replaced_and_other_files_stay(tmp_path: Path) -> None:
+    write_scene(tmp_path, b"old ")
+    (tmp_path / "meshes" / "stale.ply").write_bytes(b"stale")
+    (tmp_path / "coverage.nc").write_bytes(b"precious")
+    with atomic_folder(tmp_path) as folder:
+        write_scene(folder, b"new ")
+    assert tree(tmp_path) == {**scene_tree(b"new "), "coverage.nc": b"precious"}
+
+
+@pytest.mark.parametrize("names", [("scene.xml",), ("map.yaml",), ("meshes/walls.ply",)])
+def test_other_folders_are_refused(tmp_path: Path, names: tuple[str, ...]) -> None:
+    write_scene(tmp_path, b"mine ", names)
+    before = tree(tmp_path)
+    with (
+        pytest.raises(
+            OutputError, match=r"other content than an exported scene \(scene.xml and map.yaml\): choose a new"
+        ),
+        atomic_folder(tmp_path),
+    ):
+        pytest.fail("must not be entered")
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("dangling", [False, True])
+def test_file_is_no_folder(tmp_path: Path, dangling: bool) -> None:
+    target = tmp_path / "a"
+    if dangling:
+        target.symlink_to("nowhere")
+    else:
+        target.write_bytes(b"old")
+    with pytest.raises(OutputError, match="is a file: choose a new or an empty folder"), atomic_folder(target):
+        pytest.fail("must not be entered")
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_failed_scene_leaves_what_was(tmp_path: Path, existing: bool) -> None:
+    target = tmp_path / "scene"
+    if existing:
+        write_scene(target, b"old ")
+    before = tree(tmp_path)
+    with pytest.raises(OutputError, match="No space left"), atomic_folder(target) as folder:  # noqa: PT012
+        write_scene(folder, b"new ", ("scene.xml",))
+        Path("/dev/full").write_bytes(b"some")
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("failing", range(6))
+def test_failed_swap_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
+    """Whichever of the six moves fails, the old scene is back."""
+    write_scene(tmp_path, b"old ")
+    moves, move = [], os.replace
+
+    def replace(source: Path, target: Path) -> None:
+        moves.append(source)
+        if len(moves) == failing + 1:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        move(source, target)
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(OutputError, match="Input/output error"), atomic_folder(tmp_path) as folder:
+        write_scene(folder, b"new ")
+    assert len(moves) == 1 + 2 * failing
+    assert tree(tmp_path) == scene_tree(b"old ")

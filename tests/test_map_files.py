@@ -1,0 +1,386 @@
+"""Maps from and to files, arrays, simulators and SLAM."""
+
+import io
+import re
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from sionna_partial import map_files
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError, OutputError
+from sionna_partial.map_files import (
+    load_map,
+    map_from_array,
+    map_from_habitat,
+    map_from_occupancy,
+    map_from_slam,
+    save_map,
+)
+from sionna_partial.partial_map import PartialMap
+
+SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
+FREE, WALL, UNKNOWN = (int(state) for state in CellState)
+
+states = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 2))
+partials = st.builds(
+    PartialMap,
+    states,
+    st.floats(1e-3, 10.0),
+    st.tuples(st.floats(-1e8, 1e8), st.floats(-1e8, 1e8)),
+    st.floats(0.1, 100.0),
+    st.none() | st.integers(0, 10**9),
+)
+SMALL = PartialMap(np.array([[0, 1], [2, 0]]), 0.05, (1.5, -2.0), 2.5, 3)
+
+
+# --- files ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("suffix", [".yaml", ".yml", ".YAML", ".npz", ".NPZ"])
+@given(partial=partials)
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, suffix: str, partial: PartialMap) -> None:
+    folder = tmp_path_factory.mktemp("map")
+    save_map(partial, folder / f"home{suffix}")
+    read = load_map(folder / f"home{suffix}")
+    assert read == partial
+    assert len(list(folder.iterdir())) == (1 if "NPZ" in suffix.upper() else 2)
+
+
+def test_paths_may_be_texts(tmp_path: Path) -> None:
+    save_map(SMALL, f"{tmp_path}/home.npz")
+    assert load_map(f"{tmp_path}/home.npz") == SMALL
+
+
+def test_npz_wall_height_can_be_given(tmp_path: Path) -> None:
+    save_map(SMALL, tmp_path / "home.npz")
+    assert load_map(tmp_path / "home.npz", wall_height_m=4.0).wall_height_m == 4.0
+
+
+def test_other_suffix_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match=r"home.pgm' has the suffix '.pgm': choose .yaml, .yml or .npz"):
+        save_map(SMALL, tmp_path / "home.pgm")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
+def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OutputError, match=r"No space left on device\): the disk is full"):
+        save_map(SMALL, tmp_path / "new" / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+def export(folder: Path, image: str = "map.pgm") -> Path:
+    """Write what load_map needs of an exported scene."""
+    save_map(SMALL, folder / "map.yaml", extra={"scene_offset": [1.0, 2.0]})
+    (folder / "scene.xml").write_text("<scene/>")
+    sheet = yaml.safe_load((folder / "map.yaml").read_text())
+    (folder / "map.yaml").write_text(yaml.safe_dump({**sheet, "image": image}))
+    return folder
+
+
+def test_scene_folder(tmp_path: Path) -> None:
+    folder = export(tmp_path / "scene")
+    assert load_map(folder) == load_map(folder / "scene.xml") == load_map(folder / "map.yaml") == SMALL
+    assert load_map(folder, wall_height_m=4.0).wall_height_m == 4.0
+
+
+@pytest.mark.parametrize("outside", ["../map.pgm", "/etc/map.pgm", "meshes/../../map.pgm"])
+def test_scene_folder_reads_nothing_outside(tmp_path: Path, outside: str) -> None:
+    folder = export(tmp_path / "scene", outside)
+    with pytest.raises(MapError, match=f"image = '{outside}' is not allowed: the image of an exported scene lies in"):
+        load_map(folder)
+
+
+@pytest.mark.parametrize("name", ["map.yaml", "scene.xml"])
+def test_folder_without_scene(tmp_path: Path, name: str) -> None:
+    (export(tmp_path) / name).unlink()
+    with pytest.raises(MapError, match=rf"is no exported scene: there is no {name} in '.*'; give a ROS map YAML"):
+        load_map(tmp_path)
+
+
+def test_foreign_xml(tmp_path: Path) -> None:
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    with pytest.raises(MapError, match="is no exported scene"):
+        load_map(tmp_path / "scene.xml")
+
+
+@pytest.mark.parametrize("name", ["gone.yaml", "gone.npz", "gone", "gone.xml", "a" * 300, "a\0b", ""])
+def test_no_such_file(tmp_path: Path, name: str) -> None:
+    path = f"{tmp_path}/sub/{name}"
+    with pytest.raises(MapError, match=r"is not there: give a ROS map YAML \(.yaml, .yml\), a map written by save_map"):
+        load_map(path)
+
+
+@pytest.mark.parametrize("name", ["map.pgm", "map.png", "map.bmp"])
+def test_bare_image(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"P5\n1 1\n255\n\x00")
+    with pytest.raises(MapError, match=r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"):
+        load_map(tmp_path / name)
+
+
+def test_unknown_kind(tmp_path: Path) -> None:
+    (tmp_path / "map.ply").write_bytes(b"ply")
+    with pytest.raises(MapError, match=r"map\.ply' is of no known kind: give a ROS map YAML"):
+        load_map(tmp_path / "map.ply")
+
+
+@pytest.mark.parametrize("path", [None, 3, SMALL, ["map.yaml"]])
+def test_not_a_path(path: object) -> None:
+    with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
+        load_map(path)  # type: ignore[arg-type]
+
+
+# --- damaged npz ------------------------------------------------------------------------------------------------------
+
+
+def npz_bytes(**arrays: object) -> bytes:
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+WHOLE = {"state": SMALL.state, "resolution_m": 0.05, "origin_m": (0.0, 0.0), "wall_height_m": 3.0}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"rubbish" * 100,
+        npz_bytes(**WHOLE)[:200],
+        npz_bytes(**WHOLE)[:-30],
+        npz_bytes(state=SMALL.state),
+        npz_bytes(**{key: value for key, value in WHOLE.items() if key != "state"}),
+        npz_bytes(**{**WHOLE, "resolution_m": [0.1, 0.2]}),
+        npz_bytes(**{**WHOLE, "state": np.array([[None]])}),
+        npz_bytes(**WHOLE, interior_cells="many"),
+    ],
+)
+def test_damaged_npz(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "home.npz"
+    path.write_bytes(content)
+    with pytest.raises(
+        MapError, match=rf"path = '{re.escape(str(path))}' is damaged or was not written by save_map \(.*save"
+    ):
+        load_map(path)
+
+
+def test_every_truncation_of_an_npz(tmp_path: Path) -> None:
+    content = npz_bytes(**WHOLE)
+    for size in range(0, len(content), 37):
+        (tmp_path / "home.npz").write_bytes(content[:size])
+        with pytest.raises(MapError, match="is damaged"):
+            load_map(tmp_path / "home.npz")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"resolution_m": 50.0}, "resolution_m = 50.0 is not allowed"),
+        ({"origin_m": (np.nan, 0.0)}, "origin_m = nan is not allowed"),
+        ({"origin_m": (0.0, 0.0, 0.0)}, "origin_m = "),
+        ({"wall_height_m": -1.0}, "wall_height_m = -1.0 is not allowed"),
+        ({"state": np.array([[7]])}, "values 7 to 7"),
+    ],
+)
+def test_npz_out_of_range(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    (tmp_path / "home.npz").write_bytes(npz_bytes(**{**WHOLE, **changes}))
+    with pytest.raises(MapError, match=re.escape(message)):
+        load_map(tmp_path / "home.npz")
+
+
+def test_npz_bomb_is_not_unpacked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_files, "MAX_CELLS", 5000)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("must not be unpacked"))
+    (tmp_path / "home.npz").write_bytes(npz_bytes(**{**WHOLE, "state": np.zeros((100, 100), np.uint8)}))
+    with pytest.raises(MapError, match="holds more than 5,000 cells: cut the map or coarsen it"):
+        load_map(tmp_path / "home.npz")
+
+
+def test_npz_with_a_lying_header(tmp_path: Path) -> None:
+    """A header of 10^12 cells over a few bytes ends in an error, not in the memory."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "|u1", "fortran_order": False, "shape": (10**6, 10**6)})
+    whole, lying = io.BytesIO(npz_bytes(**WHOLE)), tmp_path / "home.npz"
+    with zipfile.ZipFile(whole) as source, zipfile.ZipFile(lying, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, header.getvalue() if name == "state.npy" else source.read(name))
+    with pytest.raises(MapError, match="is damaged"):
+        load_map(lying)
+
+
+# --- arrays -----------------------------------------------------------------------------------------------------------
+
+
+def test_array_row_0_is_the_smallest_y() -> None:
+    partial = map_from_array([[0, 1], [2, 2]], 0.5, origin_m=(10.0, 20.0), wall_height_m=2.5)
+    assert partial == PartialMap(np.array([[0, 1], [2, 2]]), 0.5, (10.0, 20.0), 2.5)
+    assert partial.state_at(np.array([10.6, 20.1])) == WALL
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        ([[0.0, 1.0]], "array has dtype float64: give integers"),
+        ([[np.nan]], "array has dtype float64: give integers"),
+        ([["wall"]], "array has dtype <U4: give integers"),
+        ([[None]], "array has dtype object: give integers"),
+        ([[1 + 2j]], "array has dtype complex128: give integers"),
+        ([[0, 1], [0]], "array is not a rectangular array: give a two-dimensional array (ny, nx)"),
+        ([0, 1], "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
+        (np.zeros((2, 2, 3), int), "array has shape (2, 2, 3): give a two-dimensional array"),
+        (np.zeros((0, 2), int), "array has shape (0, 2): give a two-dimensional array"),
+        (3, "array has shape (): give a two-dimensional array"),
+        ([[0, 3]], "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ([[-1, 0]], "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+    ],
+)
+def test_wrong_array(array: object, message: str) -> None:
+    with pytest.raises(MapError, match=re.escape(message)):
+        map_from_array(array, 0.05)  # type: ignore[arg-type]
+
+
+def test_occupancy_grid() -> None:
+    data = [[-1, 0, 25], [26, 64, 65], [100, 50, 255]]
+    partial = map_from_occupancy(data, 0.1, origin_m=(1.0, 2.0))
+    assert partial.state.tolist() == [[2, 0, 0], [2, 2, 1], [1, 2, 2]]
+    assert partial.origin_m == (1.0, 2.0)
+    tight = map_from_occupancy(np.array(data, np.int16), 0.1, occupied_percent=50, free_percent=0)
+    assert tight.state.tolist() == [[2, 0, 2], [2, 1, 1], [1, 1, 2]]
+    flat = np.array([-1, 0, 100], dtype=np.int8)
+    assert map_from_occupancy(flat.reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
+    assert map_from_occupancy(flat.view(np.uint8).reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        ([[0, 101]], {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
+        ([[-2]], {}, "data holds -2: give -1 for unknown"),
+        ([[0.5]], {}, "data has dtype float64: give integers"),
+        ([0, 100], {}, "data has shape (2,): give a two-dimensional array"),
+        ([[0]], {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
+        ([[0]], {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
+        ([[0]], {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
+    ],
+)
+def test_wrong_occupancy(data: object, options: dict[str, float], message: str) -> None:
+    with pytest.raises(MapError, match=re.escape(message)):
+        map_from_occupancy(data, 0.05, **options)  # type: ignore[arg-type]
+
+
+# --- Habitat ----------------------------------------------------------------------------------------------------------
+
+
+def test_habitat_with_border() -> None:
+    """Row 0 is the largest y; revealed border is wall; nothing else that is hidden is known."""
+    top_down = [[0, 2, 2, 2], [0, 2, 1, 1], [0, 0, 2, 2]]
+    seen = [[0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 1, 0]]
+    partial = map_from_habitat(top_down, seen, 0.1, origin_m=(-1.0, 4.0))
+    assert np.flipud(partial.state).tolist() == [[2, 1, 1, 2], [2, 1, 0, 2], [2, 2, 1, 2]]
+    assert partial.origin_m == (-1.0, 4.0)
+
+
+def test_habitat_without_border() -> None:
+    """Habitat reveals no cell that is not navigable: those beside a revealed navigable one ended the view."""
+    top_down = np.array([[0, 0, 0, 0], [0, 1, 1, 1], [0, 0, 0, 1]])
+    seen = np.array([[0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 0]], bool)
+    state = np.flipud(map_from_habitat(top_down, seen, 0.1).state)
+    assert state.tolist() == [[2, 1, 1, 2], [1, 0, 0, 2], [2, 1, 1, 2]]
+
+
+def test_habitat_drawings() -> None:
+    """Start 4, path 7, view point 8 and trajectory 10+ are navigable; a target 6 or box 9 may cover anything."""
+    top_down = np.array([[4, 6, 7, 8, 9, 10, 120, 255, 3, 5]], dtype=np.uint8)
+    state = map_from_habitat(top_down, np.ones_like(top_down), 0.1).state
+    assert state.tolist() == [[0, 2, 0, 0, 2, 0, 0, 0, 0, 0]]
+
+
+@given(arrays(np.uint8, (6, 7), elements=st.integers(0, 2)), arrays(bool, (6, 7)))
+def test_habitat_zero_is_never_free_and_hidden_never_free(top_down: np.ndarray, seen: np.ndarray) -> None:
+    state = np.flipud(map_from_habitat(top_down, seen, 0.1).state)
+    assert ((state == FREE) == (seen & (top_down == 1))).all()
+    assert (state[~seen & (top_down != 0)] == UNKNOWN).all()
+
+
+@pytest.mark.parametrize(
+    ("top_down", "seen", "message"),
+    [
+        ([[0, 1]], [[1]], "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
+        ([[0.0]], [[1]], "top_down has dtype float64: give integers"),
+        ([[True]], [[1]], "top_down has dtype bool: give integers"),
+        ([[1]], [[0.5]], "fog_of_war has dtype float64: give integers"),
+        ([[1, -1]], [[1, 1]], "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
+        ([[1, 256]], [[1, 1]], "top_down holds values 1 to 256: give Habitat's map, 0 to 255"),
+    ],
+)
+def test_wrong_habitat(top_down: object, seen: object, message: str) -> None:
+    with pytest.raises(MapError, match=re.escape(message)):
+        map_from_habitat(top_down, seen, 0.05)  # type: ignore[arg-type]
+
+
+# --- Active Neural SLAM -----------------------------------------------------------------------------------------------
+
+
+def test_slam_channels() -> None:
+    """An obstacle that was not explored is unknown; row 0 is the smallest y."""
+    obstacle, explored = [[0.0, 0.9, 0.9], [0.5, 0.49, 0.0]], [[1.0, 1.0, 0.2], [0.5, 0.6, 0.49]]
+    partial = map_from_slam(obstacle, explored, 0.05, origin_m=(-1.0, -2.0), wall_height_m=2.0)
+    assert partial == PartialMap(np.array([[0, 1, 2], [1, 0, 2]]), 0.05, (-1.0, -2.0), 2.0)
+    assert map_from_slam(obstacle, explored, 0.05, threshold=0.95).state.tolist() == [[0, 0, 2], [2, 2, 2]]
+    booleans = map_from_slam([[True, True, False]], [[True, False, True]], 0.05)
+    assert booleans.state.tolist() == [[WALL, UNKNOWN, FREE]]
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "explored", "options", "message"),
+    [
+        ([[0, 1]], [[1]], {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
+        ([[np.nan]], [[1]], {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or booleans"),
+        ([[0]], [[255]], {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
+        ([["a"]], [[1]], {}, "obstacle has dtype <U1: give numbers"),
+        ([[0]], [[1]], {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
+        ([[0]], [[1]], {"threshold": np.nan}, "threshold = nan is not allowed"),
+    ],
+)
+def test_wrong_slam(obstacle: object, explored: object, options: dict[str, float], message: str) -> None:
+    with pytest.raises(MapError, match=re.escape(message)):
+        map_from_slam(obstacle, explored, 0.05, **options)  # type: ignore[arg-type]
+
+
+# --- real maps --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="the Gibson plans are not here")
+def test_every_gibson_plan_loads(tmp_path: Path) -> None:
+    sheets = sorted((SHARED / "gibson").glob("*/map.yaml"))
+    assert len(sheets) == 20
+    for sheet in sheets:
+        partial = load_map(sheet)
+        assert partial.shape == (480, 480)
+        assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
+        assert partial.is_complete == (sheet.parent.name != "Kerrtown")
+        save_map(partial, tmp_path / "copy.yaml")
+        assert load_map(tmp_path / "copy.yaml") == partial
+        assert (tmp_path / "copy.pgm").read_bytes()[-partial.state.size :] == (sheet.parent / "map.pgm").read_bytes()[
+            -partial.state.size :
+        ]
+
+
+@pytest.mark.skipif(not (SHARED / "ros").is_dir(), reason="the ROS maps are not here")
+def test_every_ros_map_loads() -> None:
+    for sheet in (SHARED / "ros").glob("*.yaml"):
+        partial = load_map(sheet)
+        assert partial == load_map(sheet, strict=True)
+        assert {FREE, WALL, UNKNOWN} == set(np.unique(partial.state).tolist())

@@ -1,0 +1,289 @@
+"""PartialMap: what a robot knows of a floor plan."""
+
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from sionna_partial import partial_map
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError, PositionError
+from sionna_partial.partial_map import PartialMap
+
+FREE, WALL, UNKNOWN = (int(state) for state in CellState)
+
+# Row 0 is the smallest y: the plan is upside down when read as text.
+PLAN = PartialMap(
+    np.array(
+        [
+            [1, 1, 1, 1],
+            [1, 0, 0, 2],
+            [1, 1, 1, 1],
+        ]
+    ),
+    resolution_m=0.5,
+    origin_m=(10.0, -4.0),
+    wall_height_m=2.5,
+)
+states = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=8), elements=st.integers(0, 2))
+
+
+def test_properties() -> None:
+    assert PLAN.shape == (3, 4)
+    assert PLAN.bounds_m == (10.0, -4.0, 12.0, -2.5)
+    assert PLAN.state.dtype == np.uint8
+    assert PLAN.origin_m == (10.0, -4.0)
+
+
+def test_state_is_a_read_only_copy() -> None:
+    array = np.zeros((2, 2), dtype=np.uint8)
+    partial = PartialMap(array, 0.1)
+    array[0, 0] = WALL
+    assert partial.state[0, 0] == FREE
+    with pytest.raises(ValueError, match="read-only"):
+        partial.state[0, 0] = WALL
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        PartialMap(np.full((3, 4), 1), 0.5, (10.0, -4.0), 2.5),
+        PartialMap(PLAN.state, 0.25, (10.0, -4.0), 2.5),
+        PartialMap(PLAN.state, 0.5, (10.0, -4.5), 2.5),
+        PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.4),
+        PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5, 2),
+        "a text",
+    ],
+)
+def test_equality(other: object) -> None:
+    assert PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5) == PLAN
+    assert other != PLAN
+
+
+# --- cells ------------------------------------------------------------------------------------------------------------
+
+
+def test_cell_index() -> None:
+    points = np.array(
+        [[10.0, -4.0, 1.5], [10.49, -3.51, 9.0], [11.99, -2.51, 0.0], [9.9, -4.1, 0.0], [12.0, -2.5, 0.0]]
+    )
+    row, column = PLAN.cell_index(points)
+    assert row.tolist() == [0, 0, 2, -1, 3]
+    assert column.tolist() == [0, 0, 3, -1, 4]
+    assert [int(index) for index in PLAN.cell_index(np.array([11.2, -3.2]))] == [1, 2]
+    assert PLAN.cell_index(np.zeros((2, 3, 2)))[0].shape == (2, 3)
+
+
+@given(states, st.floats(1e-3, 10.0), st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)))
+def test_every_cell_centre_has_its_index_and_state(
+    state: np.ndarray, resolution_m: float, origin_m: tuple[float, float]
+) -> None:
+    partial = PartialMap(state, resolution_m, origin_m)
+    row, column = np.mgrid[: state.shape[0], : state.shape[1]]
+    centres = np.stack([column, row], axis=-1) * resolution_m + resolution_m / 2 + np.array(origin_m)
+    found = partial.cell_index(centres)
+    assert np.array_equal(found[0], row)
+    assert np.array_equal(found[1], column)
+    assert np.array_equal(partial.state_at(centres), state)
+
+
+@given(st.integers(-50, 50), st.sampled_from([0.05, 0.1, 0.03, 1 / 3]), st.sampled_from([0.0, -24.0, 7.7]))
+def test_cell_edges_belong_to_the_cell_that_they_begin(cell: int, resolution_m: float, origin: float) -> None:
+    """Rounding of multiples of the resolution does not move an edge to the cell before."""
+    partial = PartialMap(np.zeros((2, 2)).astype(int), resolution_m, (origin, origin))
+    edge = origin + cell * resolution_m
+    assert [int(index) for index in partial.cell_index(np.array([edge, edge]))] == [cell, cell]
+
+
+def test_outside_is_unknown() -> None:
+    points = np.array([[9.99, -3.0], [12.0, -3.0], [11.0, -4.01], [11.0, -2.5], [1e9, 1e9]])
+    assert PLAN.state_at(points).tolist() == [UNKNOWN] * 5
+    assert PLAN.state_at(np.array([10.7, -3.2])).shape == ()
+
+
+@pytest.mark.parametrize(
+    ("block", "state"),
+    [
+        ([[1, 1], [1, 1]], WALL),
+        ([[1, 1], [1, 2]], UNKNOWN),
+        ([[1, 2], [1, 1]], UNKNOWN),
+        ([[1, 2], [0, 1]], FREE),
+        ([[0, 2], [1, 1]], FREE),
+        ([[2, 1], [1, 0]], FREE),
+    ],
+)
+@pytest.mark.parametrize("shift", [-1e-9, 0.0, 1e-9])
+def test_a_corner_has_the_freest_state_around_it(block: list[list[int]], state: int, shift: float) -> None:
+    partial = PartialMap(np.array(block), 0.05, (7.7, -24.0))
+    assert partial.state_at(np.array([7.75 + shift, -23.95 - shift])) == state
+
+
+def test_an_edge_has_the_freer_state_of_its_two_cells() -> None:
+    assert PLAN.state_at(np.array([[10.5, -3.25], [10.75, -3.5], [11.5, -3.25], [11.75, -3.5]])).tolist() == [
+        0,
+        0,
+        0,
+        2,
+    ]
+    assert PLAN.state_at(np.array([[10.5, -3.75], [10.25, -3.5]])).tolist() == [WALL, WALL]
+
+
+# --- completeness -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("state", "complete"),
+    [
+        ([[1, 1, 1], [1, 0, 1], [1, 1, 1]], True),
+        ([[2, 1, 2], [1, 0, 1], [2, 1, 2]], True),
+        ([[1, 1, 1], [1, 0, 2], [1, 1, 1]], False),
+        ([[1, 1, 1], [2, 0, 1], [1, 1, 1]], False),
+        ([[1, 2, 1], [1, 0, 1], [1, 1, 1]], False),
+        ([[1, 1, 1], [1, 0, 1], [1, 2, 1]], False),
+        ([[1, 0, 1], [1, 0, 1], [1, 1, 1]], True),
+        ([[1, 1, 1], [1, 0, 0], [1, 1, 1]], True),
+        ([[0]], True),
+        ([[1]], False),
+        ([[2]], False),
+    ],
+)
+def test_is_complete(state: list[list[int]], complete: bool) -> None:
+    """No free cell shares an edge with an unknown one; the edge of the grid does not count."""
+    for turned in (state, np.transpose(state)):
+        assert PartialMap(np.array(turned), 0.1).is_complete is complete
+
+
+@given(states)
+def test_is_complete_cell_by_cell(state: np.ndarray) -> None:
+    padded = np.pad(state, 1, constant_values=WALL)
+    free = np.argwhere(padded == FREE)
+    steps = ((0, 1), (1, 0), (0, -1), (-1, 0))
+    reached = any(padded[row + dy, column + dx] == UNKNOWN for row, column in free for dy, dx in steps)
+    assert PartialMap(state, 0.1).is_complete == (len(free) > 0 and not reached)
+
+
+def test_observed_fraction() -> None:
+    ring = np.array([[2, 1, 2], [1, 0, 1], [2, 1, 2]])
+    assert PartialMap(ring, 0.1).observed_fraction == 1.0
+    assert PartialMap(np.array([[1, 0, 2, 2]]), 0.1).observed_fraction == 0.5
+    assert PartialMap(ring, 0.1, interior_cells=4).observed_fraction == 0.25
+    assert PartialMap(np.array([[0, 0]]), 0.1, interior_cells=1).observed_fraction == 1.0
+    assert PartialMap(np.array([[2]]), 0.1, interior_cells=0).observed_fraction == 0.0
+
+
+@given(states)
+def test_observed_fraction_is_a_share(state: np.ndarray) -> None:
+    assert 0.0 <= PartialMap(state, 0.1).observed_fraction <= 1.0
+
+
+@given(states, st.data())
+def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data: st.DataObject) -> None:
+    """As long as the map stays incomplete, or ends complete."""
+    seen = data.draw(arrays(bool, state.shape))
+    before = PartialMap(np.where(seen, state, UNKNOWN), 0.1)
+    after = PartialMap(state, 0.1)
+    assert before.is_complete or before.observed_fraction <= after.observed_fraction
+
+
+# --- wrong maps -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"state": [0, 1]}, "state has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
+        ({"state": np.zeros((0, 3), int)}, "state has shape (0, 3): give a two-dimensional array"),
+        ({"state": [[0, 3]]}, "state has values 0 to 3: use CellState integers FREE 0, WALL 1, UNK"),
+        ({"state": [[-1]]}, "values -1 to -1: use CellState integers"),
+        ({"state": [[0.0]]}, "state has dtype float64: use CellState integers"),
+        ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
+        ({"resolution_m": 50}, "resolution_m = 50 is not allowed"),
+        ({"resolution_m": np.nan}, "resolution_m = nan is not allowed"),
+        ({"resolution_m": "fine"}, "resolution_m = 'fine' is not allowed"),
+        ({"resolution_m": None}, "resolution_m = None is not allowed"),
+        ({"origin_m": (0.0,)}, "origin_m = (0.0,): give the (x, y) of the lower-left corner in metres"),
+        ({"origin_m": 3.0}, "origin_m = 3.0: give the (x, y)"),
+        ({"origin_m": (0.0, np.inf)}, "origin_m = inf is not allowed: give a number of metres in [-1e+08, 1e+08]"),
+        ({"wall_height_m": 0.0}, "wall_height_m = 0.0 is not allowed: give a number of metres in [0.1, 100]"),
+    ],
+)
+def test_wrong_map(arguments: dict[str, object], message: str) -> None:
+    with pytest.raises(MapError, match=re.escape(message)):
+        PartialMap(**{"state": [[0]], "resolution_m": 0.1, **arguments})  # type: ignore[arg-type]
+
+
+def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partial_map, "MAX_CELLS", 11)
+    with pytest.raises(
+        MapError, match="state has 3 x 4 cells, more than 11: cut the map to the building or coarsen it"
+    ):
+        PartialMap(PLAN.state, 0.5)
+
+
+# --- positions --------------------------------------------------------------------------------------------------------
+
+
+def test_positions_may_be_free_or_unknown() -> None:
+    points = [[10.75, -3.25, 1.5], [11.75, -3.25, 0.01], [11.25, -3.25, 2.49]]
+    found = PLAN.require_positions("rx", points)
+    assert found.dtype == np.float64
+    assert found.tolist() == points
+    assert PLAN.require_positions("tx", (10.75, -3.25, 1)).tolist() == [10.75, -3.25, 1.0]
+    assert PLAN.require_positions("rx", np.zeros((0, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ((10.75, -3.25), "tx has shape (2,): give x, y, z in metres, (3,) or (N, 3)"),
+        (np.zeros((1, 1, 3)), "tx has shape (1, 1, 3): give x, y, z"),
+        ("here", "tx = 'here' is not numeric: give x, y, z in metres"),
+        ([(1, 2, 3), (1, 2)], "is not numeric: give x, y, z in metres"),
+        ((np.nan, -3.25, 1.5), "tx = (nan, -3.25, 1.5) is not finite: give finite numbers in metres"),
+        ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),
+        (
+            (9.0, -3.25, 1.5),
+            "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: "
+            "move it inside, or extend the map with unknown cells",
+        ),
+        ((12.5, -3.25, 1.5), "is outside the map"),
+        ((10.75, -4.1, 1.5), "is outside the map"),
+        ((10.75, -2.4, 1.5), "is outside the map"),
+        (
+            (10.75, -3.25, 2.5),
+            "tx = (10.75, -3.25, 2.5) is not between floor and ceiling (0 to 2.5 m): change its height z or the map's "
+            "wall_height_m",
+        ),
+        ((10.75, -3.25, 0.0), "is not between floor and ceiling"),
+        (
+            (10.25, -3.25, 1.5),
+            "tx = (10.25, -3.25, 1.5) is inside a wall: move it to a free or unknown cell",
+        ),
+        (
+            [(10.75, -3.25, 1.5), (10.25, -3.25, 1.5), (10.75, -2.75, 1.5)],
+            "tx[1] = (10.25, -3.25, 1.5) (and 1 more) is inside a wall",
+        ),
+        ([(10.75, -3.25, 1.5), (np.nan, 0.0, 0.0)], "tx[1] = (nan, 0.0, 0.0) is not finite"),
+    ],
+)
+def test_wrong_positions(points: object, message: str) -> None:
+    with pytest.raises(PositionError, match=re.escape(message)):
+        PLAN.require_positions("tx", points)
+
+
+@given(states, arrays(np.float64, (5, 3), elements=st.floats(-1.0, 2.0)))
+def test_positions_pass_where_the_map_allows_them(state: np.ndarray, points: np.ndarray) -> None:
+    partial = PartialMap(state, 0.2, (-0.2, 0.1), 1.5)
+    x0, y0, x1, y1 = partial.bounds_m
+    x, y, z = points.T
+    inside = (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1) & (z > 0) & (z < 1.5)
+    allowed = inside & (partial.state_at(points) != WALL)
+    for point, good in zip(points, allowed, strict=True):
+        if good:
+            assert np.array_equal(partial.require_positions("rx", point), point)
+        else:
+            with pytest.raises(PositionError, match="rx = "):
+                partial.require_positions("rx", point)

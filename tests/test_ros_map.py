@@ -1,0 +1,418 @@
+"""ROS map_server YAML and image, read as nav2_map_server reads them."""
+
+import math
+import re
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError, OutputError
+from sionna_partial.map_files import load_map, save_map
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.ros_map import MapWarning, states_from_percent
+
+SHEET: dict[str, Any] = {
+    "image": "map.pgm",
+    "resolution": 0.05,
+    "origin": [-1.0, 2.0, 0.0],
+    "negate": 0,
+    "occupied_thresh": 0.65,
+    "free_thresh": 0.196,
+}
+FREE, WALL, UNKNOWN = (int(state) for state in CellState)
+
+
+def write_sheet(folder: Path, *, without: str = "", **changes: object) -> Path:
+    """Write map.yaml: SHEET with changes."""
+    sheet = {key: value for key, value in {**SHEET, **changes}.items() if key != without}
+    path = folder / "map.yaml"
+    path.write_text(yaml.safe_dump(sheet))
+    return path
+
+
+def write_map(folder: Path, shades: object, **changes: object) -> Path:
+    """Write an image (rows from the top; grey, RGB(A), or 16 bit) and its YAML."""
+    array = np.asarray(shades)
+    suffix = ".pgm" if array.ndim == 2 and array.dtype != np.uint16 else ".png"
+    array = array if array.dtype == np.uint16 else array.astype(np.uint8)
+    Image.fromarray(array).save(folder / f"map{suffix}")
+    return write_sheet(folder, image=f"map{suffix}", **changes)
+
+
+def load_state(folder: Path, shades: object, *, strict: bool = False, **changes: object) -> list[list[int]]:
+    """Read a map made of shades, turned back so that its first row is the image's top row."""
+    return load_map(write_map(folder, shades, **changes), strict=strict).state[::-1].tolist()
+
+
+# --- images -----------------------------------------------------------------------------------------------------------
+
+
+def test_orientation_and_place(tmp_path: Path) -> None:
+    """Image row 0 is the largest y; the origin is the lower-left corner."""
+    partial = load_map(write_map(tmp_path, [[0, 205, 205], [254, 254, 205]]))
+    assert partial.state.tolist() == [[FREE, FREE, UNKNOWN], [WALL, UNKNOWN, UNKNOWN]]
+    assert partial.origin_m == (-1.0, 2.0)
+    assert partial.resolution_m == 0.05
+    assert partial.wall_height_m == 3.0
+    assert partial.interior_cells is None
+    assert partial.state_at(np.array([[-0.99, 2.01], [-0.99, 2.09]])).tolist() == [FREE, WALL]
+
+
+PGMS = {
+    "binary": b"P5\n3 1\n255\n\x00\xcd\xfe",
+    "binary with comments": b"P5 # made by\n# CREATOR: me 0.050 m/pix\n3 # wide\n1\n255\n\x00\xcd\xfe",
+    "text": b"P2\n3 1\n255\n0 205 254\n",
+    "text with comments": b"P2\n# hand made\n3 1\n255\n0 # wall\n205\n# free:\n254\n",
+    "binary, maxval 100": b"P5\n3 1\n100\n\x00\x32\x64",
+    "text, maxval 4": b"P2\n3 1\n4\n0 2 4\n",
+    "binary, 16 bit": b"P5\n3 1\n65535\n\x00\x00\xcd\xcd\xff\xff",
+    "binary, maxval 1000": b"P5\n3 1\n1000\n\x00\x00\x02\x58\x03\xe8",
+    "text, 16 bit": b"P2\n3 1\n65535\n0 40000 65535\n",
+}
+
+
+@pytest.mark.parametrize("kind", PGMS)
+def test_every_pgm(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "map.pgm").write_bytes(PGMS[kind])
+    assert load_map(write_sheet(tmp_path)).state.tolist() == [[WALL, UNKNOWN, FREE]]
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "I;16", "BMP"])
+def test_every_image_mode(tmp_path: Path, mode: str) -> None:
+    grey = Image.fromarray(np.array([[0, 150, 255]], dtype=np.uint8))
+    if mode == "I;16":
+        grey = Image.fromarray(np.array([[0, 150 * 257, 65535]], dtype=np.uint16))
+    name = "map.bmp" if mode == "BMP" else "map.png"
+    (grey if mode in ("I;16", "BMP") else grey.convert(mode)).save(tmp_path / name)
+    state = load_map(write_sheet(tmp_path, image=name)).state.tolist()
+    assert state == [[WALL, FREE if mode == "1" else UNKNOWN, FREE]]
+
+
+def test_colours_are_averaged(tmp_path: Path) -> None:
+    pixels = [[[255, 0, 0], [255, 255, 250], [20, 10, 30], [0, 255, 255]]]
+    assert load_state(tmp_path, pixels) == [[WALL, FREE, WALL, UNKNOWN]]
+
+
+# --- modes, thresholds, negate, alpha ---------------------------------------------------------------------------------
+
+
+def test_thresholds_are_strict(tmp_path: Path) -> None:
+    """nav2: occupancy > occupied_thresh is wall, < free_thresh is free; negated 51 and 204 have exactly 0.2 and 0.8."""
+    thresholds = {"free_thresh": 0.2, "occupied_thresh": 0.8, "negate": 1}
+    assert load_state(tmp_path, [[50, 51, 52, 203, 204, 205]], **thresholds) == [[FREE, 2, 2, 2, 2, WALL]]
+
+
+def test_negate(tmp_path: Path) -> None:
+    shades = np.arange(256)[None]
+    for negate in (1, True):
+        there = load_state(tmp_path, shades, negate=negate)
+        assert there == load_state(tmp_path, 255 - shades, negate=0)
+        assert there[0][0] == FREE
+        assert there[0][255] == WALL
+
+
+@pytest.mark.parametrize("mode", ["trinary", "Trinary", "scale", "SCALE"])
+def test_between_the_thresholds_is_unknown(tmp_path: Path, mode: str) -> None:
+    assert load_state(tmp_path, [[0, 80, 100, 150, 205, 210, 255]], mode=mode) == [[1, 1, 2, 2, 2, 0, 0]]
+
+
+def test_raw_mode(tmp_path: Path) -> None:
+    """Raw pixels are percent of occupancy; above 100 they are unknown; negate is ignored, as in nav2."""
+    shades = [[0, 19, 20, 21, 64, 65, 100, 101, 205, 255]]
+    for negate in (0, 1):
+        assert load_state(tmp_path, shades, mode="raw", negate=negate) == [[0, 0, 0, 2, 2, 1, 1, 2, 2, 2]]
+
+
+def test_alpha_in_scale_mode(tmp_path: Path) -> None:
+    pixels = [[[0, 0, 0, 255], [255, 255, 255, 255], [0, 0, 0, 254], [255, 255, 255, 0]]]
+    assert load_state(tmp_path, pixels, mode="scale") == [[WALL, FREE, UNKNOWN, UNKNOWN]]
+
+
+def test_alpha_in_trinary_mode_is_a_fourth_channel(tmp_path: Path) -> None:
+    """nav2 averages alpha with the colours: opaque grey 60 has the mean (180 + 255) / 4, transparent white 3/4."""
+    pixels = [[[0, 0, 0, 255], [60, 60, 60, 255], [255, 255, 255, 255], [255, 255, 255, 0], [255, 255, 255, 0]]]
+    for strict in (False, True):
+        assert load_state(tmp_path, pixels, strict=strict) == [[WALL, UNKNOWN, FREE, UNKNOWN, UNKNOWN]]
+
+
+def test_transparent_is_unknown(tmp_path: Path) -> None:
+    pixels = [[[0, 0, 0, 0], [255, 255, 255, 255], [0, 0, 0, 255], [0, 0, 0, 0]]]
+    with pytest.warns(MapWarning, match="2 transparent cells would read as free or wall; they are kept unknown"):
+        assert load_state(tmp_path, pixels) == [[UNKNOWN, FREE, WALL, UNKNOWN]]
+    assert load_state(tmp_path, pixels, strict=True) == [[WALL, FREE, WALL, WALL]]
+
+
+# --- the 205 trap -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("colour", ["grey", "grey, 16 bit", "RGB", "RGBA", "grey, negated", "RGBA, negated"])
+def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
+    shades = np.array([[0, 254, 205], [205, 205, 254]])
+    state = [[WALL, FREE, UNKNOWN], [UNKNOWN, UNKNOWN, FREE]]
+    negate = "negated" in colour
+    pixels = 255 - shades if negate else shades
+    if "16 bit" in colour:
+        pixels = (pixels * 257).astype(np.uint16)
+    if "RGB" in colour:
+        opaque = np.full(shades.shape, 255)
+        pixels = np.stack([pixels] * 3 + [opaque] * ("RGBA" in colour), axis=-1)
+    thresholds = {"free_thresh": 0.55, "occupied_thresh": 0.9} if colour == "RGBA, negated" else {"free_thresh": 0.25}
+    shade = 50 if negate else 205
+    with pytest.warns(MapWarning, match=rf"3 cells of shade {shade} would read as free .* Pass strict=True"):
+        read = load_state(tmp_path, pixels, negate=int(negate), **thresholds)
+    assert read == state
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        letter = load_state(tmp_path, pixels, negate=int(negate), strict=True, **thresholds)
+    assert letter == [[WALL, FREE, FREE], [FREE, FREE, FREE]]
+
+
+def test_205_is_free_where_more_is_unknown_otherwise(tmp_path: Path) -> None:
+    """A map that says unknown in another way may mean what it says by 205."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert load_state(tmp_path, [[0, 128, 205, 254]], free_thresh=0.25) == [[WALL, UNKNOWN, FREE, FREE]]
+
+
+def test_one_stray_unknown_pixel_does_not_open_the_trap(tmp_path: Path) -> None:
+    with pytest.warns(MapWarning, match="2 cells of shade 205"):
+        assert load_state(tmp_path, [[0, 128, 205, 205]], free_thresh=0.25) == [[WALL, 2, 2, 2]]
+
+
+def test_warning_points_to_the_caller(tmp_path: Path) -> None:
+    path = write_map(tmp_path, [[0, 205, 254]], free_thresh=0.25)
+    with pytest.warns(MapWarning) as caught:
+        load_map(path)
+    assert caught[0].filename == __file__
+
+
+# --- the YAML ---------------------------------------------------------------------------------------------------------
+
+
+def test_numbers_as_people_write_them(tmp_path: Path) -> None:
+    """YAML 1.1 takes 5e-2 for a text; yaml-cpp, and so ROS, for a number. `negate: no` is a boolean."""
+    path = write_map(tmp_path, [[0, 205, 254]])
+    path.write_text(
+        "image: map.pgm\nmode: trinary\nresolution: 5e-2\norigin: [1, 2.5e+0, 0]\nnegate: no\n"
+        "occupied_thresh: .65\nfree_thresh: 0.196\nother: [1, {a: b}]\nwall_height: 2\ninterior_cells: 7\n"
+    )
+    partial = load_map(path)
+    assert (partial.resolution_m, partial.origin_m) == (0.05, (1.0, 2.5))
+    assert (partial.wall_height_m, partial.interior_cells) == (2.0, 7)
+    assert load_map(path, wall_height_m=2.4).wall_height_m == 2.4
+
+
+def test_image_beside_and_elsewhere(tmp_path: Path) -> None:
+    """The image is found relative to the YAML, or by an absolute path."""
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures" / "a b.pgm").write_bytes(PGMS["binary"])
+    for image in ("pictures/a b.pgm", str(tmp_path / "pictures" / "a b.pgm")):
+        assert load_map(write_sheet(tmp_path, image=image)).shape == (1, 3)
+
+
+@pytest.mark.parametrize("key", SHEET)
+def test_missing_key(tmp_path: Path, key: str) -> None:
+    (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
+    path = write_sheet(tmp_path, without=key)
+    with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} is missing: add it"):
+        load_map(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        *[
+            ("resolution", value, r"give a number of metres per cell \(not cells per metre\) in \[0.001, 10\]")
+            for value in (0, -0.05, 50, 1e-9, 1e300, 10**400, math.nan, math.inf, "fine", None, True, [0.05], {})
+        ],
+        *[("occupied_thresh", value, r"give a number in \[0, 1\]") for value in (-0.1, 65, math.nan, "high", None)],
+        *[("free_thresh", value, r"give a number in \[0, 1\]") for value in (-0.1, 19.6, math.nan, "low", None)],
+        *[("free_thresh", value, "give less than occupied_thresh, which is 0.65") for value in (0.65, 0.9)],
+        *[
+            ("origin", value, r"give \[x, y, yaw\] of the lower-left corner, in metres and radians")
+            for value in ([0, 0], [0, 0, 0, 0], [0, math.nan, 0], [math.inf, 0, 0], [0, 0, "north"], 7, None, "0, 0, 0")
+        ],
+        ("origin", [0, 0, 90], r"the yaw in radians, one turn at most \(not degrees\)"),
+        *[("negate", value, "give 0 .dark is wall. or 1 .bright is wall.") for value in (2, -1, 0.0, "maybe", None)],
+        *[("mode", value, "choose one of trinary, scale, raw") for value in ("ternary", 3, None)],
+        *[("image", value, "give the file name of the map image") for value in ("", None, 3, ["map.pgm"], "a\0b")],
+        *[("image", value, "there is no file '.*'; put the image there") for value in ("gone.pgm", ".", "a" * 300)],
+        *[("wall_height", value, r"give a number of metres in \[0.1, 100\]") for value in (0, -3, math.nan, "tall")],
+        *[("interior_cells", value, "give the number of free cells") for value in (-1, 2.5, "many", True)],
+    ],
+)
+def test_wrong_value(tmp_path: Path, key: str, value: object, message: str) -> None:
+    """The error names the file, the field, the value and the remedy."""
+    (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
+    path = write_sheet(tmp_path, **{key: value})
+    with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}") as caught:
+        load_map(path)
+    shown = str(value)
+    assert len(shown) > 100 or shown in str(caught.value) or "\0" in shown
+
+
+@pytest.mark.parametrize("value", [[2e8, 0.0, 0.0], [0.0, -2e8, 0.0]])
+def test_origin_too_far(tmp_path: Path, value: list[float]) -> None:
+    path = write_map(tmp_path, [[0]], origin=value)
+    with pytest.raises(MapError, match=r"origin_m = -?200000000.0 is not allowed: give a number of metres in"):
+        load_map(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"", "holds None in place of keys such as image, resolution and origin"),
+        (b"- 1\n- 2\n", r"holds \[1, 2\] in place of keys"),
+        (b"just a text", "holds 'just a text' in place of keys"),
+        (b"image: [unclosed", "is not valid YAML"),
+        (b"image: a\n\tresolution: 1", "is not valid YAML"),
+        (b"\x00\x01\xff\xfe rubbish", "is not valid YAML"),
+        (bytes(range(128, 256)) * 10, "is not valid YAML"),
+        (b"P5\n3 1\n255\n\x00\xcd\xfe", "is not valid YAML"),
+        (b"a: 2020-99-99", r"is not valid YAML \(month must be"),
+        (b"[" * 5000, "is not valid YAML"),
+        (b"a: !!python/object/apply:os.system ['true']", "is not valid YAML"),
+        (b"#" * 1_000_001, "has more than 1,000,000 bytes: give the YAML of a ROS map"),
+    ],
+)
+def test_damaged_yaml(tmp_path: Path, text: bytes, message: str) -> None:
+    path = tmp_path / "map.yaml"
+    path.write_bytes(text)
+    with pytest.raises(MapError, match=f"path = '{re.escape(str(path))}' {message}"):
+        load_map(path)
+
+
+def test_yaml_bomb_stays_short(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]" for n in range(1, 12)]
+    (tmp_path / "map.yaml").write_text("\n".join([*lines, "occupied_thresh: *a11"]))
+    with pytest.raises(MapError, match=r"occupied_thresh = .* is not allowed") as caught:
+        load_map(tmp_path / "map.yaml")
+    assert len(str(caught.value)) < 1000
+
+
+def test_unreadable_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    path = write_map(tmp_path, [[0]])
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(MapError, match=r"cannot be read \(Permission denied\): check the path"):
+        load_map(path)
+
+
+# --- damaged images ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"P5",
+        b"P5\n# only a comment",
+        b"P5\n3 1\n255\n\x00\xcd",
+        b"P5\n3 1\n100\n\x00\x32",
+        b"P5\n3 1\n65535\n\x00\x00\xcd",
+        b"P5\n0 1\n255\n",
+        b"P5\n-3 1\n255\n\x00\xcd\xfe",
+        b"P5\n3 1\n0\n\x00\xcd\xfe",
+        b"P5\n3 1\n70000\n\x00\xcd\xfe",
+        b"P5\nthree one\n255\n\x00\xcd\xfe",
+        b"P2\n3 1\n255\n0 205",
+        b"P2\n3 1\n255\n0 205 300",
+        b"P2\n3 1\n255\n0 205 white",
+        b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR",
+        b"\x89PNG\r\n\x1a\nrubbish" * 20,
+        b"GIF89a\x01\x00\x01\x00\x00\x00\x00;",
+        bytes(range(256)) * 4,
+    ],
+)
+def test_damaged_image(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "map.pgm").write_bytes(content)
+    path = write_sheet(tmp_path)
+    with pytest.raises(MapError, match=r"image = '.*map\.pgm' is not allowed: it is damaged or not a PGM, PNG or BMP"):
+        load_map(path)
+
+
+def test_truncated_png(tmp_path: Path) -> None:
+    path = write_map(tmp_path, np.random.default_rng(0).integers(0, 255, (40, 40, 3)))
+    whole = (tmp_path / "map.png").read_bytes()
+    for share in (0.2, 0.6, 0.95):
+        (tmp_path / "map.png").write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(MapError, match=r"it is damaged or not a PGM, PNG or BMP \(.*\); save the map again"):
+            load_map(path)
+
+
+@pytest.mark.parametrize(("width", "height"), [(20_000, 20_000), (10_001, 10_000), (2**30, 2**30)])
+def test_too_large_image(tmp_path: Path, width: int, height: int) -> None:
+    """Only the header is read, and no warning of Pillow gets out."""
+    (tmp_path / "map.pgm").write_bytes(b"P5\n%d %d\n255\n" % (width, height))
+    path = write_sheet(tmp_path)
+    with pytest.raises(MapError, match="it has more than 100,000,000 cells; cut the map to the building or coarsen it"):
+        load_map(path)
+
+
+def test_floating_point_image(tmp_path: Path) -> None:
+    (tmp_path / "map.pgm").write_bytes(b"Pf\n1 1\n-1.0\n\x00\x00\x80\x3f")
+    with pytest.raises(MapError, match="it holds floating-point shades; save a PGM or PNG"):
+        load_map(write_sheet(tmp_path))
+
+
+# --- yaw, writing, percent --------------------------------------------------------------------------------------------
+
+
+def test_yaw_turns_about_the_lower_left_corner(tmp_path: Path) -> None:
+    path = write_map(tmp_path, [[0, 205, 205], [254, 254, 205]], origin=[-1.0, 2.0, 1.5708])
+    partial = load_map(path)
+    assert partial.state.tolist() == [[WALL, FREE], [UNKNOWN, FREE], [UNKNOWN, UNKNOWN]]
+    assert partial.origin_m == (-1.1, 2.0)
+
+
+def test_interior_cells_follow_the_cell_size(tmp_path: Path) -> None:
+    path = write_map(tmp_path, np.full((9, 9), 254), origin=[0, 0, 0.5], interior_cells=81)
+    partial = load_map(path)
+    assert partial.resolution_m == 0.025
+    assert partial.interior_cells == 324
+    assert partial.observed_fraction == pytest.approx(1.0, abs=0.05)
+
+
+PARTIAL = PartialMap(np.array([[0, 1, 2], [2, 1, 0]]), 0.1, (1 / 3, -2e5 - 0.1), 2.4, 17)
+
+
+def test_written_map_to_the_letter(tmp_path: Path) -> None:
+    save_map(PARTIAL, tmp_path / "home.yaml", extra={"scene_offset": [1.5, 2.0]})
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["home.pgm", "home.yaml"]
+    assert (tmp_path / "home.pgm").read_bytes() == b"P5\n3 2\n255\n" + bytes([205, 0, 254, 254, 0, 205])
+    assert yaml.safe_load((tmp_path / "home.yaml").read_text()) == {
+        "image": "home.pgm",
+        "mode": "trinary",
+        "resolution": 0.1,
+        "origin": [1 / 3, -2e5 - 0.1, 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+        "wall_height": 2.4,
+        "interior_cells": 17,
+        "scene_offset": [1.5, 2.0],
+    }
+    for strict in (False, True):
+        assert load_map(tmp_path / "home.yaml", strict=strict) == PARTIAL
+
+
+@pytest.mark.parametrize("blocked", ["home.yaml", "home.pgm"])
+def test_neither_file_without_the_other(tmp_path: Path, blocked: str) -> None:
+    (tmp_path / blocked).mkdir()
+    with pytest.raises(OutputError, match=f"{blocked}' could not be written"):
+        save_map(PARTIAL, tmp_path / "home.yaml")
+    assert [entry.name for entry in tmp_path.iterdir()] == [blocked]
+
+
+def test_states_from_percent() -> None:
+    percent = np.array([[-128, -1, 0, 25], [26, 64, 65, 100], [101, 127, 255, 50]])
+    assert states_from_percent(percent, 65, 25).tolist() == [[2, 2, 0, 0], [2, 2, 1, 1], [2, 2, 2, 2]]

@@ -1,0 +1,164 @@
+"""Settings and constants: defaults with their source, and every refusal."""
+
+import dataclasses
+import math
+import re
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sionna_partial import constants
+from sionna_partial.constants import CellState, LinkState
+from sionna_partial.errors import SettingsError
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, TraceSettings
+
+ITU_BANDS_OF_SIONNA = """
+from sionna_partial.llvm import load_llvm
+load_llvm()
+from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+from sionna_partial.settings import ITU_BANDS_GHZ
+assert {name: tuple(bands) for name, bands in ITU_MATERIALS_PROPERTIES.items()} == ITU_BANDS_GHZ
+"""
+
+
+def test_link_and_cell_states() -> None:
+    """The numbers are part of every file that we write."""
+    assert {state.name: state.value for state in LinkState} == {"OUTAGE": 0, "LOS": 1, "NLOS": 2}
+    assert {state.name: state.value for state in CellState} == {"FREE": 0, "WALL": 1, "UNKNOWN": 2}
+
+
+def test_constants_of_the_paper() -> None:
+    assert constants.SPEED_OF_LIGHT_M_S == 299_792_458
+    assert constants.CARRIER_FREQUENCY_HZ == 28e9
+    assert constants.GAIN_FLOOR_DB == -150.0
+    assert constants.DEFAULT_HEIGHT_M == 1.5
+    assert 0 < constants.DEFAULT_HEIGHT_M < constants.DEFAULT_WALL_HEIGHT_M
+
+
+def test_defaults_are_the_papers() -> None:
+    assert Material() == Material(relative_permittivity=2.94, conductivity_s_m=0.1226, thickness_m=0.1, itu=None)
+    assert TraceSettings() == TraceSettings(
+        frequency_hz=28e9, max_depth=6, diffraction=False, refraction=False, diffuse_reflection=False
+    )
+    assert SceneSettings().material == Material()
+
+
+@pytest.mark.parametrize("settings", [Material(), SceneSettings(), TraceSettings()])
+def test_settings_are_frozen(settings: object) -> None:
+    name = dataclasses.fields(settings)[0].name  # type: ignore[arg-type]
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(settings, name, getattr(settings, name))
+
+
+NO_NUMBERS = (math.nan, math.inf, -math.inf, "1", None, True, [1.0])
+RANGES = {
+    (Material, "relative_permittivity"): ("[1, 1e+06]", (1, 1.0, 1e6), (0.999, -1, 1.1e6)),
+    (Material, "conductivity_s_m"): ("[0, 1e+09]", (0, 0.0, 1e9), (-1e-9, 2e9)),
+    (Material, "thickness_m"): ("(0, 10]", (1e-9, 10), (0, -0.1, 10.1)),
+    (SceneSettings, "outline_tolerance_cells"): ("[0, 2]", (0, 2.0), (-0.1, 2.1)),
+    (SceneSettings, "bridge_gap_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28, 1e12), (0, -28e9, 28, 1.1e12)),
+    (TraceSettings, "max_depth"): ("[0, 10]", (0, 10), (-1, 11)),
+    (TraceSettings, "samples_per_tx"): ("[1, 1e+08]", (1, 10**8), (0, 10**8 + 1)),
+    (TraceSettings, "seed"): ("[0, 2.14748e+09]", (0, 2**31 - 1), (-1, 2**31)),
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), RANGES)
+def test_ranges(kind: type, name: str) -> None:
+    """Both ends are allowed; each message has the name, the value and what is allowed."""
+    span, allowed, refused = RANGES[kind, name]
+    for value in allowed:
+        if (name, value) != ("frequency_hz", 28):
+            assert getattr(kind(**{name: value}), name) == value
+    for value in refused:
+        expected = f"{name} = {value!r} is not allowed: give a number in {span}."
+        with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
+            kind(**{name: value})
+
+
+@pytest.mark.parametrize(("kind", "name"), RANGES)
+@pytest.mark.parametrize("value", NO_NUMBERS)
+def test_no_numbers(kind: type, name: str, value: object) -> None:
+    with pytest.raises(SettingsError, match=re.escape(f"{name} = {value!r} is not allowed: give a ")):
+        kind(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["max_depth", "samples_per_tx", "seed"])
+def test_whole_numbers(name: str) -> None:
+    with pytest.raises(SettingsError, match=f"{name} = 3.0 is not allowed: give a whole number"):
+        TraceSettings(**{name: 3.0})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["diffraction", "refraction", "diffuse_reflection"])
+def test_switches(name: str) -> None:
+    assert TraceSettings().specular_only
+    assert not TraceSettings(**{name: True}).specular_only  # type: ignore[arg-type]
+    for value in (1, 0, "yes", None):
+        with pytest.raises(SettingsError, match=f"{name} = {value!r} is not allowed: give True or False"):
+            TraceSettings(**{name: value})  # type: ignore[arg-type]
+
+
+def test_scene_choices() -> None:
+    with pytest.raises(SettingsError, match="material = 'drywall' is not allowed: give a Material"):
+        SceneSettings(material="drywall")  # type: ignore[arg-type]
+    for extent in ("observed", "map", "none"):
+        assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]
+    expected = "floor_extent = 'all' is not allowed: choose one of ('observed', 'map', 'none')."
+    with pytest.raises(SettingsError, match=re.escape(expected)):
+        SceneSettings(floor_extent="all")  # type: ignore[arg-type]
+
+
+def test_itu_names() -> None:
+    assert {Material(itu=name).itu for name in ITU_BANDS_GHZ} == set(ITU_BANDS_GHZ)
+    with pytest.raises(SettingsError, match="itu = 'cheese' is not allowed: choose one of vacuum, concrete, brick, "):
+        Material(itu="cheese")
+
+
+@pytest.mark.parametrize(
+    ("name", "frequency_hz", "spans"),
+    [
+        ("brick", 60e9, "1-40 GHz or 110-330 GHz"),
+        ("concrete", 0.9e9, "1-100 GHz or 110-330 GHz"),
+        ("concrete", 105e9, "1-100 GHz or 110-330 GHz"),
+        ("wet_ground", 28e9, "1-10 GHz"),
+        ("floorboard", 28e9, "50-100 GHz or 220-300 GHz"),
+    ],
+)
+def test_frequency_outside_the_material(name: str, frequency_hz: float, spans: str) -> None:
+    message = f"frequency_hz = {frequency_hz!r} is not allowed: ITU material {name!r} is defined for {spans}"
+    with pytest.raises(
+        SettingsError, match=rf"{re.escape(message)}.*; choose a frequency there or a custom Material\."
+    ):
+        Material(itu=name).require_frequency(frequency_hz)
+
+
+@given(st.sampled_from(sorted(ITU_BANDS_GHZ)), st.floats(0.001, 1000.0))
+def test_frequency_is_allowed_inside_a_band_alone(name: str, frequency_ghz: float) -> None:
+    inside = any(low <= frequency_ghz * 1e9 / 1e9 <= high for low, high in ITU_BANDS_GHZ[name])
+    if inside:
+        Material(itu=name).require_frequency(frequency_ghz * 1e9)
+    else:
+        with pytest.raises(SettingsError, match="frequency_hz"):
+            Material(itu=name).require_frequency(frequency_ghz * 1e9)
+
+
+@pytest.mark.parametrize("low_or_high", [0, 1])
+def test_band_edges_are_inside(low_or_high: int) -> None:
+    for name, bands in ITU_BANDS_GHZ.items():
+        for band in bands:
+            Material(itu=name).require_frequency(band[low_or_high] * 1e9)
+
+
+def test_a_custom_material_has_no_bands() -> None:
+    Material().require_frequency(1e6)
+    Material().require_frequency(1e12)
+
+
+def test_itu_bands_are_those_of_sionna() -> None:
+    """In a process of its own, since Sionna starts Dr.Jit."""
+    done = subprocess.run([sys.executable, "-c", ITU_BANDS_OF_SIONNA], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,294 @@
+"""The trace against closed forms and against stock Sionna RT."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.scene import export_scene
+from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.solver import load_sionna
+from sionna_partial.trace import TracedLinks, trace_links
+
+WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
+NO_FLOOR = SceneSettings(floor_extent="none")
+
+
+def _map(shape: tuple[int, int], resolution_m: float = 0.1) -> NDArray[np.uint8]:
+    return np.full(shape, CellState.FREE, dtype=np.uint8)
+
+
+def _room() -> PartialMap:
+    """6 m x 4 m of free cells in walls, parted by a wall with a door of 1 m."""
+    state = np.full((42, 62), CellState.WALL, dtype=np.uint8)
+    state[1:-1, 1:-1] = CellState.FREE
+    state[1:15, 30] = CellState.WALL
+    state[25:-1, 30] = CellState.WALL
+    return PartialMap(state, 0.1)
+
+
+def _half_seen_room() -> PartialMap:
+    state = _room().state.copy()
+    state[:, 45:] = CellState.UNKNOWN
+    state[:6, :20] = CellState.UNKNOWN
+    return PartialMap(state, 0.1)
+
+
+def _free_space_gain_db(distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 20 * np.log10(WAVELENGTH_M / (4 * np.pi * distance_m))
+
+
+def _slab_reflection(cos_incidence: float, material: Material, polarisation: str) -> complex:
+    """Reflection coefficient of a single-layer slab (ITU-R P.2040-3, equations 31, 32 and 37)."""
+    eta = material.relative_permittivity - 1j * material.conductivity_s_m / (2 * np.pi * 28e9 * 8.8541878128e-12)
+    root = np.sqrt(eta - (1 - cos_incidence**2))
+    if polarisation == "te":
+        single = (cos_incidence - root) / (cos_incidence + root)
+    else:
+        single = (eta * cos_incidence - root) / (eta * cos_incidence + root)
+    phase = np.exp(-2j * 2 * np.pi * material.thickness_m / WAVELENGTH_M * root)
+    return complex(single * (1 - phase) / (1 - single**2 * phase))
+
+
+def _paths_of(links: TracedLinks, rx: int) -> NDArray[np.intp]:
+    return np.flatnonzero(links.path_rx == rx)
+
+
+def test_free_space_gain_delay_and_angles() -> None:
+    partial = PartialMap(_map((100, 100)), 0.1)
+    tx, rx = np.array([1.0, 2.0, 1.5]), np.array([[4.0, 6.0, 1.5], [1.0, 2.0, 2.5], [9.0, 2.0, 1.5]])
+    links = trace_links(partial, tx, rx, scene_settings=NO_FLOOR)
+    distance = np.linalg.norm(rx - tx, axis=1)
+    assert (links.link_state == LinkState.LOS).all()
+    assert links.path_rx.tolist() == [0, 1, 2]
+    np.testing.assert_allclose(links.gain_db, _free_space_gain_db(distance), atol=1e-3)
+    np.testing.assert_allclose(links.delay_s, distance / SPEED_OF_LIGHT_M_S, rtol=1e-5)
+    np.testing.assert_allclose(links.departure_rad[0], [np.pi / 2, np.arctan2(4, 3)], atol=1e-5)
+    np.testing.assert_allclose(links.arrival_rad[0], [np.pi / 2, np.arctan2(-4, -3)], atol=1e-5)
+
+
+def test_one_mirror_image_with_the_slab_reflection_coefficient() -> None:
+    state = _map((60, 100))
+    state[50, :] = CellState.WALL
+    tx, rx = np.array([1.0, 2.0, 1.5]), np.array([[5.0, 3.0, 1.5]])
+    links = trace_links(PartialMap(state, 0.1), tx, rx, scene_settings=NO_FLOOR)
+    wall_y = 5.05
+    length = np.hypot(4.0, (wall_y - 2.0) + (wall_y - 3.0))
+    cos_incidence = ((wall_y - 2.0) + (wall_y - 3.0)) / length
+    direct, mirrored = _paths_of(links, 0)
+    expected = abs(_slab_reflection(cos_incidence, Material(), "te")) * WAVELENGTH_M / (4 * np.pi * length)
+    assert abs(links.a[mirrored]) == pytest.approx(expected, rel=1e-3)
+    assert links.delay_s[mirrored] * SPEED_OF_LIGHT_M_S == pytest.approx(length, rel=1e-5)
+    x = 1.0 + 4.0 * (wall_y - 2.0) / ((wall_y - 2.0) + (wall_y - 3.0))
+    np.testing.assert_allclose(links.vertices_m[mirrored, 0], [x, wall_y, 1.5], atol=1e-4)
+    assert np.isnan(links.vertices_m[mirrored, 1:]).all()
+    assert links.interactions[mirrored].tolist() == [1, 0, 0, 0, 0, 0]
+    total = abs(links.a[direct]) ** 2 + abs(links.a[mirrored]) ** 2
+    assert links.gain_db[0] == pytest.approx(10 * np.log10(total), abs=1e-6)
+
+
+def test_floor_and_ceiling_reflect_with_the_parallel_coefficient() -> None:
+    material = Material(relative_permittivity=5.0, conductivity_s_m=0.2, thickness_m=0.2)
+    tx, rx = np.array([2.0, 2.0, 1.5]), np.array([[5.0, 2.0, 1.5]])
+    settings = SceneSettings(material=material)
+    links = trace_links(
+        PartialMap(_map((60, 100)), 0.1), tx, rx, settings=TraceSettings(max_depth=1), scene_settings=settings
+    )
+    length = np.hypot(3.0, 3.0)
+    cos_incidence = 3.0 / length
+    sin_zenith = 3.0 / length
+    expected = abs(_slab_reflection(cos_incidence, material, "tm")) * WAVELENGTH_M / (4 * np.pi * length)
+    _, floor, ceiling = _paths_of(links, 0)
+    np.testing.assert_allclose(abs(links.a[[floor, ceiling]]), expected, rtol=1e-3)
+    np.testing.assert_allclose(sorted(links.vertices_m[[floor, ceiling], 0, 2]), [0.0, 3.0], atol=1e-5)
+    assert np.sin(links.departure_rad[floor, 0]) == pytest.approx(sin_zenith, abs=1e-4)
+
+
+def test_corridor_of_two_walls_has_every_image() -> None:
+    state = _map((41, 400))
+    state[[0, 40], :] = CellState.WALL
+    low, high = 0.05, 4.05
+    tx, rx = np.array([19.0, 1.25, 1.5]), np.array([[21.0, 3.05, 1.5]])
+    links = trace_links(PartialMap(state, 0.1), tx, rx, scene_settings=NO_FLOOR)
+    width, offsets = high - low, [rx[0, 1] - tx[1]]
+    for count, first in itertools.product(range(1, 7), (low, high)):
+        to_first = abs(tx[1] - first)
+        last = first if count % 2 == 1 else (low + high - first)
+        offsets.append(to_first + (count - 1) * width + abs(rx[0, 1] - last))
+    expected = np.sort(np.hypot(2.0, offsets))
+    np.testing.assert_allclose(links.delay_s * SPEED_OF_LIGHT_M_S, expected, rtol=1e-5)
+
+
+def test_reciprocity() -> None:
+    partial = _room()
+    a, b = np.array([0.75, 0.83, 1.2]), np.array([5.21, 0.61, 2.1])
+    there, back = trace_links(partial, a, b[None]), trace_links(partial, b, a[None])
+    assert there.link_state[0] == back.link_state[0] == LinkState.NLOS
+    assert len(there.a) == len(back.a) > 10
+    assert there.gain_db[0] == pytest.approx(back.gain_db[0], abs=0.01)
+    np.testing.assert_allclose(np.sort(there.delay_s), np.sort(back.delay_s), rtol=1e-5)
+
+
+def test_a_wall_without_end_gives_outage() -> None:
+    state = _map((40, 40))
+    state[:, 20] = CellState.WALL
+    links = trace_links(PartialMap(state, 0.1), (1.0, 1.0, 1.5), [[3.0, 1.0, 1.5]])
+    assert links.link_state.tolist() == [LinkState.OUTAGE]
+    assert links.gain_db.tolist() == [-150.0]
+    assert len(links.a) == 0
+
+
+def test_unknown_space_is_free() -> None:
+    state = np.full((50, 50), CellState.UNKNOWN, dtype=np.uint8)
+    tx, rx = np.array([0.5, 0.5, 1.5]), np.array([[4.5, 3.5, 1.0]])
+    links = trace_links(PartialMap(state, 0.1), tx, rx)
+    np.testing.assert_allclose(links.gain_db, _free_space_gain_db(np.linalg.norm(rx - tx, axis=1)), atol=1e-3)
+
+
+def test_no_receivers_give_no_links() -> None:
+    links = trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)))
+    assert links.link_state.shape == links.gain_db.shape == links.a.shape == (0,)
+
+
+def test_line_of_sight_alone_at_depth_zero() -> None:
+    links = trace_links(
+        _room(), (1.0, 1.0, 1.5), [[2.0, 3.0, 1.5], [5.0, 0.6, 1.5]], settings=TraceSettings(max_depth=0)
+    )
+    assert links.link_state.tolist() == [LinkState.LOS, LinkState.OUTAGE]
+    assert links.path_rx.tolist() == [0]
+
+
+def _grid(partial: PartialMap, spacing_m: float) -> NDArray[np.float64]:
+    x0, y0, x1, y1 = partial.bounds_m
+    x, y = np.meshgrid(np.arange(x0 + spacing_m / 2, x1, spacing_m), np.arange(y0 + spacing_m / 2, y1, spacing_m))
+    rx = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)])
+    return rx[partial.state_at(rx) != CellState.WALL]
+
+
+@pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
+def test_the_answer_does_not_depend_on_the_other_receivers(partial: PartialMap) -> None:
+    tx, rx = (1.05, 2.95, 1.5), _grid(partial, 0.3)
+    together = trace_links(partial, tx, rx)
+    some = np.arange(0, len(rx), 17)
+    apart = trace_links(partial, tx, rx[some])
+    np.testing.assert_array_equal(apart.link_state, together.link_state[some])
+    np.testing.assert_array_equal(apart.gain_db, together.gain_db[some])
+
+
+def test_two_runs_give_the_same_bytes() -> None:
+    tx, rx = (1.05, 2.95, 1.5), _grid(_room(), 0.5)
+    first, second = trace_links(_room(), tx, rx), trace_links(_room(), tx, rx)
+    for name in ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m", "gain_db"):
+        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+
+
+def test_moving_the_map_changes_nothing() -> None:
+    here = _room()
+    shift = np.array([512_345.7, 4_512_345.1, 0.0])
+    there = PartialMap(here.state, here.resolution_m, tuple(shift[:2]))
+    tx, rx = np.array([1.07, 2.93, 1.5]), _grid(here, 0.5) + [0.013, 0.017, 0.0]
+    near, far = trace_links(here, tx, rx), trace_links(there, tx + shift, rx + shift)
+    np.testing.assert_array_equal(near.link_state, far.link_state)
+    np.testing.assert_allclose(near.gain_db, far.gain_db, atol=1e-3)
+    np.testing.assert_allclose(far.vertices_m - shift, near.vertices_m, atol=1e-3)
+
+
+@pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
+def test_finds_every_path_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
+    tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::29] + [0.021, 0.013, 0.3]
+    links = trace_links(partial, tx, rx)
+    scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
+    paths = load_sionna().PathSolver(deterministic=True)(
+        scene, max_depth=6, refraction=False, samples_per_src=100_000, max_num_paths_per_src=1_000_000
+    )
+    valid = paths.valid.numpy().reshape(len(rx), -1)
+    delay = paths.tau.numpy().reshape(len(rx), -1)
+    power = sum(part.numpy().reshape(len(rx), -1).astype(float) ** 2 for part in paths.a)
+    recalled = [
+        np.abs(links.delay_s[_paths_of(links, index)] - stock).min(initial=np.inf) < 1e-11
+        for index in range(len(rx))
+        for stock in delay[index][valid[index]]
+    ]
+    assert len(recalled) > 300
+    assert np.mean(recalled) > 0.999
+    gain_db = np.maximum(10 * np.log10(np.maximum((power * valid).sum(axis=1), 1e-15)), -150.0)
+    assert (np.abs(links.gain_db - gain_db) < 0.5).mean() >= 0.95
+    assert ((links.gain_db > -150) == (gain_db > -150)).all()
+
+
+def _stock_scene(folder: Path, tx: NDArray[np.float64], rx: NDArray[np.float64]):  # noqa: ANN202
+    rt = load_sionna()
+    scene = rt.load_scene(str(folder / "scene.xml"))
+    scene.frequency = 28e9
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
+    )
+    scene.add(rt.Transmitter("tx", position=[float(value) for value in tx]))
+    for index, position in enumerate(rx):
+        scene.add(rt.Receiver(f"rx{index}", position=[float(value) for value in position]))
+    return scene
+
+
+def test_refraction_passes_walls() -> None:
+    tx, rx = (1.03, 0.52, 1.5), [[5.02, 0.53, 1.5]]
+    without = trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=1))
+    shot = TraceSettings(max_depth=1, refraction=True, samples_per_tx=20_000)
+    through = trace_links(_room(), tx, rx, settings=shot)
+    assert without.link_state.tolist() == [LinkState.OUTAGE]
+    assert through.link_state.tolist() == [LinkState.NLOS]
+    assert 4 in through.interactions
+
+
+def test_diffraction_bends_around_the_door() -> None:
+    tx, rx = (1.03, 0.52, 1.5), [[4.02, 0.93, 1.5]]
+    settings = TraceSettings(max_depth=1, diffraction=True, samples_per_tx=50_000)
+    links = trace_links(_room(), tx, rx, settings=settings)
+    assert 8 in links.interactions
+    corner = links.vertices_m[(links.interactions == 8).any(axis=1), 0, :2]
+    assert np.abs(corner - [3.05, 1.45]).max(axis=1).min() < 0.1
+
+
+def test_shot_and_exact_paths_agree_where_both_apply() -> None:
+    tx, rx = (1.03, 2.93, 1.5), [[5.02, 2.03, 1.5], [2.2, 1.1, 1.2]]
+    exact = trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=2))
+    shot = trace_links(
+        _room(), tx, rx, settings=TraceSettings(max_depth=2, diffuse_reflection=True, samples_per_tx=20_000)
+    )
+    specular = ((shot.interactions == 0) | (shot.interactions == 1)).all(axis=1)
+    np.testing.assert_allclose(np.sort(shot.delay_s[specular]), np.sort(exact.delay_s), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("tx", "rx", "message"),
+    [
+        ((np.nan, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = \(nan, 1.0, 1.5\) is not finite"),
+        ((0.05, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = .* is inside a wall"),
+        ((9.0, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = .* is outside the map"),
+        ((1.0, 1.0, 1.5), [[1.0, 1.0, 3.0]], r"rx\[0\] = .* is not between floor and ceiling"),
+        ([(1.0, 1.0, 1.5)], [[1.0, 1.0, 1.0]], r"tx has shape \(1, 3\): give one transmitter"),
+        ((1.0, 1.0, 1.5), (1.0, 1.0, 1.0), r"rx has shape \(3,\): give receivers as \(N, 3\)"),
+    ],
+)
+def test_positions_are_checked(tx: object, rx: object, message: str) -> None:
+    with pytest.raises(PositionError, match=message):
+        trace_links(_room(), tx, rx)  # type: ignore[arg-type]
+
+
+def test_frequency_must_suit_the_material() -> None:
+    with pytest.raises(SettingsError, match="frequency_hz = 28000000000.0 .*'wet_ground' is defined for 1-10 GHz"):
+        trace_links(
+            _room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], scene_settings=SceneSettings(Material(itu="wet_ground"))
+        )
+
+
+def test_progress_ends_at_one() -> None:
+    seen: list[float] = []
+    trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], progress=lambda share, message: seen.append(share))
+    assert seen[0] == 0.0
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
