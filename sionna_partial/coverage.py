@@ -1,6 +1,8 @@
 """The answer: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
 
+import itertools
 import json
+import logging
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -36,6 +38,8 @@ NO_RECEIVER = 255
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
+
+_log = logging.getLogger(__name__)
 
 _LINK_FLAGS = {
     "flag_values": np.array([*LinkState, NO_RECEIVER], dtype=np.uint8),
@@ -147,7 +151,7 @@ def predict_map(
     scene_settings.material.require_frequency(trace_settings.frequency_hz)
     tx_m = _transmitter(partial, tx)
     receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
-    model = None if partial.is_complete else _predictor(predictor)
+    model = None if partial.is_complete else _predictor(predictor, trace_settings.frequency_hz)
     report = progress or (lambda share, message: None)
     links = trace_links(
         partial,
@@ -201,10 +205,17 @@ def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
     return tx_m
 
 
-def _predictor(predictor: Predictor | str | Path | None) -> Predictor:
-    if isinstance(predictor, Predictor):
-        return predictor
-    return Predictor.load() if predictor is None else Predictor.load(predictor)
+def _predictor(predictor: Predictor | str | Path | None, frequency_hz: float) -> Predictor:
+    model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+    trained_hz = model.settings.frequency_hz
+    if not math.isclose(trained_hz, frequency_hz, rel_tol=0.05):
+        _log.warning(
+            "predictor %r was trained at %g GHz, and is used at %g GHz: what it says of unobserved links is biased",
+            model.name,
+            trained_hz / 1e9,
+            frequency_hz / 1e9,
+        )
+    return model
 
 
 def _receivers(
@@ -217,16 +228,16 @@ def _receivers(
     x_m, y_m = _grid_axes(partial, spacing_m)
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     nearest_m = max(MIN_LEG_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4 * math.pi))
-    valid = np.linalg.norm(points - tx_m, axis=-1) >= nearest_m
-    for shift in (-MIN_LEG_M, MIN_LEG_M):
-        for other in (-MIN_LEG_M, MIN_LEG_M):
-            valid &= partial.state_at(points[..., :2] + (shift, other)) != CellState.WALL
+    cell_state = partial.state_at(points)
+    valid = (cell_state != CellState.WALL) & (np.linalg.norm(points - tx_m, axis=-1) >= nearest_m)
+    for corner in itertools.product((-MIN_LEG_M, MIN_LEG_M), repeat=2):
+        valid &= partial.state_at(points[..., :2] + corner) != CellState.WALL
     if not valid.any():
         raise PositionError(
             f"none of the {valid.size} receivers can stand: all are inside walls or at the transmitter; "
             f"spacing_m = {spacing_m:g}, give a smaller one."
         )
-    return _Receivers(x_m, y_m, partial.state_at(points), valid, points[valid])
+    return _Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
 def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -237,10 +248,11 @@ def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float6
     nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
     size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
     require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
-    enough = math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
-    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {1.01 * enough:.2g} or more."
+    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
+    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
     require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
-    return x0 + (np.arange(nx) + 0.5) * spacing_m, y0 + (np.arange(ny) + 0.5) * spacing_m
+    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
+    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
 
 
 def _variables(
@@ -256,8 +268,7 @@ def _variables(
         "unobserved_distance_m": phi.unobserved_distance_m,
         "distance_m": phi.distance_m,
     }
-    likeliest = np.argmax([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
-    states = {"link_state": likeliest, "partial_link_state": phi.link_state}
+    states = {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
     layers = {name: _spread(value, receivers.valid, np.float32(np.nan)) for name, value in values.items()}
     layers |= {name: _spread(value, receivers.valid, np.uint8(NO_RECEIVER)) for name, value in states.items()}
     return layers | {

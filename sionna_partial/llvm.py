@@ -90,8 +90,8 @@ def load_llvm() -> LlvmLibrary:
     """Load a libLLVM that works; later calls return what the first one found.
 
     Call it before importing mitsuba, drjit or sionna; whether TensorFlow was imported before does not matter.
-    The library is `DRJIT_LIBLLVM_PATH` where that is set, else that of karellen-llvm-core, else the newest of the system.
-    The first time on a machine it solves a few paths in a child process, which takes 3 to 5 s.
+    The library is `DRJIT_LIBLLVM_PATH` where that is set, else that of karellen-llvm-core, else the newest of the
+    system. The first time on a machine it solves a few paths in a child process, which takes 3 to 5 s.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def _started_library() -> Path | None:
 
 
 def _named_library(name: str) -> Path:
-    """The library that the user names: a path, or a bare name in the folders of the dynamic loader."""
+    """Library that the user names: a path, or a bare name in the folders of the dynamic loader."""
     if "/" in name:
         return Path(name).absolute()
     folders = os.environ.get("LD_LIBRARY_PATH", "").split(":") + _system_folders()
@@ -229,7 +229,14 @@ def _verdict(path: Path) -> _Verdict:
 def _cache_file(path: Path) -> Path | None:
     """Where the verdict on a library is kept: one file for each library, host software and processor."""
     stat = path.stat()
-    key = [str(path), stat.st_mtime_ns, stat.st_size, _host_version("drjit"), _host_version("sionna-rt"), _processor()]
+    key = [
+        str(path.resolve()),
+        stat.st_mtime_ns,
+        stat.st_size,
+        _host_version("drjit"),
+        _host_version("sionna-rt"),
+        _processor(),
+    ]
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:24]
     try:
         folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")

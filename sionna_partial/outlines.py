@@ -6,6 +6,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sionna_partial.constants import CellState
 from sionna_partial.partial_map import PartialMap
 from sionna_partial.wall_cells import wall_cells
 from sionna_partial.wall_chains import Chain, WallGraph, wall_chains
@@ -14,6 +15,7 @@ from sionna_partial.wall_lines import fit_runs
 
 _REACH_CELLS = 1.0
 _OFFSET_CELLS = 0.6
+_MIN_SHIFT_CELLS = 0.25
 _ROUNDS = 4
 
 
@@ -26,7 +28,8 @@ class Outlines:
     vertices_m : (V, 2) float64 array
         Ends of the segments [m]. Segments that meet share a vertex; every vertex is used.
     segments : (S, 2) int64 array
-        Indices into `vertices_m` of the two ends of every segment.
+        Indices into `vertices_m` of the two ends of every segment. Where just two segments meet, one ends and the other
+        begins.
     """
 
     vertices_m: NDArray[np.float64]
@@ -62,19 +65,31 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     Outlines
         Segments meet only at shared vertices.
     """
+    partial, corner = _crop(partial)
     walls = wall_cells(partial, bridge_gap_m)
     graph = wall_graph(partial, walls.cells, bridge_gap_m)
     chains = wall_chains(graph)
     places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
     fits = [_fit(places, shift, chain, tolerance_cells) for chain in chains]
-    plain: set[int] = set()
+    plain = {index for index, chain in enumerate(chains) if graph.points[chain.points[0], 0] % 2 == 0}
     for _ in range(_ROUNDS):
         lines = _polylines(graph, places, chains, fits, plain)
         crossing = _crossing_chains(lines)
         if not crossing - plain:
             break
         plain |= crossing
-    return _assemble(lines, partial.resolution_m)
+    return _assemble([line + corner for line in lines], partial.resolution_m)
+
+
+def _crop(partial: PartialMap) -> tuple[PartialMap, NDArray[np.float64]]:
+    """Cut a map to its walls and one cell around, and say where its lower-left corner was [cells]."""
+    wall = partial.state == CellState.WALL
+    bounds = [np.nonzero(wall.any(axis=axis))[0] if wall.any() else np.zeros(1, dtype=int) for axis in (0, 1)]
+    (left, right), (bottom, top) = ((int(used[0]), int(used[-1])) for used in bounds)
+    part = partial.state[max(bottom - 1, 0) : top + 2, max(left - 1, 0) : right + 2]
+    missing = [[int(bottom == 0), int(top + 1 == wall.shape[0])], [int(left == 0), int(right + 1 == wall.shape[1])]]
+    state = np.pad(part, missing, constant_values=CellState.UNKNOWN)
+    return PartialMap(state, partial.resolution_m), np.array([left - 1.0, bottom - 1.0])
 
 
 def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -96,14 +111,15 @@ def _fit(places: NDArray[np.float64], shift: NDArray[np.float64], chain: Chain, 
     first = corners[starts]
     mean = np.add.reduceat(shift[chain.points], first) / np.diff(np.append(first, len(points)))[:, None]
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
-    lines[:, :2] += (mean * normal).sum(axis=1, keepdims=True) * normal
+    offset = (mean * normal).sum(axis=1, keepdims=True)
+    lines[:, :2] += np.where(np.abs(offset) > _MIN_SHIFT_CELLS, offset, 0.0) * normal
     return _Fit(corners, starts, lines)
 
 
 def _polylines(
     graph: WallGraph, places: NDArray[np.float64], chains: list[Chain], fits: list[_Fit], plain: set[int]
 ) -> list[NDArray[np.float64]]:
-    """Vertices [cells] of every chain; chains in `plain` keep their lattice corners."""
+    """Vertices [cells] of every chain; chains in `plain` (squares, and where lines would cross) keep their corners."""
     nodes = _place_nodes(graph, places, chains, fits, plain)
     lines = []
     for index, (chain, fit) in enumerate(zip(chains, fits, strict=True)):
@@ -120,7 +136,7 @@ def _polylines(
                 route.append(_meet(fit, chain, places, k))
         if chain.closed and len(chain.points) - 1 not in fixed:
             route[0] = route[-1][-1:]
-        lines.append(np.round(np.concatenate(route), 6))
+        lines.append(np.round(np.concatenate(route), 6).astype(np.float64))
     return lines
 
 
@@ -146,11 +162,11 @@ def _place_nodes(
 
 
 def _closest(lines: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Point of least squared distance to lines (k, 4), near `place`; `place` itself if that is too far away."""
+    """Point of least squared distance to lines (k, 4), or the middle of the feet of `place` if that is far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
     offset = (normal * (lines[:, :2] - place)).sum(axis=1)
     moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
-    return place + moved if np.hypot(*moved) <= _REACH_CELLS else place
+    return place + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
 
 
 def _meet(fit: _Fit, chain: Chain, places: NDArray[np.float64], k: int) -> NDArray[np.float64]:
@@ -193,6 +209,7 @@ def _assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines
         return Outlines(np.zeros((0, 2)), np.zeros((0, 2), dtype=np.int64))
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
     vertices, inverse = np.unique(pairs.reshape(-1, 2), axis=0, return_inverse=True)
-    segments = np.unique(np.sort(inverse.reshape(-1, 2), axis=1), axis=0)
+    along = inverse.reshape(-1, 2)
+    segments = along[np.unique(np.sort(along, axis=1), axis=0, return_index=True)[1]]
     segments = segments[segments[:, 0] != segments[:, 1]]
     return Outlines(vertices * resolution_m, segments.astype(np.int64))

@@ -1,8 +1,10 @@
 """Every figure of the package."""
 
 import io
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -10,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
@@ -21,10 +24,11 @@ from sionna_partial.settings import require
 STATE_COLOURS = {LinkState.LOS: "#ddaa33", LinkState.NLOS: "#bb5566", LinkState.OUTAGE: "#004488"}
 """Paul Tol's high-contrast colours: told apart with any colour vision and in grey, the better the brighter."""
 
-_WIDTH_IN = 12.0
-_KEY_IN = 1.0
-_DPI = 150
-_WIDE = 1.8
+_WIDTH_IN, _DPI, _MAX_PIXELS = 12.0, 150, 3000
+_STACKED_ASPECT = 1.8
+_HATCH, _HATCH_COLOUR = "////", (1.0, 1.0, 1.0, 0.55)
+_UNSEEN_OPACITY = 0.45
+_STAR: dict[str, Any] = {"marker": "*", "markersize": 13, "markerfacecolor": "white", "markeredgecolor": "black"}
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,7 @@ class _Layer:
     title: str
     picture: Callable[[xr.Dataset], NDArray[np.float64]]
     scale: ScalarMappable | None = None
+    unit: str = ""
     extend: str = "neither"
 
 
@@ -59,12 +64,14 @@ GAIN = _Layer(
     "Path gain, mean",
     lambda data: data["gain_mean_db"].to_numpy(),
     ScalarMappable(Normalize(-150.0, -60.0), "viridis"),
+    "mean [dB]",
     "max",
 )
 DEVIATION = _Layer(
     "Path gain, standard deviation",
     lambda data: data["gain_std_db"].to_numpy(),
-    ScalarMappable(Normalize(0.0, 40.0), "cividis"),
+    ScalarMappable(Normalize(0.0, 40.0), "magma_r"),
+    "standard deviation [dB]",
     "max",
 )
 
@@ -91,14 +98,15 @@ def plot_coverage(coverage: xr.Dataset) -> Figure:
         For a Dataset that is no coverage map.
     """
     require_coverage(coverage)
-    wide = _aspect(coverage) > _WIDE
-    layers = np.array([[LINK_STATE, GAIN, DEVIATION]])
-    layers = layers.T if wide else layers
-    figure, axes = _panels(layers, _aspect(coverage), keys_right=wide)
-    for axis, layer in zip(axes.flat, layers.flat, strict=True):
+    wide = _aspect(coverage) > _STACKED_ASPECT
+    layers = [LINK_STATE, GAIN, DEVIATION]
+    rows = [[layer] for layer in layers] if wide else [layers]
+    figure, axes = _panels(rows, _aspect(coverage), keys_right=wide)
+    for axis, layer in zip(itertools.chain(*axes), layers, strict=True):
         _draw(axis, coverage, layer)
         axis.set_title(layer.title)
     figure.suptitle(_headline(coverage))
+    _add_legend(figure, unseen_walls=False)
     return figure
 
 
@@ -124,14 +132,15 @@ def plot_comparison(coverages: Mapping[str, xr.Dataset]) -> Figure:
     for coverage in coverages.values():
         require_coverage(coverage)
     first = next(iter(coverages.values()))
-    layers = np.array([[LINK_STATE] * len(coverages), [GAIN] * len(coverages)])
-    figure, axes = _panels(layers, _aspect(first), keys_right=True)
-    for row, column in np.ndindex(axes.shape):
-        title, coverage = list(coverages.items())[column]
-        _draw(axes[row, column], coverage, layers[row, column], first)
-        if row == 0:
-            axes[row, column].set_title(title)
+    rows = [[layer] * len(coverages) for layer in (LINK_STATE, GAIN)]
+    figure, axes = _panels(rows, _aspect(first), keys_right=True)
+    for row, layer in zip(axes, (LINK_STATE, GAIN), strict=True):
+        for axis, coverage in zip(row, coverages.values(), strict=True):
+            _draw(axis, coverage, layer, first)
+    for axis, title in zip(axes[0], coverages, strict=True):
+        axis.set_title(title)
     figure.suptitle(_headline(first))
+    _add_legend(figure, unseen_walls=True)
     return figure
 
 
@@ -151,30 +160,26 @@ def _headline(coverage: xr.Dataset) -> str:
     return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
 
 
-def _panels(
-    layers: NDArray[np.object_], aspect: float, *, keys_right: bool
-) -> tuple[Figure, NDArray[np.object_]]:
+def _panels(layers: list[list[_Layer]], aspect: float, *, keys_right: bool) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure with a panel for each layer, and a key for each row (`keys_right`) or column."""
-    rows, columns = layers.shape
-    width = (_WIDTH_IN - 1.0 - (_KEY_IN if keys_right else 0.0)) / columns - 0.2
-    height = min(max(width / aspect, 0.8), 12.0)
-    size = (_WIDTH_IN, rows * (height + 0.45) + 0.8 + (0.0 if keys_right else _KEY_IN))
+    rows, columns = len(layers), len(layers[0])
+    key_width, key_height = (1.1, 0.0) if keys_right else (0.0, 0.85)
+    width = (_WIDTH_IN - 0.8 - key_width) / columns - 0.1
+    height = min(max(width / aspect, 1.2), 12.0)
+    size = (_WIDTH_IN, rows * (height + 0.3) + 1.15 + key_height)
     figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
     grid = figure.add_gridspec(
         rows + (not keys_right),
         columns + keys_right,
-        width_ratios=[width] * columns + [_KEY_IN] * keys_right,
-        height_ratios=[height] * rows + [_KEY_IN] * (not keys_right),
+        width_ratios=[width] * columns + [key_width] * keys_right,
+        height_ratios=[height] * rows + [key_height] * (not keys_right),
     )
-    axes = np.empty(layers.shape, dtype=object)
-    for place in np.ndindex(layers.shape):
-        axes[place] = figure.add_subplot(grid[place], sharex=axes[0, 0], sharey=axes[0, 0])
-        axes[place].label_outer()
-    for axis in axes[-1]:
-        axis.set_xlabel("x [m]")
-    for axis in axes[:, 0]:
-        axis.set_ylabel("y [m]")
-    for index, layer in enumerate(layers[:, 0] if keys_right else layers[0]):
+    axes = [[figure.add_subplot(grid[row, column]) for column in range(columns)] for row in range(rows)]
+    for row, column in itertools.product(range(rows), range(columns)):
+        lowest, leftmost = row == rows - 1, column == 0
+        axes[row][column].tick_params(labelbottom=lowest, labelleft=leftmost)
+        axes[row][column].set(xlabel="x [m]" if lowest else "", ylabel="y [m]" if leftmost else "")
+    for index, layer in enumerate([row[0] for row in layers] if keys_right else layers[0]):
         key = figure.add_subplot(grid[index, columns] if keys_right else grid[rows, index])
         key.set_axis_off()
         _draw_key(key, layer, upright=keys_right)
@@ -186,40 +191,41 @@ def _draw_key(key: Axes, layer: _Layer, *, upright: bool) -> None:
     if layer.scale is None:
         _draw_triangle(key)
         return
-    place = (0.1, 0.05, 0.2, 0.9) if upright else (0.05, 0.6, 0.9, 0.18)
+    place = (0.05, 0.05, 0.17, 0.9) if upright else (0.05, 0.7, 0.9, 0.2)
     orientation = "vertical" if upright else "horizontal"
     bar = key.figure.colorbar(layer.scale, cax=key.inset_axes(place), orientation=orientation, extend=layer.extend)
-    bar.set_label(f"{layer.title} [dB]")
+    bar.set_label(layer.unit)
 
 
 def _draw_triangle(key: Axes) -> None:
     """Draw every mixture of the three states: LOS at the left, NLOS at the right, outage at the top."""
+    height = 3**0.5 / 2
     x, y = np.meshgrid(np.linspace(0.0, 1.0, 200), np.linspace(0.0, 1.0, 200))
     p_nlos = x - y / 2
     picture = np.clip(mix_state_colours(1.0 - p_nlos - y, p_nlos, y), 0.0, 1.0)
-    key.set_aspect("equal")
-    key.set(xlim=(-0.5, 1.5), ylim=(-0.2, 1.1))
-    image = key.imshow(picture, extent=(0.0, 1.0, 0.0, 3**0.5 / 2), origin="lower", interpolation="bilinear")
-    outline = Polygon([(0.0, 0.0), (1.0, 0.0), (0.5, 3**0.5 / 2)], fill=False, edgecolor="0.3", linewidth=0.6)
+    image = key.imshow(picture, extent=(0.0, 1.0, 0.0, height), origin="lower", interpolation="bilinear")
+    outline = Polygon([(0.0, 0.0), (1.0, 0.0), (0.5, height)], fill=False, edgecolor="0.3", linewidth=0.6)
     key.add_patch(outline)
     image.set_clip_path(outline)
-    key.text(-0.06, 0.0, "LOS", ha="right", va="center")
-    key.text(1.06, 0.0, "NLOS", ha="left", va="center")
-    key.text(0.5, 0.9, "outage", ha="center", va="bottom")
+    key.set(xlim=(-0.4, 1.4), ylim=(-0.1, 1.25), aspect="equal")
+    for x_text, y_text, name, align in ((-0.06, 0.0, "LOS", "right"), (1.06, 0.0, "NLOS", "left")):
+        key.text(x_text, y_text, name, ha=align, va="center")
+    key.text(0.5, height + 0.05, "outage", ha="center", va="bottom")
 
 
 def _draw(axis: Axes, coverage: xr.Dataset, layer: _Layer, reference: xr.Dataset | None = None) -> None:
     """Draw one layer, the unknown area, the walls and the transmitter."""
     extent = _extent(coverage)
-    picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy())
-    options = {} if layer.scale is None else {"norm": layer.scale.norm, "cmap": layer.scale.cmap}
-    axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", **options)
+    wall = _walls(coverage)
+    picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
+    norm, cmap = (layer.scale.norm, layer.scale.cmap) if layer.scale else (None, None)
+    axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)
     _hatch_unknown(axis, coverage)
     if reference is not None:
-        _draw_walls(axis, reference, 0.5)
-    _draw_walls(axis, coverage, 1.0)
+        axis.imshow(_shade(_walls(reference), _UNSEEN_OPACITY), extent=_extent(reference), origin="lower", zorder=3)
+    axis.imshow(_shade(wall, 1.0), extent=extent, origin="lower", zorder=3)
     x, y, _ = coverage.attrs["transmitter_m"]
-    axis.plot(x, y, "*", markersize=13, markerfacecolor="white", markeredgecolor="black", markeredgewidth=1.0)
+    axis.plot(x, y, zorder=4, **_STAR)
     axis.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
 
 
@@ -229,32 +235,56 @@ def _extent(coverage: xr.Dataset) -> tuple[float, float, float, float]:
     return x[0] - half, x[-1] + half, y[0] - half, y[-1] + half
 
 
-def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Let cells without a receiver show their nearest neighbour, which the walls drawn over them leave bare."""
-    if valid.all() or not valid.any():
-        return picture
-    row, column = distance_transform_edt(~valid, return_distances=False, return_indices=True)
-    return picture[row, column]
+def _walls(coverage: xr.Dataset) -> NDArray[np.bool_]:
+    """Where walls are, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
+    bits = coverage["wall_parts"].to_numpy()
+    fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
+    merge = WALL_PARTS // fine
+    wall = np.zeros((bits.shape[0], fine, bits.shape[1], fine), dtype=bool)
+    for row, column in np.ndindex(WALL_PARTS, WALL_PARTS):
+        wall[:, row // merge, :, column // merge] |= (bits >> (WALL_PARTS * row + column) & 1).astype(bool)
+    return wall.reshape(bits.shape[0] * fine, bits.shape[1] * fine)
+
+
+def _shade(wall: NDArray[np.bool_], opacity: float) -> NDArray[np.uint8]:
+    """Paint walls black, the rest transparent."""
+    picture = np.zeros((*wall.shape, 4), dtype=np.uint8)
+    picture[..., 3] = np.uint8(255 * opacity) * wall
+    return picture
+
+
+def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Refine a picture to the size of `wall`, and let what no receiver's cell covers show its nearest neighbour.
+
+    A wall thinner than a cell leaves a strip of cells without receiver bare; this is for the eye alone.
+    """
+    fine = wall.shape[0] // valid.shape[0]
+    bare = ~valid.repeat(fine, axis=0).repeat(fine, axis=1)
+    row, column = np.indices(bare.shape)
+    if bare.any() and not bare.all():
+        row, column = distance_transform_edt(bare, return_distances=False, return_indices=True)
+    return picture[row // fine, column // fine]
 
 
 def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
+    """Hatch the cells that the map does not know."""
     unknown = np.pad(~coverage["observed"].to_numpy(), 1, mode="edge").astype(float)
-    if not 0 < unknown.sum():
+    if not unknown.any():
         return
-    spacing_m = coverage.attrs["spacing_m"]
-    x, y = (np.pad(coverage[name].to_numpy(), 1, mode="reflect", reflect_type="odd") for name in ("x", "y"))
-    veil = axis.contourf(x, y, unknown, levels=[0.5, 1.5], colors="none", hatches=["////"])
-    veil.set_edgecolor((1, 1, 1, 0.55))
-    veil.set_linewidth(0.8)
-    veil.set_hatch_linewidth(0.6)
+    step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
+    x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
+    area = axis.contourf(x, y, unknown, levels=[0.5, 1.5], colors="none", hatches=[_HATCH], zorder=2)
+    area.set_edgecolor(_HATCH_COLOUR)
+    area.set_linewidth(0.8)
+    area.set_hatch_linewidth(0.6)
 
 
-def _draw_walls(axis: Axes, coverage: xr.Dataset, opacity: float) -> None:
-    bits = coverage["wall_parts"].to_numpy()[:, None, :, None] >> np.arange(WALL_PARTS**2).reshape(
-        1, WALL_PARTS, 1, WALL_PARTS
-    )
-    ny, nx = coverage.sizes["y"], coverage.sizes["x"]
-    wall = (bits & 1).reshape(ny * WALL_PARTS, nx * WALL_PARTS)
-    picture = np.zeros((*wall.shape, 4))
-    picture[..., 3] = opacity * wall
-    axis.imshow(picture, extent=_extent(coverage), origin="lower", interpolation="nearest")
+def _add_legend(figure: Figure, *, unseen_walls: bool) -> None:
+    handles = [
+        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
+        Patch(facecolor="black", label="wall"),
+        Patch(facecolor="0.5", hatch=_HATCH, edgecolor=_HATCH_COLOUR, label="not observed"),
+    ]
+    if unseen_walls:
+        handles.insert(2, Patch(facecolor="black", alpha=_UNSEEN_OPACITY, label="wall, not observed"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)

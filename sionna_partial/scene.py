@@ -18,6 +18,7 @@ from sionna_partial.map_files import save_map
 from sionna_partial.outlines import wall_outlines
 from sionna_partial.partial_map import PartialMap
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+from sionna_partial.wall_cells import row_runs
 
 FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
@@ -40,6 +41,8 @@ class SceneGeometry:
         Walls, as indices into `vertices_m`.
     floor_m : (R, 4) float64 array
         Rectangles x0, y0, x1, y1 of floor and ceiling [m]; they do not overlap.
+    cell_m : float
+        Edge of the square lattice that the rectangles lie on [m].
     height_m : float
         Height of walls and ceiling [m].
     material : Material
@@ -51,6 +54,7 @@ class SceneGeometry:
     vertices_m: NDArray[np.float64]
     segments: NDArray[np.int64]
     floor_m: NDArray[np.float64]
+    cell_m: float
     height_m: float
     material: Material
     origin_m: tuple[float, float]
@@ -76,7 +80,8 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
-        floor_m=_rectangles(_floor_cells(partial, settings.floor_extent)) * partial.resolution_m,
+        floor_m=_rectangles(_floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
+        cell_m=partial.resolution_m,
         height_m=partial.wall_height_m,
         material=settings.material,
         origin_m=partial.origin_m,
@@ -206,30 +211,29 @@ def _itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
 def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]]:
     """Vertices (V, 3) [m] and triangles (F, 3) of each mesh, in the local frame."""
     low = np.column_stack([geometry.vertices_m, np.zeros(len(geometry.vertices_m))])
-    high = low + [0.0, 0.0, geometry.height_m]
+    up = np.array([0.0, 0.0, geometry.height_m])
     (a, b), count = geometry.segments.T, len(low)
     walls = np.stack([a, b, b + count, a, b + count, a + count], axis=1).reshape(-1, 3)
-    corners, triangles = _triangles(geometry.floor_m)
+    corners, triangles = _triangles(geometry.floor_m, geometry.cell_m)
     floor = np.column_stack([corners, np.zeros(len(corners))])
-    ceiling = floor + [0.0, 0.0, geometry.height_m]
     return {
-        "walls": (np.concatenate([low, high]), walls),
+        "walls": (np.concatenate([low, low + up]), walls),
         "floor": (floor, triangles),
-        "ceiling": (ceiling, triangles[:, ::-1]),
+        "ceiling": (floor + up, triangles[:, ::-1]),
     }
 
 
-def _triangles(rectangles_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _triangles(rectangles_m: NDArray[np.float64], cell_m: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Corners (V, 2) and counterclockwise triangles (F, 3) of an area.
 
     Triangles share whole edges: an edge inside the area must not look like the rim of a screen, which diffracts.
     """
-    area = shapely.simplify(shapely.union_all(shapely.box(*rectangles_m.T)), 0.0)
+    area = shapely.simplify(shapely.union_all(shapely.box(*np.rint(rectangles_m / cell_m).T)), 0.0)
     pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
     rings = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3]
     corners, index = np.unique(rings.reshape(-1, 2), axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
-    return corners, triangles[np.lexsort(triangles.T)].astype(np.int64)
+    return corners * cell_m, triangles[np.lexsort(triangles.T)].astype(np.int64)
 
 
 def _floor_cells(partial: PartialMap, extent: str) -> NDArray[np.bool_]:
@@ -245,14 +249,10 @@ def _floor_cells(partial: PartialMap, extent: str) -> NDArray[np.bool_]:
 
 def _rectangles(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Cover the cells of a mask exactly by few rectangles x0, y0, x1, y1 in cells: equal runs of rows merge."""
-    ny, nx = mask.shape
-    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    row, start = np.nonzero(step == 1)
-    end = np.nonzero(step == -1)[1]
+    row, start, end = row_runs(mask)
     order = np.lexsort((row, end, start))
     row, start, end = row[order], start[order], end[order]
-    new = np.ones(len(row), dtype=bool)
-    new[1:] = (np.diff(start) != 0) | (np.diff(end) != 0) | (np.diff(row) != 1)
+    new = (np.diff(start, prepend=-1) != 0) | (np.diff(end, prepend=-1) != 0) | (np.diff(row, prepend=-2) != 1)
     first = np.nonzero(new)[0]
     last = np.append(first[1:], len(row)) - 1 if len(row) else first
     rectangles = np.stack([start[first], row[first], end[first], row[last] + 1], axis=1)

@@ -217,6 +217,6 @@ class TraceSettings:
             require(isinstance(value, bool), name, value, "give True or False.")
 
     @property
-    def specular_only(self) -> bool:
-        """Whether only line of sight and specular reflection are traced."""
-        return not (self.diffraction or self.refraction or self.diffuse_reflection)
+    def shoots_rays(self) -> bool:
+        """Whether rays are shot: refraction and diffuse reflection have no exact candidates."""
+        return self.refraction or self.diffuse_reflection

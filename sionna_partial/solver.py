@@ -8,7 +8,8 @@ way `ImageMethod` verifies every path and `FieldCalculator` gives every coeffici
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -16,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.beams import CEILING, FLOOR, SpecularCandidates
+from sionna_partial.candidates import CEILING, EDGE, FLOOR, Candidates
+from sionna_partial.diffraction import Wedges
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.settings import TraceSettings
@@ -94,10 +96,46 @@ class SceneSolver:
         self._image_method = rt.path_solvers.image_method.ImageMethod()
         self._field_calculator = rt.path_solvers.field_calculator.FieldCalculator()
 
-    def verify(self, candidates: SpecularCandidates) -> SolvedPaths:
+    def verify(self, candidates: Candidates) -> SolvedPaths:
         """Verify specular candidates and compute their coefficients."""
-        buffer = self._specular_buffer(candidates)
-        return self._solve(buffer, self._rx_m, diffraction=False)
+        buffer = self._candidate_buffer(candidates)
+        return self._solve(buffer, self._rx_m, diffraction=len(candidates.wedge) > 0)
+
+    @property
+    def wedges(self) -> Wedges:
+        """Vertical edges of the walls as Sionna RT sees them: corners, and free ends, which it takes for screens."""
+        place, normals = self._wedge_table.o.numpy(), (self._wedge_table.n0.numpy(), self._wedge_table.nn.numpy())
+        count = place.shape[1] // 2
+        normal_0, normal_n = (normal[:2, :count].T.astype(np.float64) for normal in normals)
+        return Wedges(place[:2, :count].T.astype(np.float64), normal_0, normal_n)
+
+    @cached_property
+    def _wedge_table(self) -> Any:
+        """Sionna RT's wedges along the vertical edges, once as they are and once with their faces swapped.
+
+        Segment s of the walls is made of the triangles 2 s and 2 s + 1 (see `write_scene`). Edge 1 of the one and edge
+        2 of the other are vertical.
+        """
+        import drjit as dr
+        import mitsuba as mi
+        from sionna.rt.utils.wedges import WedgeGeometry, wedge_geometry
+
+        if "walls" not in self._scene.objects:
+            return WedgeGeometry.build_with_size(0)
+        walls = self._scene.objects["walls"]
+        primitive = np.arange(walls.mi_mesh.face_count(), dtype=np.uint32)
+        local_edge = 1 + primitive % 2
+        shape = dr.reinterpret_array(mi.MeshPtr, dr.full(mi.UInt, walls.object_id, len(primitive)))
+        every = wedge_geometry(shape, mi.UInt(primitive), mi.UInt(local_edge))
+        ends = np.sort([every.prim0.numpy(), every.primn.numpy()], axis=0)
+        _, first = np.unique(ends, axis=1, return_index=True)
+        flat = (every.n0.numpy() * every.nn.numpy()).sum(axis=0) > 1.0 - 1e-6
+        kept = first[~flat[first]]
+        swapped = mi.Bool(np.repeat([False, True], len(kept)))
+        table = dr.gather(WedgeGeometry, every, mi.UInt(np.tile(kept, 2).astype(np.uint32)))
+        table.swap_faces(swapped)
+        dr.eval(table)
+        return table
 
     def shoot(self) -> Iterator[SolvedPaths]:
         """Find paths of every enabled kind by shooting rays, one receiver at a time.
@@ -137,22 +175,29 @@ class SceneSolver:
             paths = self._solve(buffer, position[None], diffraction=settings.diffraction)
             yield SolvedPaths(paths.path_rx + np.int32(index), *(getattr(paths, name) for name in _FIELDS[1:]))
 
-    def _specular_buffer(self, candidates: SpecularCandidates) -> Any:
-        """Fill one of Sionna RT's path buffers with unverified specular chains."""
+    def _candidate_buffer(self, candidates: Candidates) -> Any:
+        """Fill one of Sionna RT's path buffers with unverified candidates."""
+        import drjit as dr
         import mitsuba as mi
         from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE, InteractionType
         from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+        from sionna.rt.utils.wedges import WedgeGeometry
 
         count, depth = candidates.surface.shape
         surface = candidates.surface
         shape = np.full(surface.shape, INVALID_SHAPE, np.uint32)
-        for name, where in (("walls", surface >= 0), ("floor", surface == FLOOR), ("ceiling", surface == CEILING)):
+        for name, where in (("walls", (surface >= 0) | (surface == EDGE)), ("floor", surface == FLOOR), ("ceiling", surface == CEILING)):
             if where.any():
                 shape[where] = self._scene.objects[name].object_id
         primitive = np.where(surface >= 0, 2 * surface, 0).astype(np.uint32)
         primitive[surface == -1] = INVALID_PRIMITIVE
         kind = np.where(surface == -1, InteractionType.NONE, InteractionType.SPECULAR).astype(np.uint32)
-        buffer = PathsBuffer(count, depth, False)
+        buffer = PathsBuffer(count, depth, len(candidates.wedge) > 0)
+        if len(candidates.wedge):
+            wedges = dr.gather(WedgeGeometry, self._wedge_table, mi.UInt(candidates.wedge.astype(np.uint32)))
+            primitive[surface == EDGE] = wedges.prim0.numpy()
+            kind[surface == EDGE] = InteractionType.DIFFRACTION
+            buffer._diffracting_wedges = wedges
         x, y, z = np.moveaxis(candidates.vertices_m.astype(np.float32), 2, 0)
         buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (mi.TensorXf(v.copy()) for v in (x, y, z))
         buffer._shapes, buffer._primitives = mi.TensorXu(shape), mi.TensorXu(primitive)
@@ -209,7 +254,16 @@ def concatenate_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
         np.zeros((0, depth), np.uint8),
         np.zeros((0, depth, 3)),
     )
-    return SolvedPaths(*(np.concatenate([getattr(part, name) for part in [empty, *parts]]) for name in _FIELDS))
+    parts = [empty, *(_padded(part, depth) for part in parts)]
+    return SolvedPaths(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS))
+
+
+def _padded(paths: SolvedPaths, depth: int) -> SolvedPaths:
+    """Widen the interactions of paths to `depth`."""
+    more = ((0, 0), (0, depth - paths.interactions.shape[1]))
+    interactions = np.pad(paths.interactions, more)
+    vertices_m = np.pad(paths.vertices_m, (*more, (0, 0)), constant_values=math.nan)
+    return replace(paths, interactions=interactions, vertices_m=vertices_m)
 
 
 def _read_buffer(buffer: Any, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> SolvedPaths:

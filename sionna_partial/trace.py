@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.beams import specular_candidates, trace_beams
+from sionna_partial.beams import trace_beams
+from sionna_partial.candidates import Candidates, specular_candidates
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.diffraction import diffraction_candidates
 from sionna_partial.errors import PositionError
 from sionna_partial.map_files import load_map
 from sionna_partial.partial_map import PartialMap
@@ -164,26 +166,34 @@ def _solve_blocks(
         return
     report(0.02, "starting Sionna RT")
     solver = SceneSolver(xml, settings, tx_m, rx_m)
-    if not settings.specular_only:
+    if settings.shoots_rays:
         for done, paths in enumerate(solver.shoot()):
             yield paths
             report(0.1 + 0.9 * (done + 1) / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
         return
-    walls_m = geometry.vertices_m[geometry.segments]
-    report(0.05, f"tracing beams among {len(walls_m)} walls")
-    beams = trace_beams(walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
-    blocks = specular_candidates(
-        beams,
-        walls_m,
-        tx_m,
-        rx_m,
-        height_m=geometry.height_m,
-        horizontal=len(geometry.floor_m) > 0,
-        max_depth=settings.max_depth,
-    )
-    for candidates, share_done in blocks:
+    for candidates, share_done, message in _candidates(geometry, settings, solver, tx_m, rx_m):
         yield solver.verify(candidates)
-        report(0.1 + 0.9 * share_done, "verifying paths")
+        report(0.1 + 0.9 * share_done, message)
+
+
+def _candidates(
+    geometry: SceneGeometry,
+    settings: TraceSettings,
+    solver: SceneSolver,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+) -> Iterator[tuple[Candidates, float, str]]:
+    """Exact candidates in blocks, with the share of the work done and its name."""
+    walls_m = geometry.vertices_m[geometry.segments]
+    extent = {"height_m": geometry.height_m, "horizontal": len(geometry.floor_m) > 0, "max_depth": settings.max_depth}
+    beams = trace_beams(walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
+    part = 0.2 if settings.diffraction else 1.0
+    for candidates, share in specular_candidates(beams, walls_m, tx_m, rx_m, **extent):
+        yield candidates, part * share, "verifying reflections"
+    if not settings.diffraction:
+        return
+    for candidates, share in diffraction_candidates(walls_m, solver.wedges, tx_m, rx_m, **extent):
+        yield candidates, part + (1.0 - part) * share, "verifying diffractions"
 
 
 def _link_summary(paths: SolvedPaths, count: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:

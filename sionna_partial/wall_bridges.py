@@ -74,9 +74,7 @@ def _crossed_states(
     return walled, free
 
 
-def _end_directions(
-    graph: WallGraph, ends: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _end_directions(graph: WallGraph, ends: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Outward unit vectors (V, 2) of wall ends, zero elsewhere, and the cells of straight wall behind them."""
     directions, cells = np.zeros((len(graph.points), 2)), np.zeros(len(graph.points), dtype=np.int64)
     beside = graph.neighbours()

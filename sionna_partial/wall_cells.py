@@ -63,9 +63,9 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     free = partial.state == CellState.FREE
     for _ in range(2):
         for view in _orientations(wall):
-            _fill_notches(view)
-        for view in _orientations(wall):
             _shave_bumps(view)
+        for view in _orientations(wall):
+            _fill_notches(view)
     for cells, is_free in ((wall, free), (wall.T, free.T)):
         _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
     return _thin(wall, free)
@@ -79,7 +79,7 @@ def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp
 
 
 def _orientations(mask: NDArray[np.bool_]) -> Iterator[NDArray[np.bool_]]:
-    """Views of a mask with each of its four sides at row 0."""
+    """Yield views of a mask with each of its four sides at row 0."""
     yield from (mask, mask[::-1], mask.T, mask.T[::-1])
 
 
@@ -134,12 +134,22 @@ def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> CleanWalls:
     small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
     kept = _thick(wall) | np.array(small, dtype=bool)[label]
     facing = ndimage.binary_dilation(free, structure=_SQUARE)
+    kept |= ~ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
+    width, height = _run_lengths(wall), _run_lengths(wall.T).T
     thinned = np.pad(wall, 1)
-    for removable in (np.pad(~kept & ~facing, 1), np.pad(~kept, 1)):
-        for dy, dx in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+    for removable in (~kept & ~facing, ~kept):
+        for (dy, dx), across in (((1, 0), height), ((-1, 0), height), ((0, 1), width), ((0, -1), width)):
             side = ~np.roll(thinned, (-dy, -dx), (0, 1))
-            _peel(thinned, removable & side & _in_block(thinned))
+            _peel(thinned, side & np.pad(removable & (across <= np.minimum(width, height)), 1))
     return CleanWalls(thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing)
+
+
+def _run_lengths(wall: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Length of the horizontal run of wall through every cell, at most 255; 0 elsewhere."""
+    _, start, end = row_runs(wall)
+    length = np.zeros(wall.shape, dtype=np.uint8)
+    length[wall] = np.repeat(np.minimum(end - start, 255), end - start)
+    return length
 
 
 def _thick(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -151,11 +161,6 @@ def _thick(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
     solid[label[squares]] = True
     solid[0] = False
     return squares | solid[label]
-
-
-def _in_block(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells that belong to a full block of two by two wall cells."""
-    return ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
 
 
 def _peel(wall: NDArray[np.bool_], candidates: NDArray[np.bool_]) -> None:

@@ -1,6 +1,7 @@
 """A graph of wall edges -> chains that run straight through junctions."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,14 +72,15 @@ def wall_chains(graph: WallGraph) -> list[Chain]:
     """
     beside = graph.neighbours()
     onward = _onward(graph, beside)
-    chains, used = [], set()
+    chains: list[Chain] = []
+    used: set[tuple[int, int]] = set()
     starts = [(a, b) for a, near in enumerate(beside) if len(near) != 2 for b in near if onward.get((b, a)) is None]
     rest = [(a, b) for a, b in graph.edges.tolist()]
     for a, b in starts + rest:
         if (a, b) not in used:
             points = _walk(a, b, beside, onward)
-            used.update(zip(points[:-1], points[1:], strict=True))
-            used.update(zip(points[1:], points[:-1], strict=True))
+            used.update(pairwise(points))
+            used.update(pairwise(points[::-1]))
             closed = points[0] == points[-1]
             chains.append(Chain(_rotate(graph, points) if closed else points, closed))
     return chains

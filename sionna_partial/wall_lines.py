@@ -9,9 +9,7 @@ _RESIDUAL_COST = 16.0
 _STEEPEST = 1.05
 
 
-def fit_runs(
-    points: NDArray[np.float64], tolerance: float
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Split a polyline of straight elements into few straight runs.
 
     A run is allowed if one line passes within `tolerance` of the middle of every unit edge, measured along x or y
@@ -43,7 +41,7 @@ def fit_runs(
 
 @njit(cache=True)
 def _best_split(points, tolerance):  # type: ignore[no-untyped-def]
-    """Starts of the cheapest runs, and whether each runs along y rather than x: dynamic programming."""
+    """Find the starts of the cheapest runs, and whether each runs along y rather than x, by dynamic programming."""
     n = len(points)
     cost = np.full(n, np.inf)
     cost[0] = 0.0

@@ -1,0 +1,63 @@
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+BIN := .venv/bin
+READY := .venv/.ready
+# Two test processes share two cores: one thread each.
+ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
+
+.PHONY: help demo test lint format lock scenes predictor wheel wheel-check clean
+
+help: ## List what can be made
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
+
+demo: $(READY) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
+	@$(BIN)/sionna-partial demo --out demo-output
+
+test: lint ## Check style and types, and run the tests
+	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2
+
+lint: $(READY) ## Check style and types
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+
+format: $(READY) ## Format the code
+	@$(BIN)/ruff check --fix .
+	@$(BIN)/ruff format .
+
+lock: $(READY) ## Lock the newest allowed dependencies from PyPI in requirements.lock
+	@env -u PIP_FIND_LINKS -u PIP_EXTRA_INDEX_URL PIP_CONFIG_FILE=/dev/null CUSTOM_COMPILE_COMMAND="make lock" \
+		$(BIN)/pip-compile --upgrade --extra dev --generate-hashes --allow-unsafe --strip-extras --quiet \
+		--no-emit-index-url --no-emit-find-links --no-emit-trusted-host --output-file requirements.lock pyproject.toml
+
+scenes: $(READY) ## Make the demo scenes again (scenes/)
+	@$(BIN)/python scenes/make_scenes.py
+
+predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
+	@$(BIN)/python benchmarks/train_paper_predictor.py
+
+wheel: $(READY) ## Build the wheel (dist/)
+	@$(BIN)/python -m build --wheel --no-isolation
+
+wheel-check: $(READY) ## Install the wheel in a new environment, and run the demo there
+	@$(BIN)/python -m pytest -m slow tests/test_wheel.py
+
+clean: ## Remove what was made, the environment too
+	@rm -rf .venv build dist demo-output .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(READY): requirements.lock pyproject.toml
+	@python=; for name in python3.11 python3.12 python3.13 python3; do \
+		if "$$name" -c 'import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; \
+		then python=$$name; break; fi; done; \
+	if [ -z "$$python" ]; then \
+		echo "error: no Python 3.11, 3.12 or 3.13 with venv was found: install python3.11 (Debian: python3.11-venv too)." >&2; \
+		exit 2; fi; \
+	echo "setting up .venv with $$("$$python" --version) (a few minutes, 3 GB)"; \
+	"$$python" -m venv --clear .venv
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --only-binary :all: --require-hashes \
+		-r requirements.lock
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@

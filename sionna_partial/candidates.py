@@ -1,0 +1,218 @@
+"""Candidates of the path solver: chains of walls, with the reflections off floor and ceiling added.
+
+Floor and ceiling follow analytically: unfolded, the height of a path changes linearly along its way in the plan, so
+where it meets floor and ceiling depends on the length of that way alone.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sionna_partial.beams import Beams
+
+FLOOR = -2
+"""Surface index of the floor in a candidate."""
+
+CEILING = -3
+"""Surface index of the ceiling in a candidate."""
+
+EDGE = -4
+"""Surface index of a vertical edge that diffracts in a candidate."""
+
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Geometrically possible paths, to be verified by the path solver.
+
+    Parameters
+    ----------
+    rx : (C,) int32 array
+        Receiver of each candidate.
+    surface : (C, D) int32 array
+        Wall segment (>= 0), FLOOR, CEILING or EDGE of every interaction in order from the transmitter; -1 where there
+        is none.
+    vertices_m : (C, D, 3) float64 array
+        Points of interaction [m].
+    wedge : (C,) int32 array
+        Wedge at which each candidate diffracts (see `Wedges`); empty if none does.
+    """
+
+    rx: NDArray[np.int32]
+    surface: NDArray[np.int32]
+    vertices_m: NDArray[np.float64]
+    wedge: NDArray[np.int32]
+
+
+def specular_candidates(
+    beams: Beams,
+    walls_m: NDArray[np.float64],
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    *,
+    height_m: float,
+    horizontal: bool,
+    max_depth: int,
+    pairs_per_block: int = 40_000,
+) -> Iterator[tuple[Candidates, float]]:
+    """Add the reflections off floor and ceiling, block by block.
+
+    Parameters
+    ----------
+    beams : Beams
+        Result of `trace_beams` for the same plan.
+    walls_m : (S, 2, 2) array
+        End points of the wall segments [m].
+    tx_m, rx_m : (3,) and (N, 3) arrays
+        Transmitter and receivers [m], between floor (z = 0) and ceiling.
+    height_m : float
+        Height of the ceiling [m].
+    horizontal : bool
+        Whether there are floor and ceiling at all.
+    max_depth : int
+        Largest number of interactions of a path.
+    pairs_per_block : int
+        Number of pairs in a block, which bounds the memory.
+
+    Yields
+    ------
+    Candidates
+    float
+        Share of all pairs done with this block.
+    """
+    for start in range(0, len(beams.pair_node), pairs_per_block):
+        stop = min(start + pairs_per_block, len(beams.pair_node))
+        candidates = Candidates(
+            *_expand_heights(
+                beams.parent,
+                beams.segment,
+                beams.source,
+                beams.pair_node[start:stop],
+                beams.pair_rx[start:stop],
+                walls_m,
+                tx_m,
+                rx_m,
+                height_m,
+                horizontal,
+                max_depth,
+            ),
+            wedge=np.zeros(0, np.int32),
+        )
+        yield candidates, stop / len(beams.pair_node)
+
+
+@njit(cache=True)
+def _expand_heights(  # type: ignore[no-untyped-def]
+    parent, segment, source, pair_node, pair_rx, walls, tx, rx, height, horizontal, max_depth
+):
+    """Every order of wall, floor and ceiling reflections of each pair (see `specular_candidates`)."""
+    depth_size = max(1, max_depth)
+    chain = np.empty(depth_size, np.int64)
+    place = np.empty((depth_size, 3))
+    total = 0
+    for i in range(len(pair_node)):
+        left = max_depth - chain_length(parent, pair_node[i])
+        total += 1 + 2 * left if horizontal else 1
+    out_rx = np.empty(total, np.int32)
+    surface = np.full((total, depth_size), -1, np.int32)
+    vertices = np.zeros((total, depth_size, 3))
+    count = 0
+    for i in range(len(pair_node)):
+        target = rx[pair_rx[i]]
+        k, _, good = unfold(parent, segment, source, pair_node[i], walls, target, chain, place)
+        if not good:
+            continue
+        for bounces in range(max_depth - k + 1 if horizontal else 1):
+            for first in range(2 if bounces else 1):
+                out_rx[count] = pair_rx[i]
+                merge_heights(
+                    chain[:k],
+                    place[:k],
+                    tx,
+                    target,
+                    height,
+                    bounces,
+                    FLOOR if first == 0 else CEILING,
+                    surface[count],
+                    vertices[count],
+                )
+                count += 1
+    return out_rx[:count].copy(), surface[:count].copy(), vertices[:count].copy()
+
+
+@njit(cache=True)
+def chain_length(parent, node):  # type: ignore[no-untyped-def]
+    length = 0
+    while parent[node] >= 0:
+        length += 1
+        node = parent[node]
+    return length
+
+
+@njit(cache=True)
+def unfold(parent, segment, source, node, walls, target, chain, place):  # type: ignore[no-untyped-def]
+    """Wall reflection points of one pair: (x, y, share of the path's length) in order from the transmitter.
+
+    Returns the number of reflections, the length of the way in the plan and whether all points exist.
+    """
+    k = chain_length(parent, node)
+    x, y = target[0], target[1]
+    total = np.hypot(x - source[node, 0], y - source[node, 1])
+    for level in range(k - 1, -1, -1):
+        sx, sy = source[node, 0], source[node, 1]
+        wall = walls[segment[node]]
+        dx, dy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
+        from_source = dx * (sy - wall[0, 1]) - dy * (sx - wall[0, 0])
+        from_point = dx * (y - wall[0, 1]) - dy * (x - wall[0, 0])
+        if abs(from_source - from_point) < 1e-15 or total == 0.0:
+            return k, total, False
+        share = from_source / (from_source - from_point)
+        x, y = sx + share * (x - sx), sy + share * (y - sy)
+        chain[level] = segment[node]
+        place[level] = (x, y, np.hypot(x - sx, y - sy) / total)
+        node = parent[node]
+    return k, total, True
+
+
+@njit(cache=True)
+def merge_heights(chain, place, tx, target, height, bounces, first, surface, vertices):  # type: ignore[no-untyped-def]
+    """Write one candidate: wall reflections and `bounces` alternating floor and ceiling reflections in path order."""
+    to_first = tx[2] if first == FLOOR else height - tx[2]
+    last_is_floor = (bounces % 2 == 1) == (first == FLOOR)
+    from_last = target[2] if last_is_floor else height - target[2]
+    climb = to_first + (bounces - 1) * height + from_last if bounces else 1.0
+    walls, flats = 0, 0
+    px, py, done = tx[0], tx[1], 0.0
+    for depth in range(len(chain) + bounces):
+        share = (to_first + flats * height) / climb if flats < bounces else 2.0
+        is_floor = (flats % 2 == 0) == (first == FLOOR)
+        if walls < len(chain) and place[walls, 2] <= share:
+            px, py, done = place[walls, 0], place[walls, 1], place[walls, 2]
+            surface[depth] = chain[walls]
+            vertices[depth] = (px, py, _height_at(done, tx[2], target[2], height, bounces, first, to_first, climb))
+            walls += 1
+            continue
+        nx, ny, stop = target[0], target[1], 1.0
+        if walls < len(chain):
+            nx, ny, stop = place[walls, 0], place[walls, 1], place[walls, 2]
+        part = (share - done) / (stop - done) if stop > done else 0.0
+        surface[depth] = FLOOR if is_floor else CEILING
+        vertices[depth] = (px + part * (nx - px), py + part * (ny - py), 0.0 if is_floor else height)
+        flats += 1
+
+
+@njit(cache=True)
+def _height_at(share, tx_z, rx_z, height, bounces, first, to_first, climb):  # type: ignore[no-untyped-def]
+    """Height of a path after a share of its length."""
+    if bounces == 0:
+        return tx_z + share * (rx_z - tx_z)
+    travelled = share * climb
+    if travelled <= to_first:
+        return tx_z - travelled if first == FLOOR else tx_z + travelled
+    legs = int((travelled - to_first) // height)
+    rest = travelled - to_first - legs * height
+    rising = (legs % 2 == 0) == (first == FLOOR)
+    return rest if rising else height - rest

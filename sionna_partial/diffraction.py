@@ -1,0 +1,251 @@
+"""Exact candidates of paths that bend once around a vertical edge, with few reflections before and after.
+
+An edge is a point in the plan. Beams from the transmitter reach edges, beams from an edge reach receivers, and a path
+joins one of each. On a vertical edge Keller's cone keeps the slope of a path, so heights unfold along the whole way in
+the plan as they do without the edge.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sionna_partial.beams import Beams, trace_beams_in
+from sionna_partial.candidates import CEILING, EDGE, FLOOR, Candidates, merge_heights, unfold
+from sionna_partial.plan import Plan, PointBins, bin_points, grow, prepare_plan
+
+MAX_REFLECTIONS = 2
+"""Largest number of reflections around the diffraction."""
+
+_EXTERIOR_M = 1e-5
+"""Distance from the plane of a face [m] at which the path solver counts a point as outside a wedge."""
+
+_NEAR_M = 1e-3
+"""Shortest leg in the plan next to an edge [m]: walls that meet there do not mirror it."""
+
+_EDGES_AT_ONCE = 16
+"""Number of edges whose beams are held in memory together. It does not depend on the receivers, nor does the order of
+the candidates."""
+
+
+@dataclass(frozen=True)
+class Wedges:
+    """Vertical edges in the plan, each with the two faces that meet there.
+
+    A free end of a wall has both sides of the wall as its faces. Normals point out of the wedge, whose inner angle is
+    at most 180 degrees. In candidates, wedge W + i is wedge i with its faces swapped.
+
+    Parameters
+    ----------
+    point_m : (W, 2) float64 array
+        Place of the edge [m].
+    normal_0, normal_n : (W, 2) float64 arrays
+        Unit normals of the two faces.
+    """
+
+    point_m: NDArray[np.float64]
+    normal_0: NDArray[np.float64]
+    normal_n: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Arrivals:
+    """Ways from the transmitter to edges, ordered by edge.
+
+    `start` (E + 1,) gives the first of each edge, `count` (J,) the number of reflections, `length_m` (J,) the way in
+    the plan, and `wall` (J, R) and `place` (J, R, 3) the reflections as `unfold` gives them.
+    """
+
+    start: NDArray[np.int64]
+    count: NDArray[np.int64]
+    length_m: NDArray[np.float64]
+    wall: NDArray[np.int64]
+    place: NDArray[np.float64]
+
+
+def diffraction_candidates(
+    walls_m: NDArray[np.float64],
+    wedges: Wedges,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    *,
+    height_m: float,
+    horizontal: bool,
+    max_depth: int,
+    candidates_per_block: int = 100_000,
+) -> Iterator[tuple[Candidates, float]]:
+    """Find every way over one vertical edge with at most two reflections, block by block.
+
+    Parameters
+    ----------
+    walls_m : (S, 2, 2) array
+        End points of the wall segments [m].
+    wedges : Wedges
+    tx_m, rx_m : (3,) and (N, 3) arrays
+        Transmitter and receivers [m], between floor (z = 0) and ceiling.
+    height_m : float
+        Height of the ceiling [m].
+    horizontal : bool
+        Whether there are floor and ceiling at all.
+    max_depth : int
+        Largest number of interactions of a path, the diffraction included.
+    candidates_per_block : int
+        Number of candidates in a block, which bounds the memory.
+
+    Yields
+    ------
+    Candidates
+    float
+        Share of all edges done with this block.
+    """
+    reflections = min(MAX_REFLECTIONS, max_depth - 1)
+    if reflections < 0 or len(wedges.point_m) == 0:
+        return
+    edges_m, edge = np.unique(wedges.point_m, axis=0, return_inverse=True)
+    by_edge = np.argsort(edge, kind="stable")
+    wedge_start = np.searchsorted(edge[by_edge], np.arange(len(edges_m) + 1))
+    faces = np.hstack([wedges.normal_0, wedges.normal_n])[by_edge]
+    plan, receivers = prepare_plan(walls_m), bin_points(rx_m[:, :2])
+    arrivals = _arrivals(plan, walls_m, edges_m, tx_m, reflections)
+    reached = np.flatnonzero(np.diff(arrivals.start))
+    for first in range(0, len(reached), _EDGES_AT_ONCE):
+        group = reached[first : first + _EDGES_AT_ONCE]
+        beams = _departures(plan, receivers, edges_m[group], arrivals, group, reflections)
+        common = (beams.parent, beams.segment, beams.source, beams.pair_node, beams.pair_rx, walls_m, rx_m)
+        ways = (group, edges_m, arrivals.start, arrivals.count, arrivals.length_m, arrivals.wall, arrivals.place)
+        rows = _combine(*common, *ways, wedge_start, faces, tx_m, reflections, horizontal)
+        for low in range(0, len(rows), candidates_per_block):
+            part = rows[low : low + candidates_per_block]
+            rx, surface, vertices_m, wedge = _write(part, *common, *ways, tx_m, height_m, reflections)
+            original = by_edge[wedge % len(faces)] + len(faces) * (wedge // len(faces))
+            share = (first + len(group) * min(1.0, (low + candidates_per_block) / len(rows))) / len(reached)
+            yield Candidates(rx, surface, vertices_m, original.astype(np.int32)), share
+
+
+def _arrivals(
+    plan: Plan,
+    walls_m: NDArray[np.float64],
+    edges_m: NDArray[np.float64],
+    tx_m: NDArray[np.float64],
+    reflections: int,
+) -> _Arrivals:
+    """Find the ways of at most `reflections` walls from the transmitter to each edge."""
+    beams = trace_beams_in(plan, bin_points(edges_m), tx_m[None, :2], np.array([reflections]))
+    order = np.argsort(beams.pair_rx, kind="stable")
+    node, edge = beams.pair_node[order], beams.pair_rx[order]
+    good, count, length_m, wall, place = _unfold_all(
+        beams.parent, beams.segment, beams.source, node, edge, walls_m, edges_m, tx_m, max(1, reflections)
+    )
+    start = np.searchsorted(edge[good], np.arange(len(edges_m) + 1))
+    return _Arrivals(start, count[good], length_m[good], wall[good], place[good])
+
+
+def _departures(
+    plan: Plan,
+    receivers: PointBins,
+    sources_m: NDArray[np.float64],
+    arrivals: _Arrivals,
+    group: NDArray[np.int64],
+    reflections: int,
+) -> Beams:
+    """Trace beams from edges to receivers, as deep as the shortest arrival leaves reflections."""
+    fewest = np.minimum.reduceat(arrivals.count, arrivals.start[group])
+    return trace_beams_in(plan, receivers, sources_m, reflections - fewest)
+
+
+@njit(cache=True)
+def _unfold_all(parent, segment, source, node, edge, walls, edges, tx, reflections):  # type: ignore[no-untyped-def]
+    """Reflections on the way to each edge, and whether the last of them is not at the edge itself."""
+    good, count = np.zeros(len(node), np.bool_), np.zeros(len(node), np.int64)
+    length, wall = np.zeros(len(node)), np.zeros((len(node), reflections), np.int64)
+    place = np.zeros((len(node), reflections, 3))
+    for i in range(len(node)):
+        x, y = edges[edge[i]]
+        count[i], length[i], good[i] = unfold(parent, segment, source, node[i], walls, edges[edge[i]], wall[i], place[i])
+        px, py = tx[0], tx[1]
+        if good[i] and count[i] > 0:
+            px, py = place[i, count[i] - 1, 0], place[i, count[i] - 1, 1]
+        good[i] = good[i] and np.hypot(px - x, py - y) > _NEAR_M
+    return good, count, length, wall, place
+
+
+@njit(cache=True)
+def _root(parent, node):  # type: ignore[no-untyped-def]
+    """Root of a node's tree."""
+    while parent[node] >= 0:
+        node = parent[node]
+    return node
+
+
+@njit(cache=True)
+def _outside(face, x, y):  # type: ignore[no-untyped-def]
+    """Whether a direction from the edge points away from the two faces of a wedge."""
+    first = face[0] * x + face[1] * y > _EXTERIOR_M
+    return first, first or face[2] * x + face[3] * y > _EXTERIOR_M
+
+
+@njit(cache=True)
+def _combine(  # type: ignore[no-untyped-def]
+    parent, segment, source, pair_node, pair_rx, walls, rx,
+    group, edges, start, count, length, wall, place,
+    wedge_start, faces, tx, reflections, horizontal,
+):  # fmt: skip
+    """Join arrivals and departures: rows of (pair, arrival, wedge, bounces off floor and ceiling, first of them)."""
+    rows, used = np.empty((1024, 5), np.int32), 0
+    chain, onward = np.empty(max(1, reflections), np.int64), np.empty((max(1, reflections), 3))
+    for i in range(len(pair_node)):
+        edge = group[_root(parent, pair_node[i]) // 4]
+        target = rx[pair_rx[i]]
+        after, way, good = unfold(parent, segment, source, pair_node[i], walls, target, chain, onward)
+        ox, oy = (onward[0, 0], onward[0, 1]) if after > 0 else (target[0], target[1])
+        ox, oy = ox - edges[edge, 0], oy - edges[edge, 1]
+        if not good or np.hypot(ox, oy) < _NEAR_M:
+            continue
+        for j in range(start[edge], start[edge + 1]):
+            left = reflections - count[j] - after
+            if left < 0:
+                continue
+            ix, iy = (place[j, count[j] - 1, 0], place[j, count[j] - 1, 1]) if count[j] > 0 else (tx[0], tx[1])
+            for w in range(wedge_start[edge], wedge_start[edge + 1]):
+                first, seen = _outside(faces[w], ix - edges[edge, 0], iy - edges[edge, 1])
+                if not seen or not _outside(faces[w], ox, oy)[1]:
+                    continue
+                rows = grow(rows, used + 1 + 2 * left)
+                for bounces in range(left + 1 if horizontal else 1):
+                    for ceiling in range(2 if bounces else 1):
+                        rows[used] = (i, j, w if first else w + len(faces), bounces, ceiling)
+                        used += 1
+    return rows[:used].copy()
+
+
+@njit(cache=True)
+def _write(  # type: ignore[no-untyped-def]
+    rows, parent, segment, source, pair_node, pair_rx, walls, rx,
+    group, edges, start, count, length, wall, place,
+    tx, height, reflections,
+):  # fmt: skip
+    """Candidates of the rows that `_combine` gives."""
+    out_rx, wedge = np.empty(len(rows), np.int32), np.empty(len(rows), np.int32)
+    surface = np.full((len(rows), reflections + 1), -1, np.int32)
+    vertices = np.zeros((len(rows), reflections + 1, 3))
+    chain, way = np.empty(reflections + 1, np.int64), np.empty((reflections + 1, 3))
+    for k in range(len(rows)):
+        i, j = rows[k, 0], rows[k, 1]
+        edge = group[_root(parent, pair_node[i]) // 4]
+        target = rx[pair_rx[i]]
+        before = count[j]
+        after, onward, _ = unfold(
+            parent, segment, source, pair_node[i], walls, target, chain[before + 1 :], way[before + 1 :]
+        )
+        total = length[j] + onward
+        chain[:before], way[:before] = wall[j, :before], place[j, :before]
+        way[:before, 2] *= length[j] / total
+        chain[before], way[before] = EDGE, (edges[edge, 0], edges[edge, 1], length[j] / total)
+        size = before + 1 + after
+        way[before + 1 : size, 2] = (length[j] + onward * way[before + 1 : size, 2]) / total
+        out_rx[k], wedge[k] = pair_rx[i], rows[k, 2]
+        first = FLOOR if rows[k, 4] == 0 else CEILING
+        merge_heights(chain[:size], way[:size], tx, target, height, rows[k, 3], first, surface[k], vertices[k])
+    return out_rx, surface, vertices, wedge

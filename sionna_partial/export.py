@@ -1,0 +1,170 @@
+"""Coverage maps to files: NetCDF, GeoTIFF, CSV, PNG, ROS map."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5netcdf
+import h5py
+import numpy as np
+import xarray as xr
+import yaml
+from h5py import h5f, h5p
+from numpy.typing import NDArray
+from rasterio import Affine
+from rasterio.io import MemoryFile
+from xarray.backends import H5NetCDFStore
+
+from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, require_coverage
+from sionna_partial.errors import OutputError
+from sionna_partial.files import atomic_write
+from sionna_partial.plot import figure_png, plot_coverage
+from sionna_partial.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
+
+TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
+"""What CSV and GeoTIFF hold; `wall_parts` serves pictures alone."""
+
+LINK_STATES = ("link_state", "partial_link_state")
+
+
+def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a coverage map, in the format that the suffix names. Equal maps give equal files.
+
+    ======== ==========================================================================================
+    `.nc`    NetCDF 4 (CF conventions), everything: `xarray.load_dataset` returns an equal Dataset.
+    `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN where no receiver stands;
+             local metres, no coordinate reference system; the settings as tags.
+    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands.
+    `.png`   The picture of `plot_coverage`.
+    `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 100,
+             is the probability of outage in percent; unknown (-1) where no receiver stands. Nav2 loads it as a
+             layer that keeps a robot where it has a link (static layer, `trinary_costmap: false`).
+    ======== ==========================================================================================
+
+    Parameters
+    ----------
+    coverage : xarray.Dataset
+        From `predict_map`.
+    path : path-like
+        Where the file shall be. A file that is there is replaced.
+
+    Raises
+    ------
+    SettingsError
+        For a Dataset that is no coverage map.
+    OutputError
+        For another suffix, or if writing fails; nothing half written is left behind.
+    """
+    require_coverage(coverage)
+    target = Path(path)
+    suffix = target.suffix.lower()
+    if suffix not in _WRITERS:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(_WRITERS)}.")
+    _WRITERS[suffix](coverage, target)
+
+
+def _writer(encode: Callable[[xr.Dataset], bytes]) -> Callable[[xr.Dataset, Path], None]:
+    """Make a writer of an encoder: the file is ready in memory before the disk is touched."""
+
+    def write(coverage: xr.Dataset, path: Path) -> None:
+        content = encode(coverage)
+        with atomic_write(path) as stream:
+            stream.write(content)
+
+    return write
+
+
+def _encode_netcdf(coverage: xr.Dataset) -> bytes:
+    # to_netcdf would do the same, but lets HDF5 stamp the root group with the time of day
+    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
+    creation.set_obj_track_times(False)
+    for set_order in (creation.set_link_creation_order, creation.set_attr_creation_order):
+        set_order(h5p.CRT_ORDER_TRACKED | h5p.CRT_ORDER_INDEXED)
+    access.set_fapl_core(backing_store=False)
+    compressed = {name: {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
+    with h5py.File(h5f.create(b"coverage.nc", h5f.ACC_TRUNC, creation, access)) as memory:
+        with h5netcdf.File(memory, "w") as netcdf:
+            coverage.dump_to_store(H5NetCDFStore(netcdf), encoding=compressed)
+        memory.flush()
+        return bytes(memory.id.get_file_image())
+
+
+def _encode_geotiff(coverage: xr.Dataset) -> bytes:
+    step = float(coverage.attrs["spacing_m"])
+    left, top = float(coverage["x"][0]) - step / 2, float(coverage["y"][-1]) + step / 2
+    profile = {
+        "driver": "GTiff",
+        "dtype": "float32",
+        "count": len(TABLE_VARIABLES),
+        "height": coverage.sizes["y"],
+        "width": coverage.sizes["x"],
+        "nodata": np.nan,
+        "transform": Affine(step, 0.0, left, 0.0, -step, top),
+        "compress": "deflate",
+        "predictor": 3,
+    }
+    with MemoryFile() as memory:
+        with memory.open(**profile) as image:
+            image.update_tags(units="m", **{name: str(value) for name, value in coverage.attrs.items()})
+            for band, name in enumerate(TABLE_VARIABLES, start=1):
+                image.write(np.flipud(_float_layer(coverage, name)), band)
+                image.set_band_description(band, name)
+                image.set_band_unit(band, coverage[name].attrs.get("units", ""))
+                image.update_tags(band, **{key: str(value) for key, value in coverage[name].attrs.items()})
+        return bytes(memory.read())
+
+
+def _float_layer(coverage: xr.Dataset, name: str) -> NDArray[np.float32]:
+    """Return a variable as it is, with NaN for a link state where no receiver stands."""
+    layer = coverage[name].to_numpy().astype(np.float32)
+    if name in LINK_STATES:
+        layer[~coverage["valid"].to_numpy()] = np.nan
+    return layer
+
+
+def _encode_csv(coverage: xr.Dataset) -> bytes:
+    table = coverage[list(TABLE_VARIABLES)].to_dataframe(dim_order=["y", "x"]).reset_index()
+    for name in LINK_STATES:
+        table[name] = table[name].astype("UInt8").where(table["valid"])
+    for name in ("observed", "valid"):
+        table[name] = table[name].astype(np.uint8)
+    for name in ("x", "y"):
+        table.insert(0 if name == "x" else 1, f"{name}_m", table.pop(name).round(6))
+    return bytes(table.to_csv(index=False, lineterminator="\n"), "utf-8")
+
+
+def _encode_png(coverage: xr.Dataset) -> bytes:
+    return figure_png(plot_coverage(coverage))
+
+
+def _write_ros_map(coverage: xr.Dataset, path: Path) -> None:
+    """Write the YAML and its PGM; if one cannot be written, neither is."""
+    spacing_m = float(coverage.attrs["spacing_m"])
+    corner = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
+    image = path.with_suffix(".pgm")
+    sheet: dict[str, Any] = {
+        "image": image.name,
+        "mode": "raw",
+        "resolution": spacing_m,
+        "origin": [*corner, 0.0],
+        "negate": 0,
+        "occupied_thresh": OCCUPIED_THRESHOLD,
+        "free_thresh": FREE_THRESHOLD,
+        "quantity": "probability of outage in percent; 255 where no receiver can stand",
+    }
+    percent = np.rint(100 * coverage["p_outage"].fillna(NO_RECEIVER / 100).to_numpy()).astype(np.uint8)
+    header = b"P5\n%d %d\n255\n" % (coverage.sizes["x"], coverage.sizes["y"])
+    with atomic_write(path, "w") as text, atomic_write(image) as picture:
+        yaml.safe_dump(sheet, text, sort_keys=False, default_flow_style=None)
+        text.flush()
+        picture.write(header + np.flipud(percent).tobytes())
+
+
+_WRITERS: dict[str, Callable[[xr.Dataset, Path], None]] = {
+    ".nc": _writer(_encode_netcdf),
+    ".tif": _writer(_encode_geotiff),
+    ".csv": _writer(_encode_csv),
+    ".png": _writer(_encode_png),
+    ".yaml": _write_ros_map,
+}

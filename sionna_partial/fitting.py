@@ -1,0 +1,216 @@
+"""Training of the predictor's networks by maximum likelihood."""
+
+import itertools
+import logging
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, LinkState
+from sionna_partial.errors import PredictorError
+from sionna_partial.features import LinkFeatures
+from sionna_partial.networks import (
+    GAIN_NETWORKS,
+    INDOOR_INPUTS,
+    INDOOR_NETWORKS,
+    OUTPUT_WIDTHS,
+    STATE_INPUTS,
+    STATE_NETWORKS,
+    GainNetwork,
+    Ranges,
+    assemble,
+    gain_network,
+    import_keras,
+    logistic,
+    network_inputs,
+    parts,
+)
+from sionna_partial.settings import require, require_number
+
+if TYPE_CHECKING:
+    import keras
+
+_DEFAULT_RANGES = {"distance_m": (0.0, 30.0), "unobserved_distance_m": (0.0, 30.0), "gain_db": (GAIN_FLOOR_DB, -40.0)}
+_PRIOR_LINKS = 10
+_INDOORS = 20.0
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PredictorSettings:
+    """How a predictor is trained.
+
+    Parameters
+    ----------
+    frequency_hz : float
+        Carrier frequency of the links [Hz]; it sets the gain of free space.
+    steps : int
+        Gradient steps of each network.
+    batch_size : int
+        Links in a step.
+    learning_rate : float
+        Of Adam at the first step; it falls to 0 along a cosine.
+    minimum_links : int
+        A network with fewer links is not trained: it says mean and spread of those it has and of prior knowledge.
+    seed : int
+        Of first weights and batches.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+    """
+
+    frequency_hz: float = CARRIER_FREQUENCY_HZ
+    steps: int = 4000
+    batch_size: int = 1024
+    learning_rate: float = 0.01
+    minimum_links: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        require_number("frequency_hz", self.frequency_hz, 1e6, 1e12)
+        require_number("learning_rate", self.learning_rate, 0.0, 1.0, open_low=True)
+        for name, low, high in (
+            ("steps", 1, 1_000_000),
+            ("batch_size", 1, 1_000_000),
+            ("minimum_links", 1, 1_000_000),
+            ("seed", 0, 1_000_000_000),
+        ):
+            value = getattr(self, name)
+            require(isinstance(value, int) and not isinstance(value, bool), name, value, "give a whole number.")
+            require_number(name, value, low, high)
+
+
+def fit_networks(
+    phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64], settings: PredictorSettings
+) -> "keras.Model":
+    """Fit the classifiers and the gain networks; every receiver is taken to be indoors.
+
+    Parameters
+    ----------
+    phi : LinkFeatures
+        Of N links.
+    link_state : (N,) uint8 array of LinkState
+        True link state.
+    gain_db : (N,) float64 array
+        True omnidirectional path gain [dB].
+    settings : PredictorSettings
+
+    Returns
+    -------
+    keras.Model
+
+    Raises
+    ------
+    PredictorError
+        If the training diverges.
+    """
+    networks = {}
+    for partial_state, name in STATE_NETWORKS.items():
+        cell = phi.link_state == partial_state
+        networks[name] = _fit_states(name, phi.take(cell), link_state[cell], settings)
+    for row in GAIN_NETWORKS:
+        cell = (link_state == row.link_state) & np.isin(phi.link_state, row.partial_states)
+        networks[row.name] = _fit_gain(row, phi.take(cell), gain_db[cell], settings)
+    for name in INDOOR_NETWORKS.values():
+        networks[name] = logistic(name, INDOOR_INPUTS, _DEFAULT_RANGES, [_INDOORS])
+    return assemble(networks)
+
+
+def fit_indoor_networks(
+    model: "keras.Model", phi: LinkFeatures, inside: NDArray[np.bool_], settings: PredictorSettings
+) -> "keras.Model":
+    """Return the networks of `model` with P(indoor) fitted to N links, `inside` (N,) saying which are indoors.
+
+    A partial link state with fewer links than `minimum_links` keeps what `model` has.
+    """
+    networks = parts(model)
+    for partial_state, name in INDOOR_NETWORKS.items():
+        cell = phi.link_state == partial_state
+        if cell.sum() >= settings.minimum_links:
+            links = phi.take(cell)
+            networks[name] = logistic(name, INDOOR_INPUTS, _ranges(links, settings), [0.0])
+            _train(networks[name], links, inside[cell], "binary_crossentropy", settings)
+    return assemble(networks)
+
+
+def _fit_states(
+    name: str, phi: LinkFeatures, link_state: NDArray[np.uint8], settings: PredictorSettings
+) -> "keras.Model":
+    counts = np.bincount(link_state, minlength=len(LinkState)) + 1.0
+    network = logistic(name, STATE_INPUTS, _ranges(phi, settings), np.log(counts / counts.sum()))
+    if len(phi) >= settings.minimum_links:
+        _train(network, phi, link_state, "sparse_categorical_crossentropy", settings)
+    return network
+
+
+def _fit_gain(
+    row: GainNetwork, phi: LinkFeatures, gain_db: NDArray[np.float64], settings: PredictorSettings
+) -> "keras.Model":
+    offsets_db = gain_db - row.anchor_db(phi, settings.frequency_hz)
+    count = len(phi) + _PRIOR_LINKS
+    mean_db = (offsets_db.sum() + _PRIOR_LINKS * row.prior_offset_db) / count
+    prior = row.prior_std_db**2 + (row.prior_offset_db - mean_db) ** 2
+    variance = (((offsets_db - mean_db) ** 2).sum() + _PRIOR_LINKS * prior) / count
+    seed = settings.seed + 10 * GAIN_NETWORKS.index(row)
+    network = gain_network(
+        row, _ranges(phi, settings), float(mean_db), math.sqrt(variance), settings.frequency_hz, seed
+    )
+    if len(phi) >= settings.minimum_links:
+        _train(network, phi, gain_db, _gaussian_loss, settings)
+    return network
+
+
+def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
+    """Range of every feature of the links; a wide one if they are too few to tell."""
+    if len(phi) < settings.minimum_links:
+        return _DEFAULT_RANGES
+    spans = {name: (float(getattr(phi, name).min()), float(getattr(phi, name).max())) for name in _DEFAULT_RANGES}
+    return {name: (low, max(high, low + 1.0)) for name, (low, high) in spans.items()}
+
+
+def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
+    """Negative log-likelihood of gains (N, 1) under means and log-variances (N, 2), up to a constant."""
+    ops = import_keras().ops
+    mean, log_variance = prediction[:, :1], prediction[:, 1:]
+    return 0.5 * (log_variance + ops.square(gain_db - mean) * ops.exp(-log_variance))
+
+
+def _train(
+    network: "keras.Model",
+    phi: LinkFeatures,
+    truth: NDArray[np.generic],
+    loss: str | Callable[[Any, Any], Any],
+    settings: PredictorSettings,
+) -> None:
+    """Minimise the loss of a network in place; the same links and settings give the same weights."""
+    keras = import_keras()
+    trainer = keras.Model(network.input, network.output)
+    decay = keras.optimizers.schedules.CosineDecay(settings.learning_rate, settings.steps)
+    trainer.compile(optimizer=keras.optimizers.Adam(decay), loss=loss, jit_compile=False)
+    inputs = network_inputs(phi, tuple(network.input))
+    seed = (settings.seed, list(OUTPUT_WIDTHS).index(network.name))
+    batches = _batches(inputs, truth.astype(np.float32)[:, None], settings.batch_size, np.random.default_rng(seed))
+    history = trainer.fit(batches, steps_per_epoch=settings.steps, shuffle=False, verbose=0)
+    _log.info("%s: loss %.4f over %d links", network.name, history.history["loss"][-1], len(phi))
+    if not all(np.isfinite(weights).all() for weights in network.get_weights()):
+        raise PredictorError(
+            f"training of {network.name} diverged: learning_rate = {settings.learning_rate:g}, give a smaller one."
+        )
+
+
+def _batches(
+    inputs: dict[str, NDArray[np.float32]], truth: NDArray[np.float32], size: int, rng: np.random.Generator
+) -> Iterator[tuple[dict[str, NDArray[np.float32]], NDArray[np.float32]]]:
+    """Yield shuffled batches without end."""
+    for start in itertools.cycle(range(0, len(truth), size)):
+        if start == 0:
+            order = rng.permutation(len(truth))
+        index = order[start : start + size]
+        yield {name: column[index] for name, column in inputs.items()}, truth[index]

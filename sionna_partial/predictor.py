@@ -1,0 +1,323 @@
+"""Predictor: LinkFeatures -> LinkPrediction, the paper's link-state classifier, gain networks and indoor model."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.errors import PredictorError, SettingsError
+from sionna_partial.features import LinkFeatures, link_numbers, link_states
+from sionna_partial.fitting import PredictorSettings, fit_indoor_networks, fit_networks
+from sionna_partial.networks import (
+    GAIN_NETWORKS,
+    INDOOR_NETWORKS,
+    STATE_NETWORKS,
+    evaluate_networks,
+    import_keras,
+    network_ranges,
+)
+from sionna_partial.predictor_files import SUFFIX, digest, pack, read_files, write_files
+
+if TYPE_CHECKING:
+    import keras
+
+SHIPPED_FOLDER = Path(__file__).parent / "predictors"
+"""Predictors that come with the package."""
+
+SHIPPED = ("paper",)
+"""Their names; the first is the default."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPrediction:
+    """Predictive distribution of link state and path gain of N links; every array is (N,) float64.
+
+    Parameters
+    ----------
+    p_los, p_nlos, p_outage : arrays
+        Probabilities of the link states; they sum to 1.
+    gain_mean_db, gain_std_db : arrays
+        Mean and standard deviation of the whole distribution, an outage counting -150 dB [dB].
+    gain_los_mean_db, gain_los_std_db, gain_nlos_mean_db, gain_nlos_std_db : arrays
+        The same given line of sight, and given paths without it [dB].
+    """
+
+    p_los: NDArray[np.float64]
+    p_nlos: NDArray[np.float64]
+    p_outage: NDArray[np.float64]
+    gain_mean_db: NDArray[np.float64]
+    gain_std_db: NDArray[np.float64]
+    gain_los_mean_db: NDArray[np.float64]
+    gain_los_std_db: NDArray[np.float64]
+    gain_nlos_mean_db: NDArray[np.float64]
+    gain_nlos_std_db: NDArray[np.float64]
+
+    @property
+    def link_state(self) -> NDArray[np.uint8]:
+        """Likeliest LinkState (N,)."""
+        return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
+
+    @classmethod
+    def of_parts(
+        cls, probabilities: NDArray[np.float64], means_db: NDArray[np.float64], stds_db: NDArray[np.float64]
+    ) -> "LinkPrediction":
+        """Put the distribution together by the laws of total expectation and variance.
+
+        Parameters
+        ----------
+        probabilities, means_db, stds_db : (3, N) arrays
+            Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+
+        Returns
+        -------
+        LinkPrediction
+        """
+        mean = (probabilities * means_db).sum(axis=0)
+        variance = (probabilities * (stds_db**2 + (means_db - mean) ** 2)).sum(axis=0)
+        return cls(
+            p_los=probabilities[LinkState.LOS],
+            p_nlos=probabilities[LinkState.NLOS],
+            p_outage=probabilities[LinkState.OUTAGE],
+            gain_mean_db=mean,
+            gain_std_db=np.sqrt(variance),
+            gain_los_mean_db=means_db[LinkState.LOS],
+            gain_los_std_db=stds_db[LinkState.LOS],
+            gain_nlos_mean_db=means_db[LinkState.NLOS],
+            gain_nlos_std_db=stds_db[LinkState.NLOS],
+        )
+
+    @classmethod
+    def of_trace(cls, phi: LinkFeatures) -> "LinkPrediction":
+        """Take the trace itself for the answer, as on a complete map (paper, eq. 9): no uncertainty is left.
+
+        The components of link states that a link is not in have its traced gain, too.
+        """
+        probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
+        return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """The paper's predictor of link state and path gain (Sections III-D and III-E), made by `fit` or `load`.
+
+    P(link state | features) is one multinomial logistic classifier on distance and unobserved distance for each partial
+    link state; the gain given the link state is Gaussian, its mean and log-variance from the networks of the paper's
+    table. P(indoor) is a logistic classifier on the unobserved distance for each partial link state; it is 1 until
+    `fit_indoor`, as the paper has every receiver indoors.
+
+    Parameters
+    ----------
+    model : keras.Model
+        All networks side by side.
+    archive : bytes
+        The model as a `.keras` file.
+    settings : PredictorSettings
+        Of the training.
+    homes : tuple of str
+        Names of the homes that it was trained on.
+    links : mapping of str to int
+        Number of training links by "true state given partial state".
+    metrics : mapping
+        What was measured on homes it was not trained on.
+    versions : mapping of str to str
+        Of the packages that trained it.
+    name : str
+        "fitted", a shipped name, or the file's path.
+    """
+
+    model: "keras.Model"
+    archive: bytes = field(repr=False)
+    settings: PredictorSettings
+    homes: tuple[str, ...] = ()
+    links: Mapping[str, int] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    name: str = "fitted"
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the `.keras` file, in hexadecimal."""
+        return digest(self.archive)
+
+    sha256 = fingerprint
+
+    @classmethod
+    def fit(
+        cls,
+        features: LinkFeatures,
+        link_state: ArrayLike,
+        gain_db: ArrayLike,
+        *,
+        homes: Sequence[str] = (),
+        settings: PredictorSettings | None = None,
+    ) -> "Predictor":
+        """Train by maximum likelihood: cross-entropy of the link state, Gaussian likelihood of the gain.
+
+        The same links and settings give the same weights.
+
+        Parameters
+        ----------
+        features : LinkFeatures
+            Of N links on partial maps.
+        link_state : (N,) array-like of LinkState
+            Link state on the complete map.
+        gain_db : (N,) array-like
+            Omnidirectional path gain on the complete map [dB].
+        homes : sequence of str
+            Where the links come from, to be recorded.
+        settings : PredictorSettings, optional
+
+        Returns
+        -------
+        Predictor
+
+        Raises
+        ------
+        PredictorError
+            For no links, arrays of other shapes or values, or a training that diverges.
+        """
+        settings = settings or PredictorSettings()
+        _require_features(features)
+        if len(features) == 0:
+            raise PredictorError("features has no links: give at least one.")
+        states = link_states("link_state", link_state, len(features))
+        gains_db = np.maximum(link_numbers("gain_db", gain_db, len(features)), GAIN_FLOOR_DB)
+        model = fit_networks(features, states, gains_db, settings)
+        links = {
+            f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
+            for partial in LinkState
+            for true in LinkState
+        }
+        keras = import_keras()
+        versions = {"keras": keras.__version__, "backend": keras.backend.backend(), "numpy": np.__version__}
+        return cls(model, pack(model), settings, tuple(map(str, homes)), links, versions=versions)
+
+    def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> "Predictor":
+        """Return this predictor with P(indoor) trained (paper, "Indoor-Outdoor Estimation").
+
+        Parameters
+        ----------
+        features : LinkFeatures
+            Of N links whose receivers are drawn uniformly over the map area.
+        inside : (N,) array-like of bool
+            Whether the receiver is indoors.
+
+        Returns
+        -------
+        Predictor
+
+        Raises
+        ------
+        PredictorError
+            For arrays of other shapes or values, or a training that diverges.
+        """
+        _require_features(features)
+        indoors = link_numbers("inside", inside, len(features)) > 0.0
+        model = fit_indoor_networks(self.model, features, indoors, self.settings)
+        return replace(self, model=model, archive=pack(model))
+
+    def predict(self, features: LinkFeatures) -> LinkPrediction:
+        """Predict link state and path gain of N links whose receivers are indoors.
+
+        Parameters
+        ----------
+        features : LinkFeatures
+            N may be 0.
+
+        Returns
+        -------
+        LinkPrediction
+        """
+        _require_features(features)
+        outputs = evaluate_networks(self.model, features)
+        probabilities = _chosen(outputs, STATE_NETWORKS, features).T
+        probabilities /= probabilities.sum(axis=0)
+        means_db = np.full_like(probabilities, GAIN_FLOOR_DB)
+        stds_db = np.zeros_like(probabilities)
+        for row in GAIN_NETWORKS:
+            served = np.isin(features.link_state, row.partial_states)
+            mean_db, log_variance = outputs[row.name][served].T
+            means_db[row.link_state, served] = np.maximum(mean_db, GAIN_FLOOR_DB)
+            stds_db[row.link_state, served] = np.exp(0.5 * log_variance)
+        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+    def predict_indoor(self, features: LinkFeatures) -> NDArray[np.float64]:
+        """Predict the probability (N,) that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
+        _require_features(features)
+        return _chosen(evaluate_networks(self.model, features), INDOOR_NETWORKS, features)[:, 0]
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.keras` file, and a `.json` card of the same stem beside it.
+
+        The card has the order of the features, their scaling (a record: it is applied inside the networks), settings,
+        homes, metrics, versions and the SHA-256 of the `.keras` file.
+
+        Parameters
+        ----------
+        path : path-like
+            Ends in `.keras`.
+
+        Raises
+        ------
+        PredictorError
+            If `path` has another suffix.
+        OutputError
+            If writing fails.
+        """
+        card = {
+            "scaling": network_ranges(self.model),
+            "settings": asdict(self.settings),
+            "homes": list(self.homes),
+            "links": dict(self.links),
+            "metrics": dict(self.metrics),
+            "versions": dict(self.versions),
+        }
+        write_files(Path(path), self.archive, card)
+
+    @classmethod
+    def load(cls, name_or_path: str | Path | None = None) -> "Predictor":
+        """Load a predictor; nothing in its files is executed.
+
+        Parameters
+        ----------
+        name_or_path : None, "paper" or path-like
+            The shipped default, the paper's predictor, or the `.keras` file of your own.
+
+        Returns
+        -------
+        Predictor
+
+        Raises
+        ------
+        PredictorError
+            If a file is missing, damaged, changed, or of another kind.
+        """
+        name = SHIPPED[0] if name_or_path is None else name_or_path
+        path = SHIPPED_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
+        model, archive, card = read_files(path)
+        try:
+            settings = PredictorSettings(**card["settings"])
+            homes, links = tuple(map(str, card["homes"])), {str(k): int(v) for k, v in card["links"].items()}
+            metrics, versions = dict(card["metrics"]), dict(card["versions"])
+        except (AttributeError, KeyError, TypeError, ValueError, SettingsError) as error:
+            card_path = path.with_suffix(".json")
+            raise PredictorError(
+                f"path = '{card_path}' is damaged ({error!r}): copy it again, or train anew."
+            ) from error
+        return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
+
+
+def _require_features(features: object) -> None:
+    if not isinstance(features, LinkFeatures):
+        raise PredictorError(f"features is of type {type(features).__name__}: give the LinkFeatures of link_features.")
+
+
+def _chosen(
+    outputs: Mapping[str, NDArray[np.float64]], names: Mapping[LinkState, str], phi: LinkFeatures
+) -> NDArray[np.float64]:
+    """Return the outputs (N, K) of the network that serves the partial link state of each link."""
+    return np.stack([outputs[names[state]] for state in LinkState])[phi.link_state, np.arange(len(phi))]

@@ -1,0 +1,51 @@
+"""Demo scenes that ship with the package."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from sionna_partial.errors import SceneError
+
+HOMES_FILE = "homes.json"
+"""File in the scenes folder that says of each home how it was made, and where its transmitter stands."""
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def scenes_folder() -> Path:
+    """Folder of the demo scenes: inside the installed package, or at the top of the repository.
+
+    Returns
+    -------
+    pathlib.Path
+
+    Raises
+    ------
+    SceneError
+        If there is none.
+    """
+    for place in (_PACKAGE / "scenes", _PACKAGE.parent / "scenes"):
+        if (place / HOMES_FILE).is_file():
+            return place
+    raise SceneError(f"The demo scenes are missing in '{_PACKAGE / 'scenes'}': install sionna-partial again.")
+
+
+def demo_homes() -> dict[str, dict[str, Any]]:
+    """Describe the demo homes, each a folder in `scenes_folder`.
+
+    Returns
+    -------
+    dict
+        By name; "transmitter" is the position (x, y, z) [m], the rest is how the home was made.
+
+    Raises
+    ------
+    SceneError
+        If there are none, or their description is damaged.
+    """
+    path = scenes_folder() / HOMES_FILE
+    try:
+        homes = json.loads(path.read_text(encoding="utf-8"))
+        return {name: home | {"transmitter": tuple(map(float, home["transmitter"]))} for name, home in homes.items()}
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise SceneError(f"path = '{path}' cannot be read ({error!r}): install sionna-partial again.") from error

@@ -1,0 +1,113 @@
+"""A tracer and a predictor that answer at once, for tests of what is made of their answers."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial import coverage as coverage_module
+from sionna_partial.constants import CellState, LinkState
+from sionna_partial.coverage import predict_map
+from sionna_partial.features import LinkFeatures
+from sionna_partial.fitting import PredictorSettings
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.predictor import LinkPrediction
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.trace import TracedLinks
+
+PICTURE = """
+????????????
+?##########?
+?#.....#...?
+?#.....#.???
+?#.........?
+?#.....#..#?
+?##########?
+????????????
+"""
+"""A partly seen home of two rooms; the first line holds the largest y."""
+
+
+def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = (-1.0, 2.0)) -> PartialMap:
+    """Make a map of a drawing: `.` free, `#` wall, `?` unknown."""
+    codes = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
+    rows = [[codes[sign] for sign in line] for line in picture.split()]
+    return PartialMap(np.flipud(np.array(rows, dtype=np.uint8)), resolution_m, origin_m)
+
+
+def fake_trace(
+    scene: PartialMap,
+    tx: ArrayLike,
+    rx: NDArray[np.float64],
+    *,
+    settings: TraceSettings,
+    scene_settings: SceneSettings,
+    progress: Callable[[float, str], None],
+) -> TracedLinks:
+    """Trace without walls: LOS up to 2 m, NLOS up to 4 m, then outage; Friis' gain, less 20 dB for NLOS."""
+    progress(0.5, "tracing")
+    tx_m = scene.require_positions("tx", tx)
+    rx_m = scene.require_positions("rx", rx)
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    state = np.select([distance_m < 2.0, distance_m < 4.0], [LinkState.LOS, LinkState.NLOS], LinkState.OUTAGE)
+    gain_db = -61.4 - 20.0 * np.log10(distance_m) - np.choose(state, [150.0, 0.0, 20.0])
+    no_paths = np.zeros(0)
+    return TracedLinks(
+        tx=tx_m,
+        rx=rx_m,
+        link_state=state.astype(np.uint8),
+        gain_db=np.maximum(gain_db, -150.0),
+        path_rx=no_paths.astype(np.int32),
+        a=no_paths.astype(np.complex128),
+        delay_s=no_paths,
+        departure_rad=np.zeros((0, 2)),
+        arrival_rad=np.zeros((0, 2)),
+        interactions=np.zeros((0, settings.max_depth), dtype=np.uint8),
+        vertices_m=np.zeros((0, settings.max_depth, 3)),
+        settings=settings,
+        scene_settings=scene_settings,
+    )
+
+
+class FakePredictor:
+    """Answers with numbers that a test can compute: a tenth of the probability leaks for each unknown metre."""
+
+    name = "fake"
+    sha256 = "0" * 64
+    settings = PredictorSettings()
+
+    @classmethod
+    def load(cls, name: object = None) -> "FakePredictor":
+        return cls()
+
+    def predict(self, phi: LinkFeatures) -> LinkPrediction:
+        leak = np.clip(0.1 * phi.unobserved_distance_m, 0.0, 0.6)
+        p_outage, p_los, p_nlos = (np.where(phi.link_state == state, 1.0 - leak, leak / 2) for state in LinkState)
+        return LinkPrediction(
+            p_los=p_los,
+            p_nlos=p_nlos,
+            p_outage=p_outage,
+            gain_mean_db=phi.gain_db + leak,
+            gain_std_db=10.0 * leak,
+            gain_los_mean_db=phi.gain_db,
+            gain_los_std_db=leak,
+            gain_nlos_mean_db=phi.gain_db - 20.0,
+            gain_nlos_std_db=2.0 * leak,
+        )
+
+    def predict_indoor(self, phi: LinkFeatures) -> NDArray[np.float64]:
+        return np.full(len(phi), 0.25)
+
+
+def use_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let predict_map use the fakes."""
+    monkeypatch.setattr(coverage_module, "trace_links", fake_trace)
+    monkeypatch.setattr(coverage_module, "Predictor", FakePredictor)
+
+
+def small_coverage(monkeypatch: pytest.MonkeyPatch) -> xr.Dataset:
+    """Coverage map of `PICTURE` with receivers 0.25 m apart."""
+    use_fakes(monkeypatch)
+    return predict_map(map_of(PICTURE), (0.6, 3.6), spacing_m=0.25)

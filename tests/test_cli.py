@@ -1,0 +1,341 @@
+"""The command line: what it passes on, what it says, and how it fails."""
+
+import logging
+import os
+import subprocess
+import sys
+import warnings
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner, Result
+
+from sionna_partial import __version__, cli, info
+from sionna_partial.errors import BackendError, MapError, OutputError
+from sionna_partial.info import Finding
+from sionna_partial.map_files import load_map, save_map
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.settings import Material, SceneSettings, TraceSettings
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Undo what the command line does to its process."""
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "put back in the end")
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
+    logger = logging.getLogger("sionna_partial")
+    handlers = list(logger.handlers)
+    yield
+    logger.handlers[:] = handlers
+
+
+@pytest.fixture
+def room() -> PartialMap:
+    state = np.full((8, 10), 2, dtype=np.uint8)
+    state[1:7, 1:9] = 1
+    state[2:6, 2:8] = 0
+    return PartialMap(state, 0.5, (-2.0, -1.0))
+
+
+@pytest.fixture
+def map_path(room: PartialMap, tmp_path: Path) -> Path:
+    path = tmp_path / "map.yaml"
+    save_map(room, path)
+    return path
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What `predict` passes on, instead of a prediction."""
+    calls: list[Any] = []
+
+    def predict_map(scene: Any, tx: Any, *, progress: Any, **settings: Any) -> str:
+        progress(0.5, "half way")
+        calls.append((scene, tx, settings))
+        return "coverage"
+
+    def save_coverage(coverage: str, path: Path) -> None:
+        calls.append((coverage, path))
+
+    monkeypatch.setattr("sionna_partial.coverage.predict_map", predict_map)
+    monkeypatch.setattr("sionna_partial.export.save_coverage", save_coverage)
+    return calls
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(cli.app, [str(arg) for arg in args])
+
+
+def say(text: str) -> str:
+    """Output without line breaks that depend on the width."""
+    return " ".join(text.split())
+
+
+class TestPredict:
+    def test_defaults(self, map_path: Path, room: PartialMap, calls: list[Any], tmp_path: Path) -> None:
+        result = run("predict", map_path, "--tx", 0.5, 0.5, "--out", tmp_path / "out")
+        assert result.exit_code == 0, result.output
+        scene, tx, settings = calls[0]
+        assert scene == room
+        assert tx == (0.5, 0.5)
+        assert settings == {
+            "rx_height_m": 1.5,
+            "spacing_m": 0.15,
+            "predictor": None,
+            "scene_settings": SceneSettings(),
+            "trace_settings": TraceSettings(),
+        }
+        files = [tmp_path / "out" / f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
+        assert calls[1:] == [("coverage", file) for file in files]
+        assert result.stdout.splitlines() == [f"wrote {file}" for file in files]
+
+    def test_every_option(self, map_path: Path, calls: list[Any], tmp_path: Path) -> None:
+        options = "--rx-height 1 --spacing 0.3 --frequency 60e9 --max-depth 2 --predictor paper --material 4,0.1,0.2"
+        result = run(
+            "predict",
+            map_path,
+            "--tx",
+            1,
+            -0.5,
+            2,
+            "--out",
+            tmp_path,
+            *options.split(),
+            "--format",
+            "nc",
+            "--format",
+            ".CSV",
+        )
+        assert result.exit_code == 0, result.output
+        _, tx, settings = calls[0]
+        assert tx == (1.0, -0.5, 2.0)
+        assert settings == {
+            "rx_height_m": 1.0,
+            "spacing_m": 0.3,
+            "predictor": "paper",
+            "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2)),
+            "trace_settings": TraceSettings(frequency_hz=60e9, max_depth=2),
+        }
+        assert [path.name for _, path in calls[1:]] == ["coverage.nc", "coverage.csv"]
+
+    @pytest.mark.parametrize(
+        ("words", "tx"),
+        [
+            (["--tx", "3.2", "4.1"], (3.2, 4.1)),
+            (["--tx", "-3.2", "-4.1", "1.5"], (-3.2, -4.1, 1.5)),
+            (["--tx", "-.5", "+1e-1"], (-0.5, 0.1)),
+            (["--tx", "1,2,3"], (1.0, 2.0, 3.0)),
+            (["--tx", "1 2"], (1.0, 2.0)),
+            (["--tx=-1,2"], (-1.0, 2.0)),
+        ],
+    )
+    @pytest.mark.parametrize("first", [True, False])
+    def test_position(
+        self, map_path: Path, calls: list[Any], tmp_path: Path, words: list[str], tx: tuple[float, ...], first: bool
+    ) -> None:
+        before, after = ([], [map_path]) if first else ([map_path], [])
+        result = run("predict", *before, *words, *after, "--out", tmp_path)
+        assert result.exit_code == 0, result.output
+        assert calls[0][1] == tx
+
+    @pytest.mark.parametrize("words", [["1"], ["1", "2", "3", "4"], ["a", "b"], ["1,b"], []])
+    def test_wrong_position(self, map_path: Path, calls: list[Any], tmp_path: Path, words: list[str]) -> None:
+        result = run("predict", map_path, "--out", tmp_path, "--tx", *words)
+        assert result.exit_code == 2
+        assert "is not a position: give --tx X Y or --tx X Y Z in metres." in say(result.stderr)
+        assert not calls
+
+    def test_position_that_is_not_finite_reaches_the_check_of_positions(
+        self, map_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        result = run("predict", map_path, "--tx", "nan", 1, "--out", tmp_path / "out")
+        assert result.exit_code == 2
+        assert "error: tx = (nan, 1.0, 1.5) is not finite: give finite numbers in metres." in result.stderr
+        assert not (tmp_path / "out").exists()
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--material", "cheese"], "error: itu = 'cheese' is not allowed: choose one of vacuum"),
+            (["--material", "2,3"], "--material '2,3' is neither an ITU name nor permittivity,conductivity,thickness"),
+            (["--material", "0,0,1"], "error: relative_permittivity = 0.0 is not allowed"),
+            (["--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .yaml."),
+            (["--frequency", "1"], "error: frequency_hz = 1.0 is not allowed"),
+            (["--max-depth", "11"], "error: max_depth = 11 is not allowed"),
+        ],
+    )
+    def test_wrong_option(
+        self, map_path: Path, calls: list[Any], tmp_path: Path, words: list[str], message: str
+    ) -> None:
+        result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path, *words)
+        assert result.exit_code == 2
+        assert message in say(result.stderr)
+        assert not calls
+
+    def test_frequency_outside_the_material(self, map_path: Path, tmp_path: Path) -> None:
+        words = ["--material", "floorboard", "--frequency", "28e9"]
+        result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path / "out", *words)
+        assert result.exit_code == 2
+        assert "error: frequency_hz = 28000000000.0 is not allowed: ITU material 'floorboard'" in result.stderr
+
+    def test_missing_map(self, tmp_path: Path) -> None:
+        result = run("predict", tmp_path / "none.yaml", "--tx", 1, 1, "--out", tmp_path / "out")
+        assert result.exit_code == 2
+        assert result.stderr.startswith("error: path = ")
+        assert len(result.stderr.splitlines()) == 1
+
+    @pytest.mark.parametrize("error", [BackendError("no LLVM"), OutputError("disk full"), MapError("bad map")])
+    def test_error_is_one_line(
+        self, map_path: Path, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception
+    ) -> None:
+        def fail(*_: object, **__: object) -> None:
+            raise error
+
+        monkeypatch.setattr("sionna_partial.export.save_coverage", fail)
+        result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path)
+        assert result.exit_code == 2
+        assert result.stderr.splitlines()[-1] == f"error: {error}"
+
+    def test_interrupt(self, map_path: Path, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        def interrupt(*_: object, **__: object) -> None:
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("sionna_partial.coverage.predict_map", interrupt)
+        assert run("predict", map_path, "--tx", 1, 1, "--out", tmp_path).exit_code == 130
+
+    def test_strict(self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        read: list[Any] = []
+        monkeypatch.setattr("sionna_partial.map_files.load_map", lambda path, strict: read.append((path, strict)))
+        run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
+        run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path, "--strict")
+        assert read == [(tmp_path, False), (tmp_path, True)]
+
+    def test_warnings_are_one_line_each(
+        self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap
+    ) -> None:
+        def read(path: Path, strict: bool) -> PartialMap:
+            logging.getLogger("sionna_partial.map_turn").warning("origin yaw %g rad", 0.5)
+            with warnings.catch_warnings():
+                warnings.simplefilter("always")
+                warnings.warn("many cells of shade 205", UserWarning, stacklevel=1)
+            return room
+
+        monkeypatch.setattr("sionna_partial.map_files.load_map", read)
+        result = run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
+        assert result.stderr.splitlines()[0] == "warning: origin yaw 0.5 rad"
+
+    def test_quiet_tensorflow(self, map_path: Path, calls: list[Any], monkeypatch: Any, tmp_path: Path) -> None:
+        run("predict", map_path, "--tx", 1, 1, "--out", tmp_path)
+        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "put back in the end"
+        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+        run("predict", map_path, "--tx", 1, 1, "--out", tmp_path)
+        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+
+
+class TestExportScene:
+    def test_folder_reads_back(self, map_path: Path, room: PartialMap, tmp_path: Path) -> None:
+        result = run("export-scene", map_path, "--out", tmp_path / "scene", "--material", "concrete")
+        assert result.exit_code == 0, result.output
+        assert (tmp_path / "scene" / "scene.xml").is_file()
+        assert load_map(tmp_path / "scene") == room
+        assert "concrete" in (tmp_path / "scene" / "scene.xml").read_text()
+        assert result.stdout.startswith(f"wrote {tmp_path / 'scene'}")
+
+    def test_frequency_outside_the_material(self, map_path: Path, tmp_path: Path) -> None:
+        result = run("export-scene", map_path, "--out", tmp_path / "scene", "--material", "floorboard")
+        assert result.exit_code == 2
+        assert "error: frequency_hz" in result.stderr
+        assert not (tmp_path / "scene").exists()
+
+
+class TestExplore:
+    def test_made_home(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap) -> None:
+        asked: list[Any] = []
+
+        def explore(home: PartialMap, steps: tuple[int, ...], seed: int) -> list[PartialMap]:
+            asked.append((home, steps, seed))
+            return [room] * len(steps)
+
+        monkeypatch.setattr("sionna_partial.homes.make_home", lambda seed: asked.append(seed) or room)
+        monkeypatch.setattr(import_module("sionna_partial.explore"), "explore", explore)
+        words = ["--seed", "7", "--steps", "20", "--steps", "100"]
+        result = run("explore", "--out", tmp_path / "maps", *words)
+        assert result.exit_code == 0, result.output
+        assert asked == [7, (room, (20, 100), 7)]
+        names = ["steps_020.yaml", "steps_100.yaml", "complete.yaml"]
+        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'maps' / name}" for name in names]
+        assert all(load_map(tmp_path / "maps" / name) == room for name in names)
+
+    def test_own_home(self, monkeypatch: pytest.MonkeyPatch, map_path: Path, tmp_path: Path, room: PartialMap) -> None:
+        explore = lambda home, steps, seed: [home] * len(steps)  # noqa: E731
+        monkeypatch.setattr(import_module("sionna_partial.explore"), "explore", explore)
+        result = run("explore", "--home", map_path, "--out", tmp_path / "maps")
+        assert result.exit_code == 0, result.output
+        assert load_map(tmp_path / "maps" / "complete.yaml") == room
+        assert len(list((tmp_path / "maps").glob("steps_*.yaml"))) == 4
+
+
+def test_demo_prints_table_and_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def run_demo(out: Path, progress: Any) -> SimpleNamespace:
+        progress(0.5, "half way")
+        return SimpleNamespace(files={"coverage": out / "coverage.nc"}, table="accuracy 0.9")
+
+    monkeypatch.setattr("sionna_partial.demo.run_demo", run_demo)
+    result = run("demo", "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    assert result.stdout.splitlines() == ["accuracy 0.9", f"wrote {tmp_path / 'coverage.nc'}"]
+
+
+class TestInfo:
+    @pytest.mark.parametrize(("remedy", "code"), [("", 0), ("run pip install it", 1)])
+    def test_exit_code_says_whether_all_is_usable(
+        self, monkeypatch: pytest.MonkeyPatch, remedy: str, code: int
+    ) -> None:
+        monkeypatch.setattr(info, "findings", lambda: [Finding("python", "3.11"), Finding("it", "9.9", remedy)])
+        result = run("info")
+        assert result.exit_code == code
+        assert all(word in result.stdout for word in ("python", "3.11", "9.9", remedy))
+
+    def test_works_without_llvm_and_tensorflow(self) -> None:
+        block = "import sys; sys.modules.update(tensorflow=None, keras=None, drjit=None, mitsuba=None)"
+        code = f"{block}\nfrom sionna_partial.cli import app\napp(['info'])"
+        environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/no/such/libLLVM.so", "COLUMNS": "200"}
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+        result = subprocess.run(
+            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+        )
+        assert result.returncode == 1, result.stderr
+        assert "unset DRJIT_LIBLLVM_PATH and run pip install" in result.stdout
+        assert "sionna-rt" in result.stdout
+
+
+class TestHelp:
+    def test_version(self) -> None:
+        assert run("--version").stdout == f"{__version__}\n"
+
+    @pytest.mark.parametrize("command", ["predict", "export-scene", "explore", "demo", "info"])
+    def test_command_has_help(self, command: str) -> None:
+        result = run(command, "--help")
+        assert result.exit_code == 0
+        assert "--help" in result.stdout
+
+    def test_position_is_shown_as_it_is_typed(self) -> None:
+        assert "--tx X Y [Z]" in run("predict", "--help").stdout
+
+
+def test_join_numbers_leaves_the_rest_alone() -> None:
+    args = ["map.yaml", "--tx", "1", "-2", "--out", "-3", "4"]
+    assert cli.join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
+
+
+def test_parse_material() -> None:
+    assert cli.parse_material("") == Material()
+    assert cli.parse_material("wood") == Material(itu="wood")
+    assert cli.parse_material("2.5,0.1,0.05") == Material(2.5, 0.1, 0.05)
+    with pytest.raises(typer.BadParameter, match="'a,b,c' is neither an ITU name"):
+        cli.parse_material("a,b,c")

@@ -1,0 +1,356 @@
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import xarray as xr
+from coverage_fakes import PICTURE, FakePredictor, fake_trace, map_of, small_coverage, use_fakes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sionna_partial import coverage as coverage_module
+from sionna_partial.constants import CellState, LinkState
+from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, WALL_PARTS, predict_map, require_coverage
+from sionna_partial.errors import MapError, PositionError, SettingsError
+from sionna_partial.map_files import save_map
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.settings import Material, SceneSettings, TraceSettings
+
+TX = (0.6, 3.6)
+COMPLETE = PICTURE.replace("...?", "...#").replace("..#?", "..##").replace("#.???", "#..#?")
+
+
+@pytest.fixture
+def fakes(monkeypatch):
+    use_fakes(monkeypatch)
+
+
+@pytest.fixture
+def coverage(monkeypatch):
+    return small_coverage(monkeypatch)
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    """Fail when anything heavy starts."""
+
+    def heavy(*args, **kwargs):
+        pytest.fail("heavy work started before the input was checked")
+
+    for name in ("trace_links", "link_features"):
+        monkeypatch.setattr(coverage_module, name, heavy)
+    monkeypatch.setattr(coverage_module.Predictor, "load", heavy)
+
+
+def unknown_map(ny=8, nx=12):
+    return PartialMap(np.full((ny, nx), CellState.UNKNOWN, dtype=np.uint8), 0.5)
+
+
+def test_receivers_stand_at_the_cell_centres_of_a_grid_that_starts_in_the_lower_left_corner(coverage):
+    np.testing.assert_allclose(coverage["x"], -1.0 + 0.25 * (np.arange(24) + 0.5))
+    np.testing.assert_allclose(coverage["y"], 2.0 + 0.25 * (np.arange(16) + 0.5))
+
+
+@given(st.floats(0.05, 3.0), st.integers(1, 9), st.integers(1, 9))
+@settings(max_examples=60, deadline=None)
+def test_every_receiver_lies_on_the_map_and_no_more_would_fit(spacing_m, ny, nx):
+    partial = unknown_map(ny, nx)
+    if spacing_m >= 2 * 0.5 * min(ny, nx):
+        with pytest.raises(SettingsError, match="spacing_m"):
+            coverage_module._grid_axes(partial, spacing_m)
+        return
+    for axis, length in zip(coverage_module._grid_axes(partial, spacing_m), (0.5 * nx, 0.5 * ny), strict=True):
+        assert axis[0] == pytest.approx(spacing_m / 2)
+        assert axis[-1] < length
+        assert axis[-1] + spacing_m >= length - 1e-6
+
+
+def test_masks_follow_the_map(coverage):
+    partial = map_of(PICTURE)
+    x, y = np.meshgrid(coverage["x"], coverage["y"])
+    state = partial.state_at(np.stack([x, y], axis=-1))
+    np.testing.assert_array_equal(coverage["cell_state"], state)
+    np.testing.assert_array_equal(coverage["observed"], state != CellState.UNKNOWN)
+    np.testing.assert_array_equal(coverage["valid"], state != CellState.WALL)
+
+
+def test_all_documented_variables_are_there_and_nan_exactly_where_no_receiver_stands(coverage):
+    assert set(coverage.data_vars) == set(ATTRIBUTES)
+    valid = coverage["valid"].to_numpy()
+    assert valid.any()
+    assert not valid.all()
+    for name, layer in coverage.data_vars.items():
+        assert layer.dims == ("y", "x")
+        if layer.dtype.kind == "f":
+            np.testing.assert_array_equal(np.isnan(layer), ~valid, err_msg=name)
+    for name in ("link_state", "partial_link_state"):
+        np.testing.assert_array_equal(coverage[name] == NO_RECEIVER, ~valid)
+        assert set(np.unique(coverage[name].to_numpy()[valid])) <= set(LinkState)
+
+
+def test_the_answers_of_tracer_and_predictor_are_laid_out_row_by_row(coverage):
+    here = coverage.sel(x=2.125, y=3.625)
+    distance_m = np.hypot(2.125 - TX[0], 3.625 - TX[1])
+    assert float(here["distance_m"]) == pytest.approx(distance_m, rel=1e-6)
+    assert int(here["partial_link_state"]) == LinkState.LOS
+    assert float(here["partial_gain_db"]) == pytest.approx(-61.4 - 20 * np.log10(distance_m), rel=1e-6)
+    far = coverage.sel(x=4.875, y=5.875)
+    assert not far["observed"]
+    leak = min(0.6, 0.1 * float(far["unobserved_distance_m"]))
+    assert leak > 0
+    assert float(far["p_outage"]) == pytest.approx(1 - leak, rel=1e-5)
+    assert int(far["link_state"]) == LinkState.OUTAGE
+
+
+def test_probabilities_sum_to_one(coverage):
+    total = (coverage["p_los"] + coverage["p_nlos"] + coverage["p_outage"]).to_numpy()
+    np.testing.assert_allclose(total[coverage["valid"].to_numpy()], 1.0, atol=1e-6)
+
+
+def test_what_is_seen_to_be_free_is_indoors_for_certain(coverage):
+    free = (coverage["cell_state"] == CellState.FREE).to_numpy()
+    unknown = (coverage["cell_state"] == CellState.UNKNOWN).to_numpy()
+    assert (coverage["p_indoor"].to_numpy()[free] == 1.0).all()
+    assert (coverage["p_indoor"].to_numpy()[unknown] == 0.25).all()
+
+
+def test_on_a_complete_map_the_trace_is_the_answer(fakes, monkeypatch):
+    monkeypatch.setattr(FakePredictor, "load", lambda name: pytest.fail("no predictor is needed"))
+    partial = map_of(COMPLETE)
+    assert partial.is_complete
+    coverage = predict_map(partial, TX, spacing_m=0.25)
+    valid = coverage["valid"].to_numpy()
+    for state, name in ((LinkState.LOS, "p_los"), (LinkState.NLOS, "p_nlos"), (LinkState.OUTAGE, "p_outage")):
+        np.testing.assert_array_equal(
+            coverage[name].to_numpy()[valid], (coverage["partial_link_state"] == state).to_numpy()[valid]
+        )
+    np.testing.assert_array_equal(coverage["link_state"], coverage["partial_link_state"])
+    np.testing.assert_array_equal(coverage["gain_mean_db"], coverage["partial_gain_db"])
+    assert float(coverage["gain_std_db"].max()) == 0.0
+    assert float(coverage["unobserved_distance_m"].max()) == 0.0
+    free = (coverage["cell_state"] == CellState.FREE).to_numpy()
+    np.testing.assert_array_equal(coverage["p_indoor"].to_numpy()[valid], free[valid])
+    assert coverage.attrs["predictor_sha256"] == ""
+
+
+def test_a_map_without_walls_and_one_that_is_all_unknown_are_answered(fakes):
+    free = PartialMap(np.zeros((8, 12), dtype=np.uint8), 0.5)
+    for partial in (free, unknown_map()):
+        coverage = predict_map(partial, (1.1, 1.1), spacing_m=0.5)
+        assert coverage["valid"].all()
+        assert np.isfinite(coverage["gain_mean_db"]).all()
+
+
+def test_a_map_of_one_cell(fakes):
+    partial = unknown_map(1, 1)
+    coverage = predict_map(partial, (0.1, 0.1), spacing_m=0.5)
+    assert coverage.sizes == {"y": 1, "x": 1}
+    with pytest.raises(PositionError, match=r"none of the 1 receivers can stand.*spacing_m = 0\.5, give a smaller one"):
+        predict_map(partial, (0.25, 0.25), spacing_m=0.5)
+
+
+def test_no_receiver_stands_at_the_transmitter(fakes):
+    coverage = predict_map(unknown_map(), (1.75, 2.25), spacing_m=0.5)
+    at_tx = ~coverage["valid"].to_numpy()
+    assert at_tx.sum() == 1
+    assert np.isnan(coverage["gain_mean_db"].sel(x=1.75, y=2.25))
+    assert coverage["cell_state"].sel(x=1.75, y=2.25) == CellState.UNKNOWN
+    assert predict_map(unknown_map(), (1.75, 2.25, 1.6), spacing_m=0.5)["valid"].all()
+
+
+def test_at_low_frequencies_friis_stays_below_0_db(fakes):
+    coverage = predict_map(unknown_map(), (1.75, 2.25), spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=30e6))
+    distance_m = np.hypot(coverage["x"] - 1.75, coverage["y"] - 2.25)
+    np.testing.assert_array_equal(coverage["valid"], (distance_m >= 9.99308 / (4 * np.pi)).transpose("y", "x"))
+
+
+def test_receivers_within_a_centimetre_of_a_wall_are_masked(fakes):
+    state = np.zeros((6, 6), dtype=np.uint8)
+    state[:, 3] = CellState.WALL
+    coverage = predict_map(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=0.2)
+    x = coverage["x"].to_numpy()
+    near_m = np.maximum(1.5 - x, x - 2.0)
+    np.testing.assert_array_equal(coverage["valid"].to_numpy().all(axis=0), near_m > 0.01)
+    assert 1.5 in np.round(x, 9)
+
+
+def test_a_wall_thinner_than_a_receiver_cell_is_kept_for_pictures(fakes):
+    state = np.zeros((6, 6), dtype=np.uint8)
+    state[4, 0] = CellState.WALL
+    coverage = predict_map(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=1.5)
+    assert coverage["valid"].all()
+    expected = np.zeros((2, 2), dtype=np.int64)
+    for row in (2, 3):
+        for column in (0, 1):
+            expected[1, 0] |= 1 << (WALL_PARTS * row + column)
+    np.testing.assert_array_equal(coverage["wall_parts"], expected)
+
+
+@given(st.integers(1, 25), st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_wall_parts_cover_every_wall_and_nothing_far_from_one(tenths, seed):
+    state = (np.random.default_rng(seed).random((7, 9)) < 0.2).astype(np.uint8)
+    partial = PartialMap(state, 0.5)
+    spacing_m = tenths / 10
+    x_m, y_m = coverage_module._grid_axes(partial, spacing_m)
+    grid = SimpleNamespace(x_m=x_m, y_m=y_m, valid=np.zeros((len(y_m), len(x_m)), dtype=bool))
+    bits = coverage_module._wall_parts(partial, grid, spacing_m)
+    part = np.arange(WALL_PARTS)
+    found = (bits[:, None, :, None] >> (WALL_PARTS * part[:, None, None] + part)) & 1
+    found = found.reshape(WALL_PARTS * len(y_m), WALL_PARTS * len(x_m)).astype(bool)
+    edge = spacing_m / WALL_PARTS
+    for row, column in np.ndindex(found.shape):
+        low = np.array([column, row]) * edge
+        cells = np.argwhere(state)[:, ::-1] * 0.5
+        overlap = np.minimum(low + edge, cells + 0.5) - np.maximum(low, cells)
+        assert found[row, column] == (overlap > 1e-6).all(axis=1).any()
+
+
+def test_moving_the_map_moves_the_answer(fakes):
+    near = predict_map(map_of(PICTURE), TX, spacing_m=0.25)
+    far = predict_map(map_of(PICTURE, origin_m=(499_999.0, 4_500_002.0)), (500_000.6, 4_500_003.6), spacing_m=0.25)
+    for name in ATTRIBUTES:
+        np.testing.assert_allclose(near[name], far[name], atol=1e-4, err_msg=name)
+
+
+def test_the_transmitter_is_at_1_5_m_where_no_height_is_given(coverage):
+    np.testing.assert_array_equal(coverage.attrs["transmitter_m"], (0.6, 3.6, 1.5))
+
+
+def test_a_path_is_read(fakes, tmp_path):
+    save_map(map_of(PICTURE), tmp_path / "map.yaml")
+    xr.testing.assert_identical(
+        predict_map(tmp_path / "map.yaml", TX, spacing_m=0.25), predict_map(map_of(PICTURE), TX, spacing_m=0.25)
+    )
+    with pytest.raises(MapError, match="missing"):
+        predict_map(tmp_path / "missing.yaml", TX)
+
+
+@pytest.mark.parametrize("name", [None, "paper", "my.keras"])
+def test_the_predictor_is_loaded_by_its_name(fakes, monkeypatch, name):
+    calls = []
+    monkeypatch.setattr(FakePredictor, "load", lambda name: calls.append(name) or FakePredictor())
+    predict_map(map_of(PICTURE), TX, spacing_m=0.5, predictor=name)
+    assert calls == [name]
+
+
+def test_a_predictor_is_used_as_it_is(fakes):
+    predictor = FakePredictor()
+    predictor.name = "mine"
+    assert predict_map(map_of(PICTURE), TX, spacing_m=0.5, predictor=predictor).attrs["predictor"] == "mine"
+
+
+def test_a_predictor_trained_at_another_frequency_is_warned_about(fakes, caplog):
+    predict_map(map_of(PICTURE), TX, spacing_m=0.5)
+    assert not caplog.messages
+    predict_map(map_of(PICTURE), TX, spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=60e9))
+    (message,) = caplog.messages
+    assert message.startswith("predictor 'fake' was trained at 28 GHz, and is used at 60 GHz")
+
+
+def test_settings_reach_the_tracer_and_the_attributes(fakes):
+    coverage = predict_map(
+        map_of(PICTURE),
+        TX,
+        rx_height_m=1.0,
+        spacing_m=0.5,
+        scene_settings=SceneSettings(material=Material(itu="concrete")),
+        trace_settings=TraceSettings(frequency_hz=60e9, max_depth=3),
+    )
+    attributes = coverage.attrs
+    assert attributes["Conventions"] == "CF-1.11"
+    assert (attributes["frequency_hz"], attributes["rx_height_m"], attributes["spacing_m"]) == (60e9, 1.0, 0.5)
+    assert json.loads(attributes["trace_settings"])["max_depth"] == 3
+    assert json.loads(attributes["scene_settings"])["material"]["itu"] == "concrete"
+    assert "sionna-rt" in attributes["source"]
+    assert (attributes["predictor"], attributes["predictor_sha256"]) == ("fake", "0" * 64)
+    assert float(coverage["distance_m"].min()) >= 0.5
+
+
+def test_units_and_flags_follow_cf(coverage):
+    assert coverage["x"].attrs["standard_name"] == "projection_x_coordinate"
+    for name, layer in coverage.variables.items():
+        assert "long_name" in layer.attrs, name
+        assert ("units" in layer.attrs) or ("flag_values" in layer.attrs) or name == "wall_parts"
+        if "flag_values" in layer.attrs:
+            assert len(layer.attrs["flag_values"]) == len(layer.attrs["flag_meanings"].split())
+    assert coverage["link_state"].attrs["flag_meanings"] == "outage los nlos no_receiver"
+
+
+def test_progress_grows_to_1(fakes):
+    calls = []
+    predict_map(map_of(PICTURE), TX, spacing_m=0.5, progress=lambda share, message: calls.append((share, message)))
+    shares = [share for share, _ in calls]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    assert all(message for _, message in calls)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ({"tx": (50.0, 3.6)}, PositionError, r"tx = \(50\.0, 3\.6, 1\.5\) is outside the map"),
+        ({"tx": (-0.25, 3.6)}, PositionError, r"tx = .* is inside a wall"),
+        ({"tx": (0.6, float("nan"))}, PositionError, r"tx = .* is not finite"),
+        ({"tx": (0.6, 3.6, 9.0)}, PositionError, r"tx = .* is not between floor and ceiling"),
+        ({"tx": "here"}, PositionError, r"tx = 'here' is not numeric"),
+        ({"tx": (("a", "b"))}, PositionError, r"tx = \('a', 'b'\) is not numeric"),
+        ({"tx": [(0.6, 3.6, 1.5), (0.7, 3.6, 1.5)]}, PositionError, r"tx has shape \(2, 3\): give one transmitter"),
+        ({"rx_height_m": 0.0}, SettingsError, r"rx_height_m = 0\.0 is not allowed"),
+        ({"rx_height_m": 3.0}, SettingsError, r"rx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
+        ({"rx_height_m": float("nan")}, SettingsError, r"rx_height_m = nan is not allowed"),
+        ({"spacing_m": 0.0}, SettingsError, r"spacing_m = 0\.0 is not allowed"),
+        ({"spacing_m": float("inf")}, SettingsError, r"spacing_m = inf is not allowed"),
+        ({"spacing_m": 9.0}, SettingsError, r"spacing_m = 9\.0 .* the map is 6 x 4 m; give 4 or less"),
+        (
+            {"spacing_m": 0.05, "scene": unknown_map(400, 600)},
+            SettingsError,
+            r"spacing_m = 0\.05 .* makes 24,000,000 receivers, more than 2,000,000; give 0\.19 or more",
+        ),
+        (
+            {
+                "trace_settings": TraceSettings(frequency_hz=60e9),
+                "scene_settings": SceneSettings(Material(itu="brick")),
+            },
+            SettingsError,
+            r"frequency_hz = 60000000000\.0 .* 'brick'",
+        ),
+    ],
+)
+def test_bad_input_is_refused_before_any_heavy_work(no_work, arguments, error, message):
+    arguments = {"scene": map_of(PICTURE), "tx": TX} | arguments
+    with pytest.raises(error, match=message):
+        predict_map(arguments.pop("scene"), arguments.pop("tx"), **arguments)
+
+
+def test_the_spacing_that_the_error_proposes_is_accepted():
+    coverage_module._grid_axes(unknown_map(400, 600), 0.19)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda data: data.drop_vars(["p_los", "valid"]), r"coverage lacks p_los, valid: give the xarray\.Dataset"),
+        (lambda data: data.drop_attrs(), "coverage lacks transmitter_m, spacing_m, frequency_hz"),
+        (lambda data: data.transpose("x", "y"), "coverage lacks p_los"),
+        (lambda data: data.isel(x=slice(0, 0)), "coverage lacks receivers"),
+        (lambda data: data.drop_vars("x"), "coverage lacks x:"),
+        (lambda data: data["p_los"], "coverage is of type DataArray"),
+    ],
+)
+def test_what_is_no_coverage_map_is_named(coverage, spoil, message):
+    require_coverage(coverage)
+    with pytest.raises(SettingsError, match=message):
+        require_coverage(spoil(coverage))
+
+
+def test_the_fake_tracer_checks_positions_like_the_real_one():
+    with pytest.raises(PositionError):
+        fake_trace(
+            map_of(PICTURE),
+            (50.0, 0.0, 1.5),
+            np.zeros((0, 3)),
+            settings=TraceSettings(),
+            scene_settings=SceneSettings(),
+            progress=print,
+        )

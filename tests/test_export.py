@@ -1,0 +1,226 @@
+import os
+import stat
+import time
+
+import numpy as np
+import pandas as pd
+import pytest
+import rasterio
+import xarray as xr
+import yaml
+from coverage_fakes import small_coverage
+from PIL import Image
+
+from sionna_partial.constants import CellState
+from sionna_partial.coverage import ATTRIBUTES
+from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.export import TABLE_VARIABLES, save_coverage
+from sionna_partial.map_files import load_map
+from sionna_partial.plot import figure_png, plot_coverage
+
+SUFFIXES = (".nc", ".tif", ".csv", ".png", ".yaml")
+
+
+@pytest.fixture
+def coverage(monkeypatch):
+    return small_coverage(monkeypatch)
+
+
+def test_netcdf_returns_an_equal_dataset(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.nc")
+    loaded = xr.load_dataset(tmp_path / "coverage.nc")
+    xr.testing.assert_identical(loaded, coverage)
+    for name, layer in coverage.variables.items():
+        assert loaded[name].dtype == layer.dtype, name
+    assert loaded["p_los"].encoding["zlib"]
+    assert "_FillValue" not in loaded["x"].encoding
+
+
+def test_netcdf_is_read_without_xarrays_help(coverage, tmp_path):
+    h5netcdf = pytest.importorskip("h5netcdf")
+    save_coverage(coverage, tmp_path / "coverage.nc")
+    with h5netcdf.File(tmp_path / "coverage.nc") as file:
+        assert file.attrs["Conventions"] == "CF-1.11"
+        assert file["gain_mean_db"].attrs["units"] == "dB"
+        assert file["gain_mean_db"].dimensions == ("y", "x")
+        assert file["valid"][...].min() == 0
+
+
+def test_a_loaded_map_is_drawn_as_the_original(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.nc")
+    loaded = xr.load_dataset(tmp_path / "coverage.nc")
+    assert figure_png(plot_coverage(loaded)) == figure_png(plot_coverage(coverage))
+
+
+@pytest.mark.parametrize(("x", "y"), [(-0.875, 2.125), (0.625, 3.625), (4.875, 5.875), (-0.375, 3.625)])
+def test_geotiff_has_the_value_of_the_dataset_at_a_world_point(coverage, tmp_path, x, y):
+    save_coverage(coverage, tmp_path / "coverage.tif")
+    with rasterio.open(tmp_path / "coverage.tif") as image:
+        assert image.descriptions == TABLE_VARIABLES
+        assert image.crs is None
+        assert tuple(image.bounds) == pytest.approx((-1.0, 2.0, 5.0, 6.0))
+        values = next(image.sample([(x, y)]))
+    here = coverage.sel(x=x, y=y)
+    expected = [float(here[name]) for name in TABLE_VARIABLES]
+    masked = [name in ("link_state", "partial_link_state") and not here["valid"] for name in TABLE_VARIABLES]
+    np.testing.assert_allclose(values, np.where(masked, np.nan, expected), rtol=1e-6)
+
+
+def test_geotiff_tells_units_and_settings(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.tif")
+    with rasterio.open(tmp_path / "coverage.tif") as image:
+        assert np.isnan(image.nodata)
+        assert image.units[TABLE_VARIABLES.index("gain_mean_db")] == "dB"
+        assert image.tags()["units"] == "m"
+        assert image.tags()["predictor"] == "fake"
+        band = 1 + TABLE_VARIABLES.index("link_state")
+        assert image.tags(band)["flag_meanings"] == "outage los nlos no_receiver"
+
+
+def test_a_distance_of_255_m_is_a_number(coverage, tmp_path):
+    coverage["distance_m"][3, 4] = 255.0
+    save_coverage(coverage, tmp_path / "coverage.tif")
+    with rasterio.open(tmp_path / "coverage.tif") as image:
+        layer = np.flipud(image.read(1 + TABLE_VARIABLES.index("distance_m")))
+    assert layer[3, 4] == 255.0
+
+
+def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.csv")
+    table = pd.read_csv(tmp_path / "coverage.csv")
+    assert list(table.columns) == ["x_m", "y_m", *TABLE_VARIABLES]
+    assert len(table) == coverage["valid"].size
+    np.testing.assert_allclose(table["y_m"], np.repeat(coverage["y"], coverage.sizes["x"]))
+    for name in TABLE_VARIABLES:
+        layer = coverage[name].to_numpy().ravel().astype(float)
+        if name.endswith("link_state"):
+            layer[~coverage["valid"].to_numpy().ravel()] = np.nan
+        np.testing.assert_allclose(table[name], layer, rtol=1e-6, err_msg=name)
+
+
+def test_csv_keeps_millimetres_far_from_the_origin(coverage, tmp_path):
+    save_coverage(coverage.assign_coords(x=coverage["x"] + 500_000.0), tmp_path / "coverage.csv")
+    assert pd.read_csv(tmp_path / "coverage.csv")["x_m"][0] == 499_999.125
+
+
+def test_png_is_the_picture(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.png")
+    with Image.open(tmp_path / "coverage.png") as image:
+        assert image.width >= 1200
+    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(coverage))
+
+
+def test_ros_map_holds_the_probability_of_outage(coverage, tmp_path):
+    """As nav2_map_server reads it in raw mode: shades 0 to 100 are occupancies, others unknown, row 0 is the top."""
+    save_coverage(coverage, tmp_path / "outage.yaml")
+    sheet = yaml.safe_load((tmp_path / "outage.yaml").read_text())
+    assert (sheet["mode"], sheet["negate"], sheet["image"]) == ("raw", 0, "outage.pgm")
+    assert sheet["resolution"] == 0.25
+    assert sheet["origin"] == [-1.0, 2.0, 0.0]
+    occupancy = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(int)
+    percent = 100 * coverage["p_outage"].to_numpy()
+    valid = coverage["valid"].to_numpy()
+    assert (occupancy[~valid] == 255).all()
+    assert (np.abs(occupancy - percent)[valid] <= 0.5).all()
+
+
+def test_ros_map_loads_as_a_map(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "outage.yaml")
+    loaded = load_map(tmp_path / "outage.yaml")
+    p_outage = coverage["p_outage"].to_numpy()
+    assert loaded.shape == p_outage.shape
+    assert loaded.resolution_m == 0.25
+    assert loaded.origin_m == (-1.0, 2.0)
+    assert (loaded.state[p_outage > 0.66] == CellState.WALL).all()
+    assert (loaded.state[p_outage < 0.19] == CellState.FREE).all()
+    assert (loaded.state[np.isnan(p_outage)] == CellState.UNKNOWN).all()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_equal_maps_give_equal_files(coverage, tmp_path, suffix):
+    save_coverage(coverage, tmp_path / "first" / f"coverage{suffix}")
+    time.sleep(1.1)  # HDF5's time stamps are whole seconds
+    save_coverage(coverage.copy(deep=True), tmp_path / "second" / f"coverage{suffix}")
+    first = {file.name: file.read_bytes() for file in (tmp_path / "first").iterdir()}
+    second = {file.name: file.read_bytes() for file in (tmp_path / "second").iterdir()}
+    assert first == second
+    assert len(first) == (2 if suffix == ".yaml" else 1)
+
+
+def test_files_are_replaced_and_other_files_left_alone(coverage, tmp_path):
+    (tmp_path / "coverage.csv").write_text("old")
+    (tmp_path / "notes.txt").write_text("mine")
+    save_coverage(coverage, tmp_path / "coverage.csv")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["coverage.csv", "notes.txt"]
+    assert (tmp_path / "coverage.csv").read_text().startswith("x_m,y_m")
+
+
+def test_suffixes_are_read_in_any_case_and_paths_may_be_text(coverage, tmp_path):
+    save_coverage(coverage, str(tmp_path / "coverage.CSV"))
+    assert (tmp_path / "coverage.CSV").is_file()
+
+
+@pytest.mark.parametrize("name", ["coverage.txt", "coverage", "coverage.nc.gz"])
+def test_an_unknown_suffix_is_named(coverage, tmp_path, name):
+    with pytest.raises(
+        OutputError, match=r"path = '.*coverage.*' has the suffix '.*': choose one of \.nc, \.tif, \.csv"
+    ):
+        save_coverage(coverage, tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_folder_of_that_name_is_named_and_kept(coverage, tmp_path, suffix):
+    target = tmp_path / f"coverage{suffix}"
+    target.mkdir()
+    with pytest.raises(OutputError, match=f"coverage{suffix}"):
+        save_coverage(coverage, target)
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_an_unwritable_folder_is_named(coverage, tmp_path, suffix):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="file"):
+        save_coverage(coverage, tmp_path / "file" / f"coverage{suffix}")
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_full_disk_leaves_the_old_files(coverage, tmp_path, monkeypatch, suffix):
+    names = [f"coverage{suffix}"] + ["coverage.pgm"] * (suffix == ".yaml")
+    for name in names:
+        (tmp_path / name).write_text("old")
+
+    def full(descriptor):
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OutputError, match=r"No space left.*disk is full"):
+        save_coverage(coverage, tmp_path / f"coverage{suffix}")
+    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(names)
+    assert all((tmp_path / name).read_text() == "old" for name in names)
+
+
+@pytest.mark.parametrize("suffix", [".nc", ".tif", ".csv", ".png"])
+def test_a_writer_that_fails_leaves_nothing(coverage, tmp_path, monkeypatch, suffix):
+    def fail(*args, **kwargs):
+        raise RuntimeError("broken")
+
+    for name in ("h5netcdf.File", "MemoryFile", "plot_coverage"):
+        monkeypatch.setattr(f"sionna_partial.export.{name}", fail)
+    monkeypatch.setattr(xr.Dataset, "to_dataframe", fail)
+    with pytest.raises(RuntimeError, match="broken"):
+        save_coverage(coverage, tmp_path / f"coverage{suffix}")
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_is_no_coverage_map_is_refused(coverage, tmp_path):
+    with pytest.raises(SettingsError, match="coverage lacks p_outage"):
+        save_coverage(coverage.drop_vars("p_outage"), tmp_path / "coverage.nc")
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_variable_but_the_walls_parts_is_in_the_tables():
+    assert set(ATTRIBUTES) - set(TABLE_VARIABLES) == {"wall_parts"}

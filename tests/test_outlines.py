@@ -1,0 +1,350 @@
+"""Wall outlines: literal tiny maps, synthetic nasty maps, and properties."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from sionna_partial.constants import CellState
+from sionna_partial.outlines import Outlines, wall_outlines
+from sionna_partial.partial_map import PartialMap
+
+SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
+CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
+
+
+def drawn(text: str, resolution_m: float = 0.05) -> PartialMap:
+    """Map of an ASCII drawing, its last line at y = 0."""
+    rows = text.split()
+    return PartialMap(np.array([[CELLS[c] for c in row] for row in reversed(rows)], dtype=np.uint8), resolution_m)
+
+
+def in_cells(partial: PartialMap, outlines: Outlines) -> NDArray[np.float64]:
+    """Segments (S, 2, 2) in cells."""
+    return np.round(outlines.vertices_m / partial.resolution_m, 4)[outlines.segments]
+
+
+def segment_set(partial: PartialMap, **options: float) -> set[tuple[tuple[float, ...], ...]]:
+    pairs = in_cells(partial, wall_outlines(partial, **options))
+    return {tuple(sorted(tuple(end) for end in pair.tolist())) for pair in pairs}
+
+
+def tilted(angle_deg: float, thickness: float, phase: float = 0.0, gap: tuple[float, float] = (0.0, 0.0)) -> PartialMap:
+    """A wall of 100 cells length in free space; thickness 0 gives an 8-connected, -1 a 4-connected staircase."""
+    y, x = np.mgrid[:140, :140] + 0.5 - 70.0
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    along, across = x * cosine + (y - phase) * sine, -x * sine + (y - phase) * cosine
+    half = {0.0: max(abs(cosine), abs(sine)) / 2, -1.0: (abs(cosine) + abs(sine)) / 2}.get(thickness, thickness / 2)
+    wall = (across >= -half) & (across < half) & (abs(along) < 50) & ~((along >= gap[0]) & (along < gap[1]))
+    return PartialMap(np.where(wall, CellState.WALL, CellState.FREE).astype(np.uint8), 0.05)
+
+
+def ragged_room(seed: int, thickness: int, share: float) -> PartialMap:
+    """Two rooms joined by a door of 20 cells, with ragged walls, a few specks, and unknown around."""
+    rng = np.random.default_rng(seed)
+    wall = np.zeros((140, 140), dtype=bool)
+    wall[20:120, 20:120] = True
+    inside = np.zeros_like(wall)
+    inside[20 + thickness : 120 - thickness, 20 + thickness : 120 - thickness] = True
+    wall &= ~inside
+    wall[20:120, 70 : 70 + thickness] = True
+    wall[60:80, 70 : 70 + thickness] = False
+    bumps = ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < share)
+    specks = inside & (rng.random(wall.shape) < 0.001)
+    state = np.where(inside, CellState.FREE, CellState.UNKNOWN)
+    return PartialMap(np.where(wall | bumps | specks, CellState.WALL, state).astype(np.uint8), 0.05)
+
+
+def farthest_from_walls(partial: PartialMap, outlines: Outlines) -> float:
+    """Largest distance of an outline point from the next WALL cell centre [cells]."""
+    row, column = np.nonzero(partial.state == CellState.WALL)
+    pairs = in_cells(partial, outlines)
+    share = np.linspace(0.0, 1.0, 401)[:, None, None]
+    points = (pairs[:, 0] * (1 - share) + pairs[:, 1] * share).reshape(-1, 2)
+    return float(cKDTree(np.stack([column, row], 1) + 0.5).query(points)[0].max())
+
+
+def farthest_from_outlines(partial: PartialMap, outlines: Outlines) -> float:
+    """Largest distance of a WALL cell that touches FREE ones from the next outline [cells]."""
+    wall = partial.state == CellState.WALL
+    row, column = np.nonzero(wall & ndimage.binary_dilation(partial.state == CellState.FREE))
+    lines = shapely.multilinestrings(shapely.linestrings(in_cells(partial, outlines)))
+    return float(shapely.distance(lines, shapely.points(column + 0.5, row + 0.5)).max())
+
+
+def regions(partial: PartialMap, outlines: Outlines, scale: int = 5) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Regions that walls, and regions that outlines enclose, at every cell away from walls."""
+    wall = partial.state == CellState.WALL
+    drawing = np.zeros((partial.shape[0] * scale + 1, partial.shape[1] * scale + 1), dtype=bool)
+    for start, end in in_cells(partial, outlines) * scale:
+        count = int(3 * np.abs(end - start).max()) + 2
+        column, row = np.rint(np.linspace(start, end, count)).astype(int).T
+        drawing[row, column] = True
+    row, column = np.nonzero(ndimage.distance_transform_edt(~wall) > 2.2)
+    by_wall, by_line = ndimage.label(~wall)[0], ndimage.label(~ndimage.binary_dilation(drawing))[0]
+    return by_wall[row, column], by_line[row * scale + scale // 2, column * scale + scale // 2]
+
+
+def assert_sound(outlines: Outlines) -> None:
+    """Every vertex is used, no segment is a point or twice there, none meets another away from a shared vertex."""
+    vertices, segments = outlines.vertices_m, outlines.segments
+    assert vertices.dtype == np.float64
+    assert set(segments.ravel().tolist()) == set(range(len(vertices)))
+    assert len(np.unique(vertices, axis=0)) == len(vertices)
+    assert (segments[:, 0] != segments[:, 1]).all()
+    assert len(np.unique(np.sort(segments, axis=1), axis=0)) == len(segments)
+    lines = shapely.linestrings(vertices[segments])
+    first, second = shapely.STRtree(lines).query(lines, predicate="intersects")
+    for a, b in zip(first.tolist(), second.tolist(), strict=True):
+        if a < b:
+            shared = set(segments[a].tolist()) & set(segments[b].tolist())
+            assert len(shared) == 1
+            assert shapely.intersection(lines[a], lines[b]).geom_type == "Point"
+
+
+@pytest.mark.parametrize("state", list(CellState))
+def test_a_map_of_one_state(state: CellState) -> None:
+    outlines = wall_outlines(PartialMap(np.full((6, 9), state, dtype=np.uint8), 0.1))
+    assert len(outlines.segments) == (4 if state == CellState.WALL else 0)
+    assert outlines.vertices_m.shape == (len(outlines.segments), 2)
+
+
+def test_thin_wall_is_one_line_through_the_cell_centres() -> None:
+    partial = drawn("........ .######. ........")
+    assert segment_set(partial) == {((1.5, 1.5), (6.5, 1.5))}
+
+
+def test_lone_cell_is_a_square() -> None:
+    corners = [(1.0, 1.0), (2.0, 1.0), (2.0, 2.0), (1.0, 2.0)]
+    expected = {tuple(sorted((corners[k], corners[k - 1]))) for k in range(4)}
+    assert segment_set(drawn("... .#. ...")) == expected
+    assert len(wall_outlines(drawn("#")).segments) == 4
+
+
+def test_thick_wall_is_its_faces() -> None:
+    partial = drawn("........ .######. .######. .######. ........")
+    corners = [(1.5, 1.5), (6.5, 1.5), (6.5, 3.5), (1.5, 3.5)]
+    assert segment_set(partial) == {tuple(sorted((corners[k], corners[k - 1]))) for k in range(4)}
+
+
+def test_wall_of_two_cells_is_one_line_in_its_middle() -> None:
+    assert segment_set(drawn("........ .######. .######. ........")) == {((1.5, 2.0), (6.5, 2.0))}
+
+
+def test_wall_of_two_cells_is_the_layer_that_faces_free_cells() -> None:
+    assert segment_set(drawn("???????? .######. .######. ........")) == {((1.5, 1.5), (6.5, 1.5))}
+
+
+def test_walls_that_meet_share_a_vertex() -> None:
+    partial = drawn(
+        """
+        .......
+        .#####.
+        ...#...
+        ...#...
+        ...#...
+        """
+    )
+    assert segment_set(partial) == {
+        ((1.5, 3.5), (3.5, 3.5)),
+        ((3.5, 3.5), (5.5, 3.5)),
+        ((3.5, 0.5), (3.5, 3.5)),
+    }
+
+
+def test_diagonal_joint_is_closed() -> None:
+    partial = drawn(
+        """
+        ......
+        ####..
+        ....#.
+        ....#.
+        ....#.
+        """
+    )
+    outlines = wall_outlines(partial)
+    assert (
+        len(
+            shapely.get_parts(
+                shapely.line_merge(shapely.multilinestrings(shapely.linestrings(in_cells(partial, outlines))))
+            )
+        )
+        == 1
+    )
+    assert farthest_from_outlines(partial, outlines) < 0.6
+
+
+def test_spur_of_one_cell_is_cut() -> None:
+    assert segment_set(drawn("......... ....#.... .#######. .........")) == {((1.5, 1.5), (7.5, 1.5))}
+
+
+def test_pinhole_bump_and_notch_of_a_thick_wall_vanish() -> None:
+    clean = drawn(".............. .############. .############. .############. .############. ..............")
+    ragged = drawn(".............. .######.#####. .###.########. .##?#########. .############. .......##.....")
+    assert segment_set(ragged) == segment_set(clean)
+
+
+@pytest.mark.parametrize("gap", ["?", "??", ".", ".."])
+def test_short_gap_is_bridged(gap: str) -> None:
+    width = 10 + len(gap)
+    partial = drawn(f"{'.' * (width + 2)} .#####{gap}#####. {'.' * (width + 2)}")
+    assert segment_set(partial) == {((1.5, 1.5), (width + 0.5, 1.5))}
+
+
+@pytest.mark.parametrize(
+    ("row", "resolution_m", "bridge_gap_m"),
+    [
+        (".#####???#####.", 0.05, 0.2),
+        (".#####...#####.", 0.05, 0.2),
+        (".#####..#####.", 0.1, 0.2),
+        (".#####??#####.", 0.1, 0.1),
+        (".#####.#####.", 0.2, 0.2),
+        (".#####?#####.", 0.05, 0.0),
+        (".##..#####.", 0.05, 0.2),
+    ],
+)
+def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float) -> None:
+    partial = drawn(f"{'.' * len(row)} {row} {'.' * len(row)}", resolution_m)
+    first, last = row.index("#"), row.rindex("#")
+    opening = row.strip(".").replace("?", ".").split(".")
+    left, right = first + len(opening[0]) - 1, last - len(opening[-1]) + 1
+    assert segment_set(partial, bridge_gap_m=bridge_gap_m) == {
+        ((first + 0.5, 1.5), (left + 0.5, 1.5)),
+        ((right + 0.5, 1.5), (last + 0.5, 1.5)),
+    }
+
+
+def test_dotted_wall_with_unknown_gaps_is_one_line() -> None:
+    assert segment_set(drawn("............. .#?#?#?#?#?#. ?????????????")) == {((1.5, 1.5), (11.5, 1.5))}
+
+
+@pytest.mark.parametrize("angle_deg", [3, 17, 30, 45, 73])
+@pytest.mark.parametrize("thickness", [0.0, -1.0])
+def test_gap_of_a_tilted_wall_is_bridged_and_a_door_is_not(angle_deg: float, thickness: float) -> None:
+    sampled = tilted(angle_deg, thickness)
+    state = sampled.state.copy()
+    middle = 70
+    rows, columns = np.nonzero(state == CellState.WALL)
+    position = columns if angle_deg <= 45 else rows
+    state[rows[position == middle], columns[position == middle]] = CellState.UNKNOWN
+    assert len(wall_outlines(PartialMap(state, 0.05)).segments) == 1
+    door = wall_outlines(tilted(angle_deg, thickness, gap=(-4.0, 4.0)))
+    ends = in_cells(sampled, door)
+    assert len(ends) == 2
+    nearest = np.abs((ends.reshape(-1, 2) - 70) @ [np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))]).min()
+    assert nearest > 3.0
+
+
+@pytest.mark.parametrize("angle_deg", [0, 3, 17, 45, 60, 87])
+@pytest.mark.parametrize("thickness", [0.0, -1.0])
+@pytest.mark.parametrize("phase", [0.11, 0.37, 0.8])
+def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: float, phase: float) -> None:
+    partial = tilted(angle_deg, thickness, phase)
+    outlines = wall_outlines(partial)
+    assert len(outlines.segments) == 1
+    start, end = in_cells(partial, outlines)[0] - 70
+    found = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0]))
+    assert abs((found - angle_deg + 90) % 180 - 90) < 0.6
+    assert 97 < np.hypot(*(end - start)) < 101
+    assert farthest_from_outlines(partial, outlines) < 0.8
+
+
+@pytest.mark.parametrize("angle_deg", [3, 17, 45])
+@pytest.mark.parametrize("thickness", [4, 6])
+def test_thick_tilted_wall_has_few_segments(angle_deg: float, thickness: float) -> None:
+    partial = tilted(angle_deg, thickness, 0.2)
+    outlines = wall_outlines(partial)
+    assert 4 <= len(outlines.segments) <= 8
+    assert_sound(outlines)
+
+
+def test_tolerance_zero_keeps_every_corner() -> None:
+    partial = drawn("......... ....####. .####.... .........")
+    assert segment_set(partial, tolerance_cells=0.0) == {
+        ((1.5, 1.5), (4.5, 1.5)),
+        ((4.5, 1.5), (4.5, 2.5)),
+        ((4.5, 2.5), (7.5, 2.5)),
+    }
+    assert len(segment_set(partial, tolerance_cells=0.5)) == 1
+
+
+@pytest.mark.parametrize("thickness", [1, 2, 3, 5])
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.2])
+def test_ragged_rooms_keep_their_regions(thickness: int, share: float) -> None:
+    partial = ragged_room(7, thickness, share)
+    outlines = wall_outlines(partial)
+    assert_sound(outlines)
+    by_wall, by_line = regions(partial, outlines)
+    assert len(set(zip(by_wall.tolist(), by_line.tolist(), strict=True))) == len(set(by_wall.tolist())) == 2
+    assert farthest_from_walls(partial, outlines) < 1.6
+    assert farthest_from_outlines(partial, outlines) < 2.3
+    assert len(outlines.segments) < 70 + 900 * share
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 24), st.integers(1, 24), st.floats(0.05, 0.7), st.sampled_from([0, 2]))
+def test_random_maps_give_sound_outlines(seed: int, ny: int, nx: int, share: float, other: int) -> None:
+    rng = np.random.default_rng(seed)
+    state = np.where(rng.random((ny, nx)) < share, CellState.WALL, other).astype(np.uint8)
+    partial = PartialMap(state, 0.1)
+    outlines = wall_outlines(partial)
+    assert_sound(outlines)
+    if (state == CellState.WALL).any():
+        assert farthest_from_walls(partial, outlines) < 2.2
+    else:
+        assert len(outlines.segments) == 0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(-1e6, 1e6), st.integers(0, 5), st.integers(0, 5))
+def test_moving_or_padding_the_map_changes_nothing(seed: int, origin: float, below: int, left: int) -> None:
+    rng = np.random.default_rng(seed)
+    state = rng.choice(3, (14, 14), p=[0.5, 0.3, 0.2]).astype(np.uint8)
+    here = wall_outlines(PartialMap(state, 0.05))
+    moved = wall_outlines(PartialMap(state, 0.05, (origin, -origin)))
+    np.testing.assert_array_equal(moved.vertices_m, here.vertices_m)
+    np.testing.assert_array_equal(moved.segments, here.segments)
+    padded = np.pad(state, ((below, 1), (left, 2)), constant_values=CellState.UNKNOWN)
+    again = wall_outlines(PartialMap(padded, 0.05))
+    np.testing.assert_allclose(again.vertices_m - [left * 0.05, below * 0.05], here.vertices_m, atol=1e-9)
+    np.testing.assert_array_equal(again.segments, here.segments)
+
+
+def test_unknown_cells_bear_no_outline() -> None:
+    partial = ragged_room(3, 1, 0.0)
+    state = partial.state.copy()
+    state[:, 80:] = CellState.UNKNOWN
+    outlines = wall_outlines(PartialMap(state, 0.05))
+    assert len(outlines.segments) > 0
+    assert outlines.vertices_m[:, 0].max() <= 79.5 * 0.05 + 1e-9
+
+
+def test_large_warehouse_is_quick_and_few() -> None:
+    """A hall of 50 x 30 m with racks at 0.03 m, unknown all around."""
+    state = np.full((1200, 1870), CellState.UNKNOWN, dtype=np.uint8)
+    state[96:1104, 96:1774] = CellState.WALL
+    state[100:1100, 100:1770] = CellState.FREE
+    for row in range(200, 1000, 100):
+        for column in range(200, 1400, 370):
+            state[row : row + 33, column : column + 300] = CellState.WALL
+    outlines = wall_outlines(PartialMap(state, 0.03))
+    assert len(outlines.segments) == 8 + 4 * 8 * 4
+
+
+@pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="reference homes are not here")
+@pytest.mark.parametrize("home", ["Shelbiana", "Kerrtown", "Brevort"])
+def test_real_homes_have_faithful_and_few_outlines(home: str) -> None:
+    from sionna_partial.map_files import load_map
+
+    partial = load_map(SHARED / "gibson" / home / "map.yaml")
+    outlines = wall_outlines(partial)
+    assert_sound(outlines)
+    assert len(outlines.segments) < (partial.state == CellState.WALL).sum() / 8
+    assert farthest_from_walls(partial, outlines) < 1.3
+    assert farthest_from_outlines(partial, outlines) < 1.5

@@ -1,0 +1,169 @@
+import io
+
+import numpy as np
+import pytest
+from coverage_fakes import small_coverage
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.path import Path
+from PIL import Image
+
+from sionna_partial.constants import LinkState
+from sionna_partial.coverage import predict_map
+from sionna_partial.errors import SettingsError
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.plot import STATE_COLOURS, figure_png, mix_state_colours, plot_comparison, plot_coverage
+
+LOS, NLOS, OUTAGE = (
+    np.array(to_rgb(STATE_COLOURS[state])) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)
+)
+
+
+@pytest.fixture
+def coverage(monkeypatch):
+    return small_coverage(monkeypatch)
+
+
+def panels(figure):
+    return [axis for axis in figure.axes if axis.get_xlim() != (0.0, 1.0) and axis.images and axis.axison]
+
+
+def test_a_certain_state_has_its_colour():
+    np.testing.assert_allclose(mix_state_colours([1, 0, 0], [0, 1, 0], [0, 0, 1]), [LOS, NLOS, OUTAGE])
+
+
+def test_colours_are_weighted_by_the_probabilities():
+    np.testing.assert_allclose(mix_state_colours(0.5, 0.2, 0.3), 0.5 * LOS + 0.2 * NLOS + 0.3 * OUTAGE)
+    assert np.isnan(mix_state_colours(np.nan, np.nan, np.nan)).all()
+
+
+def test_the_colours_are_told_apart_in_grey_and_by_colour_blind_eyes():
+    """Lightness differs by 15 at least, in order of link quality; so does what is left without red-green vision."""
+
+    def lightness(rgb):
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        return 116 * np.cbrt(linear @ [0.2126, 0.7152, 0.0722]) - 16
+
+    steps = -np.diff([lightness(colour) for colour in (LOS, NLOS, OUTAGE)])
+    assert (steps > 15).all()
+
+
+def test_the_picture_of_the_link_state_is_the_mixture(coverage):
+    image = panels(plot_coverage(coverage))[0].images[0].get_array()
+    refine = image.shape[0] // coverage.sizes["y"]
+    middle = image[refine // 2 :: refine, refine // 2 :: refine]
+    expected = mix_state_colours(coverage["p_los"], coverage["p_nlos"], coverage["p_outage"])
+    valid = coverage["valid"].to_numpy()
+    np.testing.assert_allclose(middle[valid], expected[valid])
+    assert np.isfinite(image).all()
+
+
+def test_gain_and_deviation_are_drawn_with_fixed_scales(coverage):
+    _, gain, deviation = panels(plot_coverage(coverage))
+    for panel, name, limits in ((gain, "gain_mean_db", (-150, -60)), (deviation, "gain_std_db", (0, 40))):
+        image = panel.images[0]
+        assert image.get_clim() == limits
+        refine = image.get_array().shape[0] // coverage.sizes["y"]
+        valid = coverage["valid"].to_numpy()
+        np.testing.assert_allclose(
+            image.get_array()[refine // 2 :: refine, refine // 2 :: refine][valid], coverage[name].to_numpy()[valid]
+        )
+
+
+def test_walls_are_black_where_they_are_and_nowhere_else(coverage):
+    panel = panels(plot_coverage(coverage))[0]
+    walls = panel.images[-1]
+    assert walls.get_extent() == pytest.approx((-1.0, 5.0, 2.0, 6.0))
+    rgba = walls.get_array()
+    x, y = np.meshgrid(np.linspace(-1, 5, 2 * rgba.shape[1] + 1)[1::2], np.linspace(2, 6, 2 * rgba.shape[0] + 1)[1::2])
+    nearest = coverage["cell_state"].sel(x=x[0], y=y[:, 0], method="nearest").to_numpy()
+    np.testing.assert_array_equal(rgba[..., 3] == 255, nearest == 1)
+    assert not rgba[..., :3].any()
+
+
+def test_the_unknown_area_is_hatched_and_a_known_map_is_not(coverage):
+    def hatches(figure):
+        return [item for item in panels(figure)[0].collections if item.get_hatch() or getattr(item, "hatches", None)]
+
+    (area,) = hatches(plot_coverage(coverage))
+    (outline,) = area.get_paths()
+    x, y = np.meshgrid(coverage["x"], coverage["y"])
+    points = np.column_stack([x.ravel(), y.ravel()])
+    inside = np.logical_xor.reduce([Path(ring).contains_points(points) for ring in outline.to_polygons()])
+    np.testing.assert_array_equal(inside.reshape(x.shape), ~coverage["observed"].to_numpy())
+    known = coverage.assign(observed=coverage["observed"] | True)
+    assert not hatches(plot_coverage(known))
+
+
+def test_the_transmitter_is_marked_in_each_panel(coverage):
+    for panel in panels(plot_coverage(coverage)):
+        (star,) = panel.lines
+        assert (star.get_xdata()[0], star.get_ydata()[0]) == (0.6, 3.6)
+        assert panel.get_aspect() == 1.0
+        assert panel.get_xlim() == pytest.approx((-1.0, 5.0))
+
+
+def test_axes_are_labelled_in_metres(coverage):
+    first, *others = panels(plot_coverage(coverage))
+    assert (first.get_xlabel(), first.get_ylabel()) == ("x [m]", "y [m]")
+    assert all(panel.get_xlabel() == "x [m]" for panel in others)
+    assert [panel.get_title() for panel in (first, *others)] == [
+        "Link state",
+        "Path gain, mean",
+        "Path gain, standard deviation",
+    ]
+
+
+def test_the_comparison_has_a_column_for_each_map(coverage):
+    figure = plot_comparison({"truth": coverage, "nothing observed": coverage, "partial map": coverage})
+    shown = panels(figure)
+    assert len(shown) == 6
+    assert [panel.get_title() for panel in shown[:3]] == ["truth", "nothing observed", "partial map"]
+    np.testing.assert_array_equal(shown[0].images[0].get_array(), shown[2].images[0].get_array())
+    assert shown[3].images[0].get_clim() == (-150, -60)
+
+
+def test_the_comparison_shows_unseen_walls_of_the_first_map_in_grey(coverage):
+    blind = coverage.assign(wall_parts=0 * coverage["wall_parts"])
+    shown = panels(plot_comparison({"truth": coverage, "blind": blind}))
+    grey, black = shown[1].images[1:]
+    assert not black.get_array()[..., 3].any()
+    assert 0 < grey.get_array()[..., 3].max() < 255
+
+
+def test_figures_are_unknown_to_pyplot_and_become_png(coverage):
+    import matplotlib.pyplot as plt
+
+    figure = plot_coverage(coverage)
+    assert isinstance(figure, Figure)
+    assert not plt.get_fignums()
+    with Image.open(io.BytesIO(figure_png(figure))) as image:
+        assert image.size[0] >= 1200
+        assert not image.text
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 3)])
+def test_maps_of_any_shape_are_drawn(coverage, shape):
+    partial = PartialMap(np.full(shape, 2, dtype=np.uint8), 0.5)
+    small = predict_map(partial, (0.1, 0.1), spacing_m=0.5)
+    for figure in (plot_coverage(small), plot_comparison({"one": small, "two": small})):
+        with Image.open(io.BytesIO(figure_png(figure))) as image:
+            assert max(image.size) < 8000
+
+
+def test_large_maps_are_drawn_with_coarser_walls(monkeypatch, coverage):
+    fine = panels(plot_coverage(coverage))[0].images[-1].get_array()
+    monkeypatch.setattr("sionna_partial.plot._MAX_PIXELS", 60)
+    coarse = panels(plot_coverage(coverage))[0].images[-1].get_array()
+    assert fine.shape[:2] == (96, 144)
+    assert coarse.shape[:2] == (32, 48)
+    np.testing.assert_array_equal(fine[1::3, 1::3], coarse)
+
+
+def test_what_cannot_be_drawn_is_named(coverage):
+    with pytest.raises(SettingsError, match="coverage lacks p_los"):
+        plot_coverage(coverage.drop_vars("p_los"))
+    with pytest.raises(SettingsError, match="coverage lacks wall_parts"):
+        plot_comparison({"truth": coverage.drop_vars("wall_parts")})
+    with pytest.raises(SettingsError, match=r"coverages = \{\} is not allowed: give at least one coverage map"):
+        plot_comparison({})

@@ -1,0 +1,239 @@
+"""Scenes: literal geometry, files on disk, and what stock Sionna RT makes of them."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.llvm import load_llvm
+from sionna_partial.map_files import load_map
+from sionna_partial.partial_map import PartialMap
+from sionna_partial.scene import FAR_M, build_scene, export_scene, write_scene
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+
+CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
+ROOM = """
+    ????????????
+    ?##########?
+    ?#........#?
+    ?#........#?
+    ?#........#?
+    ?#........??
+    ?#####.####?
+    ????????????
+"""
+
+
+def drawn(text: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = (0.0, 0.0)) -> PartialMap:
+    """Map of an ASCII drawing, its last line at the bottom."""
+    rows = text.split()
+    state = np.array([[CELLS[c] for c in row] for row in reversed(rows)], dtype=np.uint8)
+    return PartialMap(state, resolution_m, origin_m)
+
+
+def covered(rectangles_m: NDArray[np.float64], partial: PartialMap) -> NDArray[np.int_]:
+    """How many rectangles cover each cell."""
+    count = np.zeros(partial.shape, dtype=int)
+    for x0, y0, x1, y1 in np.rint(rectangles_m / partial.resolution_m).astype(int):
+        count[y0:y1, x0:x1] += 1
+    return count
+
+
+def mesh(folder: Path, name: str) -> trimesh.Trimesh:
+    return trimesh.load(folder / "meshes" / f"{name}.ply", process=False)
+
+
+def load(folder: Path):  # type: ignore[no-untyped-def]
+    load_llvm()
+    import sionna.rt
+
+    return sionna.rt.load_scene(str(folder / "scene.xml"), merge_shapes=False)
+
+
+def count_paths(scene, tx: tuple[float, ...], rx: tuple[float, ...]) -> int:  # type: ignore[no-untyped-def]
+    """Number of paths of at most two interactions."""
+    import sionna.rt as rt
+
+    scene.frequency = 28e9
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
+    )
+    scene.add(rt.Transmitter("tx", list(tx)))
+    scene.add(rt.Receiver("rx", list(rx)))
+    paths = rt.PathSolver()(scene, max_depth=2, samples_per_src=20_000, refraction=False)
+    return int(paths.valid.numpy().sum())
+
+
+def test_floor_covers_free_cells_and_the_walls_they_touch() -> None:
+    partial = drawn("?????? ?###?? ?#.#?? ?#..?? ??#?## ??????")
+    floor = covered(build_scene(partial).floor_m, partial)
+    expected = drawn("?????? ?###?? ?###?? ?###?? ??#?#? ??????").state == CellState.WALL
+    np.testing.assert_array_equal(floor, expected)
+
+
+def test_floor_of_the_whole_map_and_no_floor() -> None:
+    partial = drawn(ROOM)
+    whole = build_scene(partial, SceneSettings(floor_extent="map")).floor_m
+    np.testing.assert_array_equal(whole, [[0.0, 0.0, 6.0, 4.0]])
+    assert build_scene(partial, SceneSettings(floor_extent="none")).floor_m.shape == (0, 4)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(1, 15), st.integers(1, 15))
+def test_floor_and_its_triangles_cover_the_observed_area_once(seed: int, ny: int, nx: int) -> None:
+    from sionna_partial.scene import _triangles
+
+    state = np.random.default_rng(seed).choice(3, (ny, nx)).astype(np.uint8)
+    partial = PartialMap(state, 0.1)
+    rectangles = build_scene(partial).floor_m
+    count = covered(rectangles, partial)
+    assert count.max(initial=0) <= 1
+    assert (count[state == CellState.FREE] == 1).all()
+    assert (count[state == CellState.UNKNOWN] == 0).all()
+    corners, triangles = _triangles(rectangles, 0.1)
+    (ax, ay), (bx, by), (cx, cy) = (corners[triangles[:, k]].T for k in range(3))
+    areas = ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay)) / 2
+    assert (areas > 0.004).all()
+    assert areas.sum() == pytest.approx(count.sum() * 0.01)
+
+
+def test_floor_triangles_share_whole_edges(tmp_path: Path) -> None:
+    """The only free edges are the rim of the area, and diffraction sees no other."""
+    partial = drawn("...... .?.... .?..?. ...... ??....")
+    write_scene(build_scene(partial), tmp_path, offset_m=(0.0, 0.0))
+    floor = mesh(tmp_path, "floor")
+    edges, counts = np.unique(floor.edges_sorted, axis=0, return_counts=True)
+    rim = floor.vertices[edges[counts == 1]]
+    length = np.linalg.norm(rim[:, 0] - rim[:, 1], axis=1).sum()
+    free = np.pad(partial.state == CellState.FREE, 1).astype(int)
+    assert length == pytest.approx(0.5 * (np.abs(np.diff(free, axis=0)).sum() + np.abs(np.diff(free, axis=1)).sum()))
+
+
+def test_meshes_stand_where_the_map_is(tmp_path: Path) -> None:
+    partial = drawn(ROOM, origin_m=(-10.0, 20.0))
+    folder = export_scene(partial, tmp_path / "scene")
+    walls, floor, ceiling = (mesh(folder, name) for name in ("walls", "floor", "ceiling"))
+    np.testing.assert_allclose(walls.bounds, [[-9.25, 20.75, 0.0], [-4.75, 23.25, 3.0]])
+    np.testing.assert_allclose(floor.bounds, [[-9.5, 20.5, 0.0], [-4.5, 23.5, 0.0]])
+    np.testing.assert_allclose(ceiling.bounds, [[-9.5, 20.5, 3.0], [-4.5, 23.5, 3.0]])
+    assert (floor.face_normals[:, 2] > 0.99).all()
+    assert (ceiling.face_normals[:, 2] < -0.99).all()
+    assert (np.abs(walls.face_normals[:, 2]) < 1e-6).all()
+
+
+def test_walls_that_meet_share_their_vertices(tmp_path: Path) -> None:
+    geometry = build_scene(drawn("....... .#####. .#####. .#####. ......."))
+    write_scene(geometry, tmp_path, offset_m=(0.0, 0.0))
+    walls = mesh(tmp_path, "walls")
+    assert walls.vertices.shape == (8, 3)
+    assert walls.faces.shape == (8, 3)
+    assert len(walls.face_adjacency) == 8
+    for wall, (a, b) in enumerate(geometry.segments):
+        corners = walls.vertices[walls.faces[2 * wall : 2 * wall + 2]].reshape(-1, 3)
+        expected = {tuple(geometry.vertices_m[a]), tuple(geometry.vertices_m[b])}
+        assert {tuple(corner) for corner in corners[:, :2]} == expected
+
+
+def test_nothing_stands_in_unknown_space(tmp_path: Path) -> None:
+    partial = drawn("????????? ?###????? ?#.#????? ?###????? ?????????")
+    folder = export_scene(partial, tmp_path / "scene")
+    for name in ("walls", "floor", "ceiling"):
+        assert mesh(folder, name).bounds[1, 0] <= 2.0 + 1e-6
+
+
+def test_stock_sionna_loads_and_solves_the_scene(tmp_path: Path) -> None:
+    folder = export_scene(drawn(ROOM), tmp_path / "scene")
+    scene = load(folder)
+    assert set(scene.objects) == {"walls", "floor", "ceiling"}
+    (material,) = scene.radio_materials.values()
+    assert material.relative_permittivity.numpy() == pytest.approx(2.94)
+    assert material.conductivity.numpy() == pytest.approx(0.1226)
+    assert material.thickness.numpy() == pytest.approx(0.1)
+    assert count_paths(scene, (1.6, 1.9, 1.5), (3.9, 2.2, 1.2)) > 8
+
+
+@pytest.mark.parametrize(("text", "names"), [("??? ???", set()), ("...", {"floor", "ceiling"}), ("#", {"walls"})])
+def test_scenes_without_walls_or_floor_load(text: str, names: set[str], tmp_path: Path) -> None:
+    folder = export_scene(drawn(text), tmp_path / "scene")
+    scene = load(folder)
+    assert set(scene.objects) == names
+    assert {path.stem for path in (folder / "meshes").iterdir()} == names
+    assert count_paths(scene, (10.0, 0.0, 1.5), (11.0, 0.0, 1.5)) >= 1
+
+
+@pytest.mark.parametrize("name", list(ITU_BANDS_GHZ))
+def test_every_itu_material_loads_with_its_constants(name: str, tmp_path: Path) -> None:
+    low, high = ITU_BANDS_GHZ[name][0]
+    frequency_hz = float(np.clip(28.0, low, high)) * 1e9
+    chosen = SceneSettings(material=Material(itu=name, thickness_m=0.07))
+    scene = load(export_scene(drawn(ROOM), tmp_path / "scene", chosen, frequency_hz=frequency_hz))
+    from sionna.rt.radio_materials.itu import itu_material
+
+    scene.frequency = frequency_hz
+    (material,) = scene.radio_materials.values()
+    permittivity, conductivity = itu_material(name, frequency_hz)
+    assert material.relative_permittivity.numpy() == pytest.approx(float(permittivity), rel=1e-5)
+    assert material.conductivity.numpy() == pytest.approx(float(conductivity), rel=1e-4, abs=1e-12)
+    assert material.thickness.numpy() == pytest.approx(0.07)
+
+
+def test_custom_material(tmp_path: Path) -> None:
+    chosen = SceneSettings(material=Material(relative_permittivity=5.5, conductivity_s_m=0.02, thickness_m=0.2))
+    (material,) = load(export_scene(drawn(ROOM), tmp_path / "scene", chosen)).radio_materials.values()
+    assert material.relative_permittivity.numpy() == pytest.approx(5.5)
+    assert material.conductivity.numpy() == pytest.approx(0.02)
+    assert material.thickness.numpy() == pytest.approx(0.2)
+
+
+def test_frequency_outside_the_material_is_refused_and_nothing_written(tmp_path: Path) -> None:
+    chosen = SceneSettings(material=Material(itu="wet_ground"))
+    with pytest.raises(SettingsError, match=r"frequency_hz = 28000000000.0 .*wet_ground.* 1-10 GHz"):
+        export_scene(drawn(ROOM), tmp_path / "scene", chosen)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_foreign_folder_is_refused_and_kept(tmp_path: Path) -> None:
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(OutputError, match="choose a new or an empty folder"):
+        export_scene(drawn(ROOM), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_same_bytes_twice(tmp_path: Path) -> None:
+    first, second = (export_scene(drawn(ROOM), tmp_path / name) for name in ("one", "two"))
+    files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
+    assert len(files) == 6
+    for file in files:
+        assert (first / file).read_bytes() == (second / file).read_bytes()
+
+
+def test_reading_back_gives_the_same_map(tmp_path: Path) -> None:
+    partial = drawn(ROOM, 0.05, (1.25, -3.5))
+    assert load_map(export_scene(partial, tmp_path / "scene")) == partial
+
+
+def test_paths_in_the_scene_are_relative(tmp_path: Path) -> None:
+    root = ET.parse(export_scene(drawn(ROOM), tmp_path / "scene") / "scene.xml").getroot()
+    names = [node.get("value") for node in root.iter("string") if node.get("name") == "filename"]
+    assert names == ["meshes/walls.ply", "meshes/floor.ply", "meshes/ceiling.ply"]
+    assert {node.tag for node in root} == {"bsdf", "shape"}
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (-FAR_M, 0.0), (500_000.3, 4_500_000.7)])
+def test_far_maps_are_moved_to_the_origin(origin_m: tuple[float, float], tmp_path: Path) -> None:
+    folder = export_scene(drawn(ROOM, origin_m=origin_m), tmp_path / "scene")
+    offset = yaml.safe_load((folder / "map.yaml").read_text())["scene_offset"]
+    far = max(origin_m) > FAR_M
+    assert offset == list(origin_m if far else (0.0, 0.0))
+    here = mesh(export_scene(drawn(ROOM), tmp_path / "here"), "walls")
+    shift = np.subtract(origin_m, offset)
+    np.testing.assert_allclose(mesh(folder, "walls").vertices - [*shift, 0.0], here.vertices, atol=1e-4)
+    assert load_map(folder).origin_m == pytest.approx(origin_m)
