@@ -56,7 +56,8 @@ def main() -> None:
     with atomic_write(arguments.out / "partial_vs_full.csv", "w") as stream:
         writer = csv.DictWriter(stream, [field.name for field in fields(Row)], lineterminator="\n")
         writer.writeheader()
-        writer.writerows(asdict(row) for row in rows)
+        for row in rows:
+            writer.writerow({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in asdict(row).items()})
     with atomic_write(arguments.out / "partial_vs_full.png") as stream:
         stream.write(figure_png(draw(rows)))
     print_table(rows)

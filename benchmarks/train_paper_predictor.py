@@ -10,7 +10,7 @@ arguments give the same file. Run it with
 import argparse
 import multiprocessing
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial as bind
@@ -28,7 +28,7 @@ from sionna_partial.homes import make_home
 from sionna_partial.networks import free_space_gain_db
 from sionna_partial.partial_map import PartialMap
 from sionna_partial.predictor import SHIPPED_FOLDER, LinkPrediction, Predictor
-from sionna_partial.trace import TracedLinks, trace_links
+from sionna_partial.trace import trace_links
 
 STAGES = (0, 50, 100, 150, 200)
 FIRST_HOME = 10_000
@@ -36,8 +36,6 @@ TRANSMITTERS = 2
 NEAREST_M = 0.1
 INTERVAL = (0.05, 0.95)
 MODELS = ("predictor", "distance only", "majority", "partial trace")
-
-Trace = Callable[[PartialMap, NDArray[np.float64], NDArray[np.float64]], TracedLinks]
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def make_links(seeds: range, count: int, workers: int) -> list[Links]:
     return homes
 
 
-def home_links(seed: int, count: int, trace: Trace = trace_links) -> Links:
+def home_links(seed: int, count: int) -> Links:
     """Trace `count` links with indoor receivers, and as many with receivers anywhere on the map, at every stage."""
     home, rng = make_home(seed), np.random.default_rng(seed)
     stages = explore(home, steps=STAGES, seed=seed)
@@ -110,9 +108,9 @@ def home_links(seed: int, count: int, trace: Trace = trace_links) -> Links:
         uniform = np.arange(len(rx_m)) >= share
         apart = np.linalg.norm(rx_m - tx, axis=1) >= NEAREST_M
         rx_m, uniform = rx_m[apart], uniform[apart]
-        truth, inside = trace(home, tx, rx_m), home.state_at(rx_m) == CellState.FREE
+        truth, inside = trace_links(home, tx, rx_m), home.state_at(rx_m) == CellState.FREE
         for step, seen in zip(STAGES, stages, strict=True):
-            phi = link_features(seen, trace(seen, tx, rx_m))
+            phi = link_features(seen, trace_links(seen, tx, rx_m))
             parts.append(Links(np.full(len(rx_m), step), phi, truth.link_state, truth.gain_db, inside, uniform))
     return Links.concatenate(parts)
 
@@ -169,7 +167,7 @@ def majority(train: Links, count: int) -> LinkPrediction:
 
 
 def measure(answer: LinkPrediction, links: Links) -> dict[str, float]:
-    """Accuracy, RMSE [dB], negative log-likelihood of (state, gain) [nat], and coverage of the central 90 % interval."""
+    """Return accuracy, RMSE [dB], negative log-likelihood of (state, gain) [nat], and coverage of the 90 % interval."""
     result = {
         "accuracy": float((answer.link_state == links.link_state).mean()),
         "rmse_db": float(np.sqrt(np.mean((answer.gain_mean_db - links.gain_db) ** 2))),

@@ -84,7 +84,7 @@ def trace_beams_in(
 
 
 def _chain_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Number the chains of wall lines, so that beams split by a gap in one line share a number."""
+    """Give chains of wall lines numbers, so that beams split by a gap in one line share a number."""
     chain = np.arange(len(parent)) // 4
     lines = int(line.max(initial=0)) + 1
     used = int((depth == 0).sum()) // 4
@@ -99,15 +99,9 @@ def _chain_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArra
 @njit(cache=True)
 def _trace_beams(walls, line, sources, max_depth, points, bins, grid):  # type: ignore[no-untyped-def]
     """Breadth-first beam trees and the points inside each beam (see `trace_beams`)."""
-    count = 4 * len(sources)
-    beam, left = np.empty((2 * count + 1024, 6)), np.empty(2 * count + 1024, np.int64)
-    parent, segment = np.empty(len(left), np.int32), np.empty(len(left), np.int32)
-    depth = np.empty(len(left), np.int32)
-    for root in range(count):
-        x, y = sources[root // 4]
-        low = _ROOT_ANGLE_RAD + 0.5 * np.pi * (root % 4)
-        beam[root] = (x, y, x + np.cos(low), y + np.sin(low), x - np.sin(low), y + np.cos(low))
-        parent[root], segment[root], depth[root], left[root] = -1, -1, 0, max_depth[root // 4]
+    beam, count = _root_beams(sources), 4 * len(sources)
+    parent, segment, depth = np.full(count, -1, np.int32), np.full(count, -1, np.int32), np.zeros(count, np.int32)
+    left = np.repeat(max_depth, 4)
     pair_node, pair_rx, pairs = np.empty(4096, np.int32), np.empty(4096, np.int32), 0
     piece = np.empty((2 * len(walls) + 3, 4))
     piece_wall = np.empty(2 * len(walls) + 3, np.int32)
@@ -137,6 +131,17 @@ def _trace_beams(walls, line, sources, max_depth, points, bins, grid):  # type: 
         pair_node[:pairs].copy(),
         pair_rx[:pairs].copy(),
     )
+
+
+@njit(cache=True)
+def _root_beams(sources):  # type: ignore[no-untyped-def]
+    """Four quadrants of the view from each source, with a window at 1 m."""
+    beam = np.empty((4 * len(sources), 6))
+    for root in range(len(beam)):
+        x, y = sources[root // 4]
+        low = _ROOT_ANGLE_RAD + 0.5 * np.pi * (root % 4)
+        beam[root] = (x, y, x + np.cos(low), y + np.sin(low), x - np.sin(low), y + np.cos(low))
+    return beam
 
 
 @njit(cache=True)
@@ -195,19 +200,8 @@ def _visible_pieces(walls, line, beam, own, piece, piece_wall):  # type: ignore[
         t0, t1 = edges[i], edges[i + 1]
         if t1 - t0 < 1e-12:
             continue
-        middle = 0.5 * (t0 + t1)
-        best, best_w = -1, 0.0
-        for k in range(count):
-            if found[k, 0] <= middle <= found[k, 2]:
-                slope = (found[k, 3] - found[k, 1]) / (found[k, 2] - found[k, 0])
-                w = found[k, 1] + slope * (middle - found[k, 0])
-                if w > best_w:
-                    best, best_w = k, w
+        best, w0, w1 = _nearest(found[:count], t0, t1)
         wall = index[best] if best >= 0 else -1
-        w0, w1 = 0.0, 0.0
-        if best >= 0:
-            slope = (found[best, 3] - found[best, 1]) / (found[best, 2] - found[best, 0])
-            w0, w1 = best_w + slope * (t0 - middle), best_w + slope * (t1 - middle)
         same = pieces > 0 and (
             piece_wall[pieces - 1] == wall
             or (wall >= 0 and piece_wall[pieces - 1] >= 0 and line[piece_wall[pieces - 1]] == line[wall])
@@ -219,6 +213,20 @@ def _visible_pieces(walls, line, beam, own, piece, piece_wall):  # type: ignore[
             piece_wall[pieces] = wall
             pieces += 1
     return pieces
+
+
+@njit(cache=True)
+def _nearest(found, t0, t1):  # type: ignore[no-untyped-def]
+    """Find the nearest of the clipped walls from t0 to t1, where none of them ends: its index (or -1), w0, w1."""
+    middle = 0.5 * (t0 + t1)
+    best, best_w, best_slope = -1, 0.0, 0.0
+    for k in range(len(found)):
+        if found[k, 0] <= middle <= found[k, 2]:
+            slope = (found[k, 3] - found[k, 1]) / (found[k, 2] - found[k, 0])
+            w = found[k, 1] + slope * (middle - found[k, 0])
+            if w > best_w:
+                best, best_w, best_slope = k, w, slope
+    return best, best_w + best_slope * (t0 - middle), best_w + best_slope * (t1 - middle)
 
 
 @njit(cache=True)
@@ -245,21 +253,10 @@ def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignore[no-untyped-def]
     """Indices of the points between the window of a beam and one piece of its view."""
-    sx, sy = beam[0], beam[1]
-    corner = np.empty((4, 2))
     x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
     rows = (len(bins) - 1) // columns
-    reach = abs(sx - x0) + abs(sy - y0) + edge * (columns + rows) + 1.0
-    direction = np.empty((2, 2))
-    for k in range(2):
-        t, w = piece[2 * k], piece[2 * k + 1]
-        direction[k, 0] = (1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)
-        direction[k, 1] = (1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)
-        far = 2.0 * reach / np.hypot(direction[k, 0], direction[k, 1])
-        r_far = 1.0 / w if w * far > 1.0 else far
-        r_near = 1.0 if reflected else 0.0
-        corner[k] = (sx + r_near * direction[k, 0], sy + r_near * direction[k, 1])
-        corner[3 - k] = (sx + r_far * direction[k, 0], sy + r_far * direction[k, 1])
+    reach = abs(beam[0] - x0) + abs(beam[1] - y0) + edge * (columns + rows) + 1.0
+    corner = _corners(beam, reflected, piece, reach)
     normal, offset = _inward_edges(corner)
     found = np.empty(16, np.int32)
     count = 0
@@ -285,6 +282,23 @@ def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignor
                 found[count] = i
                 count += 1
     return found[:count]
+
+
+@njit(cache=True)
+def _corners(beam, reflected, piece, reach):  # type: ignore[no-untyped-def]
+    """Corners (4, 2) of the part of a beam between its window and one piece of its view, cut off beyond `reach`."""
+    sx, sy = beam[0], beam[1]
+    corner = np.empty((4, 2))
+    for k in range(2):
+        t, w = piece[2 * k], piece[2 * k + 1]
+        dx = (1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)
+        dy = (1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)
+        far = 2.0 * reach / np.hypot(dx, dy)
+        r_far = 1.0 / w if w * far > 1.0 else far
+        r_near = 1.0 if reflected else 0.0
+        corner[k] = (sx + r_near * dx, sy + r_near * dy)
+        corner[3 - k] = (sx + r_far * dx, sy + r_far * dy)
+    return corner
 
 
 @njit(cache=True)
@@ -314,5 +328,3 @@ def _span(corner, low, high):  # type: ignore[no-untyped-def]
                 x = px + (level - py) / (qy - py) * (qx - px)
                 left, right = min(left, x), max(right, x)
     return left, right
-
-

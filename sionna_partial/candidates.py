@@ -23,7 +23,6 @@ EDGE = -4
 """Surface index of a vertical edge that diffracts in a candidate."""
 
 
-
 @dataclass(frozen=True)
 class Candidates:
     """Geometrically possible paths, to be verified by the path solver.
@@ -56,7 +55,7 @@ def specular_candidates(
     height_m: float,
     horizontal: bool,
     max_depth: int,
-    pairs_per_block: int = 40_000,
+    pairs_per_block: int = 20_000,
 ) -> Iterator[tuple[Candidates, float]]:
     """Add the reflections off floor and ceiling, block by block.
 
@@ -85,22 +84,20 @@ def specular_candidates(
     """
     for start in range(0, len(beams.pair_node), pairs_per_block):
         stop = min(start + pairs_per_block, len(beams.pair_node))
-        candidates = Candidates(
-            *_expand_heights(
-                beams.parent,
-                beams.segment,
-                beams.source,
-                beams.pair_node[start:stop],
-                beams.pair_rx[start:stop],
-                walls_m,
-                tx_m,
-                rx_m,
-                height_m,
-                horizontal,
-                max_depth,
-            ),
-            wedge=np.zeros(0, np.int32),
+        rx, surface, vertices_m = _expand_heights(
+            beams.parent,
+            beams.segment,
+            beams.source,
+            beams.pair_node[start:stop],
+            beams.pair_rx[start:stop],
+            walls_m,
+            tx_m,
+            rx_m,
+            height_m,
+            horizontal,
+            max_depth,
         )
+        candidates = Candidates(rx, surface, vertices_m, wedge=np.zeros(0, np.int32))
         yield candidates, stop / len(beams.pair_node)
 
 
@@ -145,6 +142,7 @@ def _expand_heights(  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def chain_length(parent, node):  # type: ignore[no-untyped-def]
+    """Count the walls from the root down to a node."""
     length = 0
     while parent[node] >= 0:
         length += 1

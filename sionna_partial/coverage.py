@@ -122,7 +122,7 @@ def predict_map(
     spacing_m : float
         Distance between receivers [m]. Their grid starts half of it inside the lower-left corner of the map.
     predictor : None, "paper", path or Predictor
-        None is the shipped default, a path one that you saved. Not used on a complete map.
+        None is the shipped default, a path one that you saved. On a complete map it is read, but not used.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     progress : callable, optional
@@ -151,7 +151,9 @@ def predict_map(
     scene_settings.material.require_frequency(trace_settings.frequency_hz)
     tx_m = _transmitter(partial, tx)
     receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
-    model = None if partial.is_complete else _predictor(predictor, trace_settings.frequency_hz)
+    complete = partial.is_complete
+    chosen = None if complete and predictor is None else _predictor(predictor, trace_settings.frequency_hz)
+    model = None if complete else chosen
     report = progress or (lambda share, message: None)
     links = trace_links(
         partial,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SceneError
-from sionna_partial.export import save_coverage
+from sionna_partial.export import FORMATS, save_coverage
 from sionna_partial.files import atomic_write
 from sionna_partial.map_files import load_map
 from sionna_partial.partial_map import PartialMap
@@ -24,8 +24,6 @@ from sionna_partial.trace import Progress
 
 TRUTH, NOTHING, PARTIAL = "truth", "nothing observed", "partial map"
 """Titles of the three coverage maps that are compared (paper, Fig. 5)."""
-
-FORMATS = (".nc", ".tif", ".csv", ".png", ".yaml")
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,9 @@ def run_demo(
         coverages[title] = predict_map(scene, tx, predictor=predictor, progress=advance)
     table = comparison_table(coverages)
     report(0.85, "writing")
-    return DemoResult(_write(coverages, table, Path(out)), table)
+    files = _write(coverages, table, Path(out))
+    report(1.0, "done")
+    return DemoResult(files, table)
 
 
 def demo_scene(home: str, step: int) -> tuple[PartialMap, PartialMap, tuple[float, ...]]:

@@ -25,7 +25,7 @@ _EXTERIOR_M = 1e-5
 _NEAR_M = 1e-3
 """Shortest leg in the plan next to an edge [m]: walls that meet there do not mirror it."""
 
-_EDGES_AT_ONCE = 16
+_EDGES_AT_ONCE = 32
 """Number of edges whose beams are held in memory together. It does not depend on the receivers, nor does the order of
 the candidates."""
 
@@ -34,18 +34,20 @@ the candidates."""
 class Wedges:
     """Vertical edges in the plan, each with the two faces that meet there.
 
-    A free end of a wall has both sides of the wall as its faces. Normals point out of the wedge, whose inner angle is
-    at most 180 degrees. In candidates, wedge W + i is wedge i with its faces swapped.
+    A free end of a wall has both sides of the wall as its faces. Where three or more walls meet, Sionna RT knows
+    several wedges in one place, and a path takes the first that it passes outside of. Normals point out of the wedge,
+    whose inner angle is at most 180 degrees. In candidates, wedge W + i is wedge i with its faces swapped.
 
     Parameters
     ----------
-    point_m : (W, 2) float64 array
-        Place of the edge [m].
+    segment, end : (W,) int64 arrays
+        A wall that ends at the edge, and which of its two ends that is.
     normal_0, normal_n : (W, 2) float64 arrays
         Unit normals of the two faces.
     """
 
-    point_m: NDArray[np.float64]
+    segment: NDArray[np.int64]
+    end: NDArray[np.int64]
     normal_0: NDArray[np.float64]
     normal_n: NDArray[np.float64]
 
@@ -101,9 +103,9 @@ def diffraction_candidates(
         Share of all edges done with this block.
     """
     reflections = min(MAX_REFLECTIONS, max_depth - 1)
-    if reflections < 0 or len(wedges.point_m) == 0:
+    if reflections < 0 or len(wedges.segment) == 0:
         return
-    edges_m, edge = np.unique(wedges.point_m, axis=0, return_inverse=True)
+    edges_m, edge = np.unique(walls_m[wedges.segment, wedges.end], axis=0, return_inverse=True)
     by_edge = np.argsort(edge, kind="stable")
     wedge_start = np.searchsorted(edge[by_edge], np.arange(len(edges_m) + 1))
     faces = np.hstack([wedges.normal_0, wedges.normal_n])[by_edge]
@@ -163,7 +165,9 @@ def _unfold_all(parent, segment, source, node, edge, walls, edges, tx, reflectio
     place = np.zeros((len(node), reflections, 3))
     for i in range(len(node)):
         x, y = edges[edge[i]]
-        count[i], length[i], good[i] = unfold(parent, segment, source, node[i], walls, edges[edge[i]], wall[i], place[i])
+        count[i], length[i], good[i] = unfold(
+            parent, segment, source, node[i], walls, edges[edge[i]], wall[i], place[i]
+        )
         px, py = tx[0], tx[1]
         if good[i] and count[i] > 0:
             px, py = place[i, count[i] - 1, 0], place[i, count[i] - 1, 1]
@@ -198,7 +202,7 @@ def _combine(  # type: ignore[no-untyped-def]
     for i in range(len(pair_node)):
         edge = group[_root(parent, pair_node[i]) // 4]
         target = rx[pair_rx[i]]
-        after, way, good = unfold(parent, segment, source, pair_node[i], walls, target, chain, onward)
+        after, _, good = unfold(parent, segment, source, pair_node[i], walls, target, chain, onward)
         ox, oy = (onward[0, 0], onward[0, 1]) if after > 0 else (target[0], target[1])
         ox, oy = ox - edges[edge, 0], oy - edges[edge, 1]
         if not good or np.hypot(ox, oy) < _NEAR_M:
@@ -217,6 +221,7 @@ def _combine(  # type: ignore[no-untyped-def]
                     for ceiling in range(2 if bounces else 1):
                         rows[used] = (i, j, w if first else w + len(faces), bounces, ceiling)
                         used += 1
+                break
     return rows[:used].copy()
 
 

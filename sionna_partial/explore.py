@@ -13,7 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
-from skimage.graph import MCP_Geometric
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -102,7 +103,8 @@ def explore(home: PartialMap, steps: Sequence[int] = (50, 100, 150, 200), seed: 
 
 
 def _check(steps: Sequence[int], seed: int) -> None:
-    rising = len(steps) > 0 and all(_whole(count) for count in steps) and bool(np.all(np.diff(steps) > 0))
+    counts = list(steps) if np.iterable(steps) else []
+    rising = len(counts) > 0 and all(_whole(count) for count in counts) and bool(np.all(np.diff(counts) > 0))
     require(rising, "steps", steps, "give increasing whole numbers of 0 or more, such as (50, 100, 150, 200).")
     require(_whole(seed), "seed", seed, "give a whole number of 0 or more.")
 
@@ -151,7 +153,7 @@ class _Robot:
         error = math.degrees(math.atan2(row + 0.5 - self._y, column + 0.5 - self._x)) - self._heading_deg
         error = (error + 180.0) % 360.0 - 180.0
         if abs(error) > TURN_DEG / 2:
-            self._heading_deg += math.copysign(TURN_DEG, error)
+            self._heading_deg = (self._heading_deg + math.copysign(TURN_DEG, error)) % 360.0
         elif not self._step_forward():
             self._bump(goal)
         self._look()
@@ -166,19 +168,19 @@ class _Robot:
         return beside & (self.seen == _FREE) & ~self._given_up
 
     def _choose_goal(self) -> _Goal | None:
-        """Frontier that promises the most unseen cells per step, or None if none can be reached."""
+        """Frontier that promises much for few steps, or None if none can be reached."""
         labels, count = ndimage.label(self._frontier(), structure=_EIGHT)
-        sizes = np.bincount(labels.ravel(), minlength=count + 1)
-        router = MCP_Geometric(self._travel_cost())
-        costs, _ = router.find_costs([(int(self._y), int(self._x))])
+        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+        router = _Router(self._travel_cost(), (int(self._y), int(self._x)))
         best, best_score = None, 0.0
-        for label in np.nonzero(sizes[1:] >= _SMALLEST_FRONTIER_CELLS)[0] + 1:
+        for label in np.nonzero(sizes >= _SMALLEST_FRONTIER_CELLS)[0] + 1:
             cells = np.argwhere(labels == label)
-            cell = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
-            score = 1.0 / (self._steps_to(cell, costs[tuple(cell)]) + _DECISION_STEPS)
+            row, column = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
+            steps = self._steps_to((row, column), router.costs[row, column])
+            score = math.sqrt(sizes[label - 1]) / (steps + _DECISION_STEPS)
             if score > best_score:
-                best, best_score = cell, score
-        return None if best is None else _Goal(np.array(router.traceback(best)))
+                best, best_score = (row, column), score
+        return None if best is None else _Goal(router.path_to(best))
 
     def _distance_to(self, cell: tuple[int, int]) -> float:
         return math.hypot(cell[0] + 0.5 - self._y, cell[1] + 0.5 - self._x)
@@ -186,19 +188,19 @@ class _Robot:
     def _is_done(self, cell: tuple[int, int]) -> bool:
         return self._distance_to(cell) * self._cell_m < _ARRIVAL_M and not self._frontier()[cell]
 
-    def _steps_to(self, cell: NDArray[np.intp], cost: float) -> float:
-        """Number of actions to a cell: the way, and the turn towards it."""
+    def _steps_to(self, cell: tuple[int, int], cost: float) -> float:
+        """Count the actions to a cell: the way, and the turn towards it."""
         bearing = math.degrees(math.atan2(cell[0] + 0.5 - self._y, cell[1] + 0.5 - self._x))
         turn = abs((bearing - self._heading_deg + 180.0) % 360.0 - 180.0)
         return float(cost * self._cell_m / FORWARD_M + turn / TURN_DEG)
 
     def _travel_cost(self) -> NDArray[np.float64]:
-        """Cost per cell of the way: 1 in the open, more beside walls, -1 (no way) where not seen free."""
+        """Cost per cell of the way: 1 in the open, more beside walls, 0 (no way) where not seen free."""
         distance = ndimage.distance_transform_edt(self.seen != _WALL) - 0.5
         nearness = np.clip(1.0 - distance * self._cell_m / _COMFORT_M, 0.0, 1.0)
         cost = 1.0 + _COMFORT_COST * nearness
         cost[(distance < self._radius) | self._bumps] = _TIGHT_COST
-        cost[self.seen != _FREE] = -1.0
+        cost[self.seen != _FREE] = 0.0
         return cost
 
     def _waypoint(self, goal: _Goal) -> NDArray[np.intp]:
@@ -231,6 +233,35 @@ class _Robot:
         if math.hypot(row + 0.5 - self._y, column + 0.5 - self._x) < 2 * reach:
             self._given_up |= np.hypot(rows - row, columns - column) <= reach
         self._goal = None
+
+
+class _Router:
+    """Shortest ways from one cell to all others, in eight directions, where a cell costs more than 0 to cross."""
+
+    def __init__(self, cost: NDArray[np.float64], start: tuple[int, int]) -> None:
+        self._cells = np.argwhere(cost > 0)
+        self._index = np.full(cost.shape, -1)
+        self._index[tuple(self._cells.T)] = np.arange(len(self._cells))
+        ny, nx = cost.shape
+        ends, weights = [], []
+        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            here = slice(0, ny - down), slice(max(0, -right), nx - max(0, right))
+            there = slice(down, ny), slice(max(0, right), nx + min(0, right))
+            linked = (cost[here] > 0) & (cost[there] > 0)
+            ends.append([self._index[here][linked], self._index[there][linked]])
+            weights.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
+        size = len(self._cells)
+        graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(size, size)).tocsr()
+        cheapest, self._before = dijkstra(graph, directed=False, indices=self._index[start], return_predecessors=True)
+        self.costs = np.full(cost.shape, np.inf)
+        self.costs[tuple(self._cells.T)] = cheapest
+
+    def path_to(self, cell: tuple[int, int]) -> NDArray[np.intp]:
+        """Cells (n, 2) from the start to `cell`."""
+        way = [self._index[cell]]
+        while self._before[way[-1]] >= 0:
+            way.append(self._before[way[-1]])
+        return self._cells[way[::-1]]
 
 
 def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float, NDArray[np.bool_]]:

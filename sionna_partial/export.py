@@ -168,3 +168,6 @@ _WRITERS: dict[str, Callable[[xr.Dataset, Path], None]] = {
     ".png": _writer(_encode_png),
     ".yaml": _write_ros_map,
 }
+
+FORMATS = tuple(_WRITERS)
+"""Suffixes that `save_coverage` knows."""

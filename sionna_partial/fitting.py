@@ -3,12 +3,14 @@
 import itertools
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import log_softmax
 
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
@@ -17,7 +19,6 @@ from sionna_partial.networks import (
     GAIN_NETWORKS,
     INDOOR_INPUTS,
     INDOOR_NETWORKS,
-    OUTPUT_WIDTHS,
     STATE_INPUTS,
     STATE_NETWORKS,
     GainNetwork,
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_RANGES = {"distance_m": (0.0, 30.0), "unobserved_distance_m": (0.0, 30.0), "gain_db": (GAIN_FLOOR_DB, -40.0)}
 _PRIOR_LINKS = 10
+_WEIGHT_PENALTY = 0.01
 _INDOORS = 20.0
 
 _log = logging.getLogger(__name__)
@@ -136,7 +138,7 @@ def fit_indoor_networks(
         if cell.sum() >= settings.minimum_links:
             links = phi.take(cell)
             networks[name] = logistic(name, INDOOR_INPUTS, _ranges(links, settings), [0.0])
-            _train(networks[name], links, inside[cell], "binary_crossentropy", settings)
+            _fit_logistic(networks[name], links, inside[cell].astype(np.uint8))
     return assemble(networks)
 
 
@@ -146,7 +148,7 @@ def _fit_states(
     counts = np.bincount(link_state, minlength=len(LinkState)) + 1.0
     network = logistic(name, STATE_INPUTS, _ranges(phi, settings), np.log(counts / counts.sum()))
     if len(phi) >= settings.minimum_links:
-        _train(network, phi, link_state, "sparse_categorical_crossentropy", settings)
+        _fit_logistic(network, phi, link_state)
     return network
 
 
@@ -163,7 +165,7 @@ def _fit_gain(
         row, _ranges(phi, settings), float(mean_db), math.sqrt(variance), settings.frequency_hz, seed
     )
     if len(phi) >= settings.minimum_links:
-        _train(network, phi, gain_db, _gaussian_loss, settings)
+        _train(network, phi, gain_db, settings)
     return network
 
 
@@ -175,6 +177,31 @@ def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
     return {name: (low, max(high, low + 1.0)) for name, (low, high) in spans.items()}
 
 
+def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: NDArray[np.uint8]) -> None:
+    """Set the weights of a logistic classifier to those of the smallest cross-entropy, a convex problem.
+
+    A slight penalty keeps weights finite where a straight line parts the classes.
+    """
+    keras = import_keras()
+    scaled = keras.Model(network.input, network.get_layer("clamped").output)(network_inputs(phi, tuple(network.input)))
+    rows = np.concatenate([np.asarray(scaled, dtype=np.float64), np.ones((len(phi), 1))], axis=1)
+    classes = max(2, network.output.shape[1])
+    picked = truth[:, None] == np.arange(classes)
+
+    def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        weights = flat.reshape(-1, classes)
+        log_p = log_softmax(rows @ weights, axis=1)
+        slope = rows.T @ (np.exp(log_p) - picked) + _WEIGHT_PENALTY * weights
+        return -log_p[picked].sum() + 0.5 * _WEIGHT_PENALTY * (flat**2).sum(), slope.ravel()
+
+    found = minimize(loss, np.zeros(rows.shape[1] * classes), jac=True, method="L-BFGS-B", options={"maxiter": 1000})
+    weights = found.x.reshape(-1, classes)
+    if network.output.shape[1] == 1:
+        weights = weights[:, 1:] - weights[:, :1]
+    network.get_layer("probability").set_weights([weights[:-1], weights[-1]])
+    _log.info("%s: cross-entropy %.4f over %d links", network.name, found.fun / len(phi), len(phi))
+
+
 def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
     """Negative log-likelihood of gains (N, 1) under means and log-variances (N, 2), up to a constant."""
     ops = import_keras().ops
@@ -183,20 +210,16 @@ def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
 
 
 def _train(
-    network: "keras.Model",
-    phi: LinkFeatures,
-    truth: NDArray[np.generic],
-    loss: str | Callable[[Any, Any], Any],
-    settings: PredictorSettings,
+    network: "keras.Model", phi: LinkFeatures, gain_db: NDArray[np.float64], settings: PredictorSettings
 ) -> None:
-    """Minimise the loss of a network in place; the same links and settings give the same weights."""
+    """Minimise the loss of a gain network in place; the same links and settings give the same weights."""
     keras = import_keras()
     trainer = keras.Model(network.input, network.output)
     decay = keras.optimizers.schedules.CosineDecay(settings.learning_rate, settings.steps)
-    trainer.compile(optimizer=keras.optimizers.Adam(decay), loss=loss, jit_compile=False)
+    trainer.compile(optimizer=keras.optimizers.Adam(decay), loss=_gaussian_loss, jit_compile=False)
     inputs = network_inputs(phi, tuple(network.input))
-    seed = (settings.seed, list(OUTPUT_WIDTHS).index(network.name))
-    batches = _batches(inputs, truth.astype(np.float32)[:, None], settings.batch_size, np.random.default_rng(seed))
+    seed = (settings.seed, [row.name for row in GAIN_NETWORKS].index(network.name))
+    batches = _batches(inputs, gain_db.astype(np.float32)[:, None], settings.batch_size, np.random.default_rng(seed))
     history = trainer.fit(batches, steps_per_epoch=settings.steps, shuffle=False, verbose=0)
     _log.info("%s: loss %.4f over %d links", network.name, history.history["loss"][-1], len(phi))
     if not all(np.isfinite(weights).all() for weights in network.get_weights()):
@@ -206,11 +229,11 @@ def _train(
 
 
 def _batches(
-    inputs: dict[str, NDArray[np.float32]], truth: NDArray[np.float32], size: int, rng: np.random.Generator
+    inputs: dict[str, NDArray[np.float32]], gain_db: NDArray[np.float32], size: int, rng: np.random.Generator
 ) -> Iterator[tuple[dict[str, NDArray[np.float32]], NDArray[np.float32]]]:
     """Yield shuffled batches without end."""
-    for start in itertools.cycle(range(0, len(truth), size)):
+    for start in itertools.cycle(range(0, len(gain_db), size)):
         if start == 0:
-            order = rng.permutation(len(truth))
+            order = rng.permutation(len(gain_db))
         index = order[start : start + size]
-        yield {name: column[index] for name, column in inputs.items()}, truth[index]
+        yield {name: column[index] for name, column in inputs.items()}, gain_db[index]

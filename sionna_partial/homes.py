@@ -36,11 +36,18 @@ DOOR_M = (0.8, 1.0)
 WIDE_M = (1.2, 2.5)
 """Width of wide openings [m]."""
 
+LOCKED_SHARE = 0.15
+"""Share of the rooms at dead ends that stay locked."""
+
+LEAF_SHARE = 0.2
+"""Share of the doors whose leaf stands open into a room."""
+
 _MARGIN_M = 0.3
-_JAMB_M = 0.12
+_JAMB_M = 0.05
+_CORRIDOR_SHAPE = 25
 _NEAR_M = 0.01
 _SLIVER_M = 0.1
-_KEPT_SHARE = 0.9
+_WALKED_SHARE = 0.97
 _SMALLEST_ROOM_M2 = 1.0
 
 
@@ -57,7 +64,8 @@ class _Style:
     openness: float
     more_doors: float
     pillars: float
-    locked: float = 0.08
+    wall: float = 0.1
+    clutter: float = 1.0
 
 
 STYLES: dict[str, _Style] = {
@@ -107,33 +115,37 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
     return PartialMap(state, resolution_m, interior_cells=int((state == CellState.FREE).sum()))
 
 
-def _draw(rng: np.random.Generator, style: _Style) -> tuple[Polygon, shapely.Geometry] | None:
+def _draw(rng: np.random.Generator, kind: _Style) -> tuple[Polygon, shapely.Geometry] | None:
     """Free area and wall lines of one home; None if too much of it cannot be reached."""
+    style = _varied(rng, kind)
     outline = _outline(rng, _log_uniform(rng, style.area))
-    style = _varied(rng, style)
-    rooms = _without_slivers(list(_rooms(rng, outline, style)))
-    used = [room for room in rooms if len(rooms) < 4 or rng.random() > style.locked]
-    openings = _openings(rng, used, style)
+    rooms = [core for piece in _rooms(rng, outline, style) for core in _cores(piece)]
+    rooms, openings = _connected(rng, rooms, style)
+    leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < LEAF_SHARE]
     gaps = shapely.union_all([opening.buffer(0.05, cap_style="flat") for opening in openings])
-    lines = shapely.union_all([outline.boundary, *(room.boundary for room in rooms)]).difference(gaps)
-    leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < 0.2]
-    lines = shapely.union_all([lines, *leaves])
-    thickness_m = rng.choice([rng.uniform(0.05, 0.2), rng.uniform(0.2, 0.45)])
-    walls = lines.buffer(thickness_m / 2, cap_style="flat", join_style="mitre")
-    clutter = rng.choice([0.15, rng.uniform(0.4, 4.0)], p=[0.2, 0.8])
-    things = [thing for room in used for thing in _things(rng, room, walls, openings, clutter, style.pillars)]
-    gaps = shapely.union_all([opening.buffer(thickness_m, cap_style="flat") for opening in openings])
-    free = shapely.union_all([*used, gaps]).difference(shapely.union_all([walls, *things]))
+    lines = shapely.union_all([room.boundary for room in rooms]).difference(gaps)
+    walls = lines.buffer(style.wall / 2, cap_style="flat", join_style="mitre")
+    lines, walls = shapely.union_all([lines, *leaves]), shapely.union_all([walls, *shapely.buffer(leaves, _NEAR_M)])
+    things = [thing for room in rooms for thing in _things(rng, room, walls, openings, style)]
+    gaps = shapely.union_all([opening.buffer(style.wall, cap_style="flat") for opening in openings])
+    free = shapely.union_all([*rooms, gaps]).difference(shapely.union_all([walls, *things]))
     free = free.buffer(-_SLIVER_M, join_style="mitre").buffer(_SLIVER_M, join_style="mitre")
-    largest = _parts(free)[0]
-    return (largest, lines) if largest.area >= _KEPT_SHARE * free.area else None
+    walked = _parts(free.buffer(-WALK_M / 2))
+    if not walked or walked[0].area < _WALKED_SHARE * sum(part.area for part in walked):
+        return None
+    return next(part for part in _parts(free) if part.intersects(walked[0])), lines
 
 
 def _varied(rng: np.random.Generator, style: _Style) -> _Style:
-    """Style of one home: larger or smaller rooms, more open or closed, than its kind has on average."""
+    """Style of one home: larger or smaller rooms, more open, fuller, thicker walls than its kind has on average."""
     scale = float(rng.uniform(0.6, 1.6))
-    room_area = (scale * style.room_area[0], scale * style.room_area[1])
-    return replace(style, room_area=room_area, openness=style.openness * rng.uniform(0, 2))
+    return replace(
+        style,
+        room_area=(scale * style.room_area[0], scale * style.room_area[1]),
+        openness=style.openness * rng.uniform(0, 2),
+        wall=rng.choice([rng.uniform(0.05, 0.2), rng.uniform(0.2, 0.45)]),
+        clutter=rng.choice([0.15, rng.uniform(0.3, 2.5)], p=[0.25, 0.75]),
+    )
 
 
 def _parts(shape: shapely.Geometry) -> list[Polygon]:
@@ -179,9 +191,12 @@ def _rooms(rng: np.random.Generator, outline: Polygon, style: _Style) -> Iterato
     if rng.random() < style.corridor:
         x0, y0, x1, y1 = outline.bounds
         x, y = np.array([x0, y0]) + rng.uniform(0.35, 0.65, 2) * (x1 - x0, y1 - y0)
-        half = rng.uniform(*style.corridor_width) / 2
+        half = (rng.uniform(*style.corridor_width) + style.wall) / 2
         reach = rng.choice([1.0, rng.uniform(0.5, 0.9)])
-        strips = [box(x0, y - half, x0 + reach * (x1 - x0), y + half), box(x - half, y0, x + half, y0 + reach * (y1 - y0))]
+        strips = [
+            box(x0, y - half, x0 + reach * (x1 - x0), y + half),
+            box(x - half, y0, x + half, y0 + reach * (y1 - y0)),
+        ]
         first = int(y1 - y0 > x1 - x0)
         corridor = strips[first].union(strips[1 - first]) if rng.random() < 0.3 else strips[first]
         yield from _parts(outline.intersection(corridor))
@@ -213,44 +228,42 @@ def _divide(rng: np.random.Generator, part: Polygon, style: _Style) -> Iterator[
             yield piece
 
 
-def _without_slivers(rooms: list[Polygon]) -> list[Polygon]:
-    """Add what is too small to be a room to the neighbour with the longest common wall."""
-    kept = [room for room in rooms if _is_room(room)] or rooms[:1]
-    for sliver in rooms:
-        if not _is_room(sliver):
-            shared = [sliver.boundary.intersection(room.buffer(_NEAR_M)).length for room in kept]
-            best = int(np.argmax(shared))
-            kept[best] = _parts(kept[best].union(sliver.buffer(_NEAR_M, join_style="mitre")))[0]
-    return kept
+def _cores(piece: Polygon) -> list[Polygon]:
+    """Parts of a piece that are wide enough for a room; the rest is solid."""
+    half_m = DOOR_M[0] / 2
+    wide = piece.buffer(-half_m, join_style="mitre").buffer(half_m, join_style="mitre")
+    return [core for core in _parts(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
 
 
-def _is_room(shape: Polygon) -> bool:
-    return bool(shape.area >= _SMALLEST_ROOM_M2 and not shape.buffer(-DOOR_M[0] / 2).is_empty)
+def _connected(rng: np.random.Generator, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString]]:
+    """Rooms that can be reached, and their openings: those of a random spanning tree, and some more."""
+    jamb_m = _JAMB_M + style.wall / 2
+    pairs = [(i, j) for i in range(len(rooms)) for j in range(i)]
+    walls = [_common_wall(rooms[i], rooms[j]) for i, j in pairs]
+    wide = [k for k, wall in enumerate(walls) if wall.length >= DOOR_M[0] + 2 * jamb_m]
+    tree = _tree(rng, rooms, [pairs[k] for k in wide])
+    doors = [k for k in wide if pairs[k] in tree or rng.random() < style.more_doors]
+    degree = np.bincount([room for k in doors for room in pairs[k]], minlength=len(rooms))
+    locked = (degree == 0) | ((degree == 1) & (rng.random(len(rooms)) < LOCKED_SHARE))
+    if locked.all():
+        return rooms[:1], []
+    openings = [_opening(rng, walls[k], style, jamb_m) for k in doors if not locked[list(pairs[k])].any()]
+    return [room for room, shut in zip(rooms, locked, strict=True) if not shut], openings
 
 
-def _openings(rng: np.random.Generator, rooms: list[Polygon], style: _Style) -> list[LineString]:
-    """Openings that connect the rooms: those of a random spanning tree that likes corridors, and some more."""
-    pairs, walls = [], []
-    for i, j in zip(*np.triu_indices(len(rooms), 1), strict=True):
-        wall = _common_wall(rooms[i], rooms[j])
-        if wall is not None:
-            pairs.append((i, j))
-            walls.append(wall)
-    if not pairs:
-        return []
-    hub = np.array([room.length**2 > 25 * room.area for room in rooms])
-    rows, columns = np.array(pairs).T
-    weights = rng.uniform(1, 2, len(pairs)) + 2.0 * ~(hub[rows] | hub[columns])
+def _tree(rng: np.random.Generator, rooms: list[Polygon], pairs: list[tuple[int, int]]) -> set[tuple[int, int]]:
+    """Pairs of a random spanning tree of the rooms that goes through corridors where it can."""
+    corridor = np.array([room.length**2 > _CORRIDOR_SHAPE * room.area for room in rooms])
+    rows, columns = np.array(pairs, dtype=int).reshape(-1, 2).T
+    weights = rng.uniform(1, 2, len(pairs)) + 2.0 * ~(corridor[rows] | corridor[columns])
     tree = minimum_spanning_tree(coo_array((weights, (rows, columns)), shape=(len(rooms),) * 2)).tocoo()
-    chosen = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
-    opened = [wall for pair, wall in zip(pairs, walls, strict=True) if pair in chosen or rng.random() < style.more_doors]
-    return [_opening(rng, wall, style) for wall in opened]
+    return set(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
 
 
-def _common_wall(room: Polygon, other: Polygon) -> LineString | None:
-    """Longest straight wall between two rooms in which a door has room."""
+def _common_wall(room: Polygon, other: Polygon) -> LineString:
+    """Longest straight wall between two rooms; empty if there is none."""
     if room.distance(other) > _NEAR_M:
-        return None
+        return LineString()
     shared = shapely.line_merge(room.boundary.intersection(other.buffer(_NEAR_M)))
     sides = [
         LineString(ends)
@@ -258,18 +271,17 @@ def _common_wall(room: Polygon, other: Polygon) -> LineString | None:
         if line.geom_type == "LineString"
         for ends in zip(line.coords, line.coords[1:], strict=False)
     ]
-    longest = max(sides, key=lambda side: side.length, default=LineString())
-    return longest if longest.length >= DOOR_M[0] + 2 * _JAMB_M else None
+    return max(sides, key=lambda side: side.length, default=LineString())
 
 
-def _opening(rng: np.random.Generator, wall: LineString, style: _Style) -> LineString:
+def _opening(rng: np.random.Generator, wall: LineString, style: _Style, jamb_m: float) -> LineString:
     """Part of a wall that is a door, a wide opening, or all of it."""
-    room = wall.length - 2 * _JAMB_M
+    room = wall.length - 2 * jamb_m
     if rng.random() < style.openness and room > WIDE_M[0]:
         width = room if rng.random() < 0.4 else rng.uniform(WIDE_M[0], min(room, WIDE_M[1]))
     else:
         width = rng.uniform(DOOR_M[0], min(room, DOOR_M[1]))
-    start = _JAMB_M + rng.choice([0.0, rng.random(), 1.0]) * (room - width)
+    start = jamb_m + rng.choice([0.0, rng.random(), 1.0]) * (room - width)
     return substring(wall, start, start + width)
 
 
@@ -280,23 +292,21 @@ def _leaf(rng: np.random.Generator, opening: LineString) -> LineString:
 
 
 def _things(
-    rng: np.random.Generator,
-    room: Polygon,
-    walls: Polygon,
-    openings: list[LineString],
-    clutter: float,
-    pillars: float,
+    rng: np.random.Generator, room: Polygon, walls: Polygon, openings: list[LineString], style: _Style
 ) -> Iterator[Polygon]:
     """Furniture and pillars of a room that leave a way through it and to its openings."""
-    ways = [opening.buffer(WALK_M, cap_style="flat") for opening in openings if opening.distance(room) < _NEAR_M]
+    near = [opening for opening in openings if opening.distance(room) < _NEAR_M]
+    doorsteps = shapely.union_all([opening.buffer(WALK_M, cap_style="flat") for opening in near])
+    ways = [opening.buffer(1.5 * WALK_M, cap_style="flat") for opening in near]
     left = shapely.union_all([room, *ways]).difference(walls)
-    left = _parts(left)[0]
-    things = [_furniture(rng, room) for _ in range(rng.poisson(clutter * room.area / 4) if room.area > 4 else 0)]
-    if room.area > 20 and rng.random() < pillars:
+    things = [_furniture(rng, room) for _ in range(rng.poisson(style.clutter * room.area / 4) if room.area > 4 else 0)]
+    if room.area > 20 and rng.random() < style.pillars:
         things += [_place(rng, room, box(-s, -s, s, s)) for s in rng.uniform(0.12, 0.3, int(room.area / 15))]
     for thing in things:
+        thing = thing.intersection(room).difference(doorsteps)
         now = left.difference(thing)
-        if now.buffer(-WALK_M / 2).geom_type == "Polygon":
+        walkable = now.buffer(-WALK_M / 2)
+        if walkable.geom_type == "Polygon" and not walkable.is_empty:
             left = now
             yield thing
 

@@ -21,12 +21,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Literal
+from typing import Final, Literal
 
 from sionna_partial.errors import BackendError, OutputError
 from sionna_partial.files import atomic_write
 
-PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
+PATH_VARIABLE: Final = "DRJIT_LIBLLVM_PATH"
 """Environment variable with which Dr.Jit is told what to load."""
 
 PIP_REQUIREMENT = "karellen-llvm-core>=19.1.7,<24"
@@ -153,8 +153,11 @@ def _candidates() -> Iterator[tuple[Path, LlvmSource]]:
         yield _named_library(named), PATH_VARIABLE
     else:
         pip_libraries = _pip_libraries()
-        yield from ((path, "karellen-llvm-core") for path in pip_libraries[:1])
-        yield from ((path, "system") for path in _system_libraries() if path not in pip_libraries)
+        for path in pip_libraries[:1]:
+            yield path, "karellen-llvm-core"
+        for path in _system_libraries():
+            if path not in pip_libraries:
+                yield path, "system"
 
 
 def _started_library() -> Path | None:

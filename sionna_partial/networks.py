@@ -218,7 +218,8 @@ def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
     ranges = {}
     for name, network in parts(model).items():
         scaling = network.get_layer("scaled").get_config()
-        spans = zip(network.input, scaling["scale"], scaling["offset"], strict=True)
+        names = [key for key in FEATURES if key in network.input]
+        spans = zip(names, scaling["scale"], scaling["offset"], strict=True)
         ranges[name] = {key: [-offset / scale, (1.0 - offset) / scale] for key, scale, offset in spans}
     return ranges
 

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
@@ -26,7 +27,7 @@ STATE_COLOURS = {LinkState.LOS: "#ddaa33", LinkState.NLOS: "#bb5566", LinkState.
 
 _WIDTH_IN, _DPI, _MAX_PIXELS = 12.0, 150, 3000
 _STACKED_ASPECT = 1.8
-_HATCH, _HATCH_COLOUR = "////", (1.0, 1.0, 1.0, 0.55)
+_HATCH, _HATCH_COLOUR = "////", (0.75, 0.75, 0.75, 0.8)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = {"marker": "*", "markersize": 13, "markerfacecolor": "white", "markeredgecolor": "black"}
 
@@ -37,9 +38,9 @@ class _Layer:
 
     title: str
     picture: Callable[[xr.Dataset], NDArray[np.float64]]
-    scale: ScalarMappable | None = None
+    norm: Normalize | None = None
+    cmap: str | None = None
     unit: str = ""
-    extend: str = "neither"
 
 
 def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> NDArray[np.float64]:
@@ -61,18 +62,18 @@ def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) 
 
 LINK_STATE = _Layer("Link state", lambda data: mix_state_colours(data["p_los"], data["p_nlos"], data["p_outage"]))
 GAIN = _Layer(
-    "Path gain, mean",
+    "Mean path gain",
     lambda data: data["gain_mean_db"].to_numpy(),
-    ScalarMappable(Normalize(-150.0, -60.0), "viridis"),
+    Normalize(-150.0, -60.0),
+    "viridis",
     "mean [dB]",
-    "max",
 )
 DEVIATION = _Layer(
-    "Path gain, standard deviation",
+    "Standard deviation of the path gain",
     lambda data: data["gain_std_db"].to_numpy(),
-    ScalarMappable(Normalize(0.0, 40.0), "magma_r"),
-    "standard deviation [dB]",
-    "max",
+    Normalize(0.0, 40.0),
+    "magma_r",
+    "std. dev. [dB]",
 )
 
 
@@ -137,6 +138,7 @@ def plot_comparison(coverages: Mapping[str, xr.Dataset]) -> Figure:
     for row, layer in zip(axes, (LINK_STATE, GAIN), strict=True):
         for axis, coverage in zip(row, coverages.values(), strict=True):
             _draw(axis, coverage, layer, first)
+        row[0].set_ylabel(f"{layer.title}\n\ny [m]")
     for axis, title in zip(axes[0], coverages, strict=True):
         axis.set_title(title)
     figure.suptitle(_headline(first))
@@ -166,8 +168,8 @@ def _panels(layers: list[list[_Layer]], aspect: float, *, keys_right: bool) -> t
     key_width, key_height = (1.1, 0.0) if keys_right else (0.0, 0.85)
     width = (_WIDTH_IN - 0.8 - key_width) / columns - 0.1
     height = min(max(width / aspect, 1.2), 12.0)
-    size = (_WIDTH_IN, rows * (height + 0.3) + 1.15 + key_height)
-    figure = Figure(figsize=size, dpi=_DPI, layout="constrained")
+    size = (_WIDTH_IN, rows * (height + 0.2) + 1.2 + key_height)
+    figure = Figure(figsize=size, dpi=_DPI, layout=ConstrainedLayoutEngine(h_pad=0.08))
     grid = figure.add_gridspec(
         rows + (not keys_right),
         columns + keys_right,
@@ -188,12 +190,13 @@ def _panels(layers: list[list[_Layer]], aspect: float, *, keys_right: bool) -> t
 
 def _draw_key(key: Axes, layer: _Layer, *, upright: bool) -> None:
     """Draw the colour bar of a scale, or the triangle of mixed state colours."""
-    if layer.scale is None:
+    if layer.norm is None:
         _draw_triangle(key)
         return
     place = (0.05, 0.05, 0.17, 0.9) if upright else (0.05, 0.7, 0.9, 0.2)
     orientation = "vertical" if upright else "horizontal"
-    bar = key.figure.colorbar(layer.scale, cax=key.inset_axes(place), orientation=orientation, extend=layer.extend)
+    scale = ScalarMappable(layer.norm, layer.cmap)
+    bar = key.figure.colorbar(scale, cax=key.inset_axes(place), orientation=orientation, extend="max")
     bar.set_label(layer.unit)
 
 
@@ -218,8 +221,7 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: _Layer, reference: xr.Dataset
     extent = _extent(coverage)
     wall = _walls(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
-    norm, cmap = (layer.scale.norm, layer.scale.cmap) if layer.scale else (None, None)
-    axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)
+    axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=layer.norm, cmap=layer.cmap)
     _hatch_unknown(axis, coverage)
     if reference is not None:
         axis.imshow(_shade(_walls(reference), _UNSEEN_OPACITY), extent=_extent(reference), origin="lower", zorder=3)

@@ -76,7 +76,7 @@ class LinkPrediction:
         -------
         LinkPrediction
         """
-        mean = (probabilities * means_db).sum(axis=0)
+        mean = np.maximum((probabilities * means_db).sum(axis=0), GAIN_FLOOR_DB)
         variance = (probabilities * (stds_db**2 + (means_db - mean) ** 2)).sum(axis=0)
         return cls(
             p_los=probabilities[LinkState.LOS],

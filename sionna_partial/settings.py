@@ -184,9 +184,12 @@ class TraceSettings:
         Carrier frequency [Hz].
     max_depth : int
         Largest number of interactions on a path, 0 (line of sight alone) to 10.
-    diffraction, refraction, diffuse_reflection : bool
-        Further interactions beside line of sight and specular reflection. They are found by shooting rays (Sionna
-        RT's own candidate generator), which is slower than the exact beams that find specular paths.
+    diffraction : bool
+        One diffraction at a vertical edge, with at most two reflections around it. Found by exact beams, as line of
+        sight and specular reflections are, unless rays are shot anyway.
+    refraction, diffuse_reflection : bool
+        Further interactions. With either of them, every path is found by shooting rays (Sionna RT's own candidate
+        generator), which is slower than exact beams.
     samples_per_tx : int
         Number of rays shot from the transmitter where rays are shot.
     seed : int
@@ -217,6 +220,6 @@ class TraceSettings:
             require(isinstance(value, bool), name, value, "give True or False.")
 
     @property
-    def shoots_rays(self) -> bool:
-        """Whether rays are shot: refraction and diffuse reflection have no exact candidates."""
-        return self.refraction or self.diffuse_reflection
+    def specular_only(self) -> bool:
+        """Whether only line of sight and specular reflection are traced."""
+        return not (self.diffraction or self.refraction or self.diffuse_reflection)

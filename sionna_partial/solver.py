@@ -8,7 +8,7 @@ way `ImageMethod` verifies every path and `FieldCalculator` gives every coeffici
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
@@ -29,7 +29,7 @@ MITSUBA_VARIANT = "llvm_ad_mono_polarized"
 
 @dataclass(frozen=True)
 class SolvedPaths:
-    """Verified paths in the order of their candidates, in scene coordinates (fields as in `TracedLinks`)."""
+    """Verified paths in scene coordinates (fields as in `TracedLinks`; D may be less)."""
 
     path_rx: NDArray[np.int32]
     a: NDArray[np.complex128]
@@ -37,7 +37,7 @@ class SolvedPaths:
     departure_rad: NDArray[np.float64]
     arrival_rad: NDArray[np.float64]
     interactions: NDArray[np.uint8]
-    vertices_m: NDArray[np.float64]
+    vertices_m: NDArray[Any]
 
 
 def load_sionna() -> ModuleType:
@@ -97,21 +97,20 @@ class SceneSolver:
         self._field_calculator = rt.path_solvers.field_calculator.FieldCalculator()
 
     def verify(self, candidates: Candidates) -> SolvedPaths:
-        """Verify specular candidates and compute their coefficients."""
+        """Verify candidates and compute their coefficients; either all of them diffract or none does."""
         buffer = self._candidate_buffer(candidates)
         return self._solve(buffer, self._rx_m, diffraction=len(candidates.wedge) > 0)
 
     @property
     def wedges(self) -> Wedges:
         """Vertical edges of the walls as Sionna RT sees them: corners, and free ends, which it takes for screens."""
-        place, normals = self._wedge_table.o.numpy(), (self._wedge_table.n0.numpy(), self._wedge_table.nn.numpy())
-        count = place.shape[1] // 2
-        normal_0, normal_n = (normal[:2, :count].T.astype(np.float64) for normal in normals)
-        return Wedges(place[:2, :count].T.astype(np.float64), normal_0, normal_n)
+        table, primitive = self._wedge_table
+        faces = (normal.numpy()[:2, : len(primitive)].T.astype(np.float64) for normal in (table.n0, table.nn))
+        return Wedges(primitive // 2, 1 - primitive % 2, *faces)
 
     @cached_property
-    def _wedge_table(self) -> Any:
-        """Sionna RT's wedges along the vertical edges, once as they are and once with their faces swapped.
+    def _wedge_table(self) -> tuple[Any, NDArray[np.int64]]:
+        """Sionna RT's wedges along the vertical edges, as they are and then with faces swapped, and their triangles.
 
         Segment s of the walls is made of the triangles 2 s and 2 s + 1 (see `write_scene`). Edge 1 of the one and edge
         2 of the other are vertical.
@@ -121,7 +120,7 @@ class SceneSolver:
         from sionna.rt.utils.wedges import WedgeGeometry, wedge_geometry
 
         if "walls" not in self._scene.objects:
-            return WedgeGeometry.build_with_size(0)
+            return WedgeGeometry.build_with_size(0), np.zeros(0, np.int64)
         walls = self._scene.objects["walls"]
         primitive = np.arange(walls.mi_mesh.face_count(), dtype=np.uint32)
         local_edge = 1 + primitive % 2
@@ -135,7 +134,7 @@ class SceneSolver:
         table = dr.gather(WedgeGeometry, every, mi.UInt(np.tile(kept, 2).astype(np.uint32)))
         table.swap_faces(swapped)
         dr.eval(table)
-        return table
+        return table, primitive[kept].astype(np.int64)
 
     def shoot(self) -> Iterator[SolvedPaths]:
         """Find paths of every enabled kind by shooting rays, one receiver at a time.
@@ -179,33 +178,40 @@ class SceneSolver:
         """Fill one of Sionna RT's path buffers with unverified candidates."""
         import drjit as dr
         import mitsuba as mi
-        from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE, InteractionType
+        from sionna.rt.constants import INVALID_PRIMITIVE, InteractionType
         from sionna.rt.path_solvers.paths_buffer import PathsBuffer
         from sionna.rt.utils.wedges import WedgeGeometry
 
         count, depth = candidates.surface.shape
         surface = candidates.surface
-        shape = np.full(surface.shape, INVALID_SHAPE, np.uint32)
-        for name, where in (("walls", (surface >= 0) | (surface == EDGE)), ("floor", surface == FLOOR), ("ceiling", surface == CEILING)):
-            if where.any():
-                shape[where] = self._scene.objects[name].object_id
         primitive = np.where(surface >= 0, 2 * surface, 0).astype(np.uint32)
         primitive[surface == -1] = INVALID_PRIMITIVE
         kind = np.where(surface == -1, InteractionType.NONE, InteractionType.SPECULAR).astype(np.uint32)
         buffer = PathsBuffer(count, depth, len(candidates.wedge) > 0)
         if len(candidates.wedge):
-            wedges = dr.gather(WedgeGeometry, self._wedge_table, mi.UInt(candidates.wedge.astype(np.uint32)))
+            wedges = dr.gather(WedgeGeometry, self._wedge_table[0], mi.UInt(candidates.wedge.astype(np.uint32)))
             primitive[surface == EDGE] = wedges.prim0.numpy()
             kind[surface == EDGE] = InteractionType.DIFFRACTION
             buffer._diffracting_wedges = wedges
         x, y, z = np.moveaxis(candidates.vertices_m.astype(np.float32), 2, 0)
         buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (mi.TensorXf(v.copy()) for v in (x, y, z))
-        buffer._shapes, buffer._primitives = mi.TensorXu(shape), mi.TensorXu(primitive)
+        buffer._shapes, buffer._primitives = mi.TensorXu(self._shapes(surface)), mi.TensorXu(primitive)
         buffer._interaction_types = mi.TensorXu(kind)
         buffer._tgt_indices = mi.UInt(candidates.rx.astype(np.uint32))
         buffer._paths_counter = mi.UInt(count)
         buffer.shrink()
         return buffer
+
+    def _shapes(self, surface: NDArray[np.int32]) -> NDArray[np.uint32]:
+        """Identify the shape of each surface for Sionna RT."""
+        from sionna.rt.constants import INVALID_SHAPE
+
+        shape = np.full(surface.shape, INVALID_SHAPE, np.uint32)
+        walls = (surface >= 0) | (surface == EDGE)
+        for name, where in (("walls", walls), ("floor", surface == FLOOR), ("ceiling", surface == CEILING)):
+            if where.any():
+                shape[where] = self._scene.objects[name].object_id
+        return shape
 
     def _solve(self, buffer: Any, rx_m: NDArray[np.float64], *, diffraction: bool) -> SolvedPaths:
         """Run the image method and the field calculator on a buffer of candidates."""
@@ -242,41 +248,48 @@ class SceneSolver:
 _FIELDS = tuple(SolvedPaths.__dataclass_fields__)
 
 
-def concatenate_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
-    """Join lists of paths; an empty list gives no paths."""
-    depth = max(1, max_depth)
-    empty = SolvedPaths(
-        np.zeros(0, np.int32),
-        np.zeros(0, np.complex128),
-        np.zeros(0),
-        np.zeros((0, 2)),
-        np.zeros((0, 2)),
-        np.zeros((0, depth), np.uint8),
-        np.zeros((0, depth, 3)),
+def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
+    """Join lists of paths, ordered by receiver and then by delay.
+
+    Takes the parts out of the list one by one, so that memory need not hold all paths twice.
+    """
+    total, depth = sum(len(part.a) for part in parts), max(1, max_depth)
+    joined = SolvedPaths(
+        path_rx=np.zeros(total, np.int32),
+        a=np.zeros(total, np.complex128),
+        delay_s=np.zeros(total),
+        departure_rad=np.zeros((total, 2)),
+        arrival_rad=np.zeros((total, 2)),
+        interactions=np.zeros((total, depth), np.uint8),
+        vertices_m=np.full((total, depth, 3), math.nan),
     )
-    parts = [empty, *(_padded(part, depth) for part in parts)]
-    return SolvedPaths(*(np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS))
-
-
-def _padded(paths: SolvedPaths, depth: int) -> SolvedPaths:
-    """Widen the interactions of paths to `depth`."""
-    more = ((0, 0), (0, depth - paths.interactions.shape[1]))
-    interactions = np.pad(paths.interactions, more)
-    vertices_m = np.pad(paths.vertices_m, (*more, (0, 0)), constant_values=math.nan)
-    return replace(paths, interactions=interactions, vertices_m=vertices_m)
+    place = np.empty(total, np.int64)
+    if parts:
+        order = np.lexsort([np.concatenate([getattr(part, key) for part in parts]) for key in ("delay_s", "path_rx")])
+        place[order] = np.arange(total)
+    start = 0
+    while parts:
+        part = parts.pop(0)
+        at = place[start : start + len(part.a)]
+        for name in _FIELDS[:5]:
+            getattr(joined, name)[at] = getattr(part, name)
+        joined.interactions[at, : part.interactions.shape[1]] = part.interactions
+        joined.vertices_m[at, : part.interactions.shape[1]] = part.vertices_m
+        start += len(part.a)
+    return joined
 
 
 def _read_buffer(buffer: Any, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> SolvedPaths:
     """Copy the valid paths of a buffer out of Dr.Jit."""
     if buffer.buffer_size == 0:
-        return concatenate_paths([], buffer.max_depth)
+        return join_paths([], buffer.max_depth)
     buffer.schedule()
     valid = np.flatnonzero(buffer.valid.numpy())
     path_rx = buffer.target_indices.numpy()[valid].astype(np.int32)
     a = buffer.a[0][0]
     interactions = buffer.interaction_types.numpy()[valid].astype(np.uint8)
     vertices = np.stack([v.numpy()[valid] for v in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2)
-    vertices = np.where(interactions[:, :, None] > 0, vertices.astype(np.float64), math.nan)
+    vertices = np.where(interactions[:, :, None] > 0, vertices, np.float32(math.nan))
     count = (interactions > 0).sum(axis=1)
     direct = (count == 0)[:, None]
     first, last = vertices[:, 0], vertices[np.arange(len(valid)), np.maximum(count, 1) - 1]

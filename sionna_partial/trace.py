@@ -4,6 +4,7 @@ import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +18,7 @@ from sionna_partial.map_files import load_map
 from sionna_partial.partial_map import PartialMap
 from sionna_partial.scene import SceneGeometry, build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.solver import SceneSolver, SolvedPaths, concatenate_paths
+from sionna_partial.solver import SceneSolver, SolvedPaths, join_paths
 
 Progress = Callable[[float, str], None]
 """Called with the share of the work done, in [0, 1], and what is being done."""
@@ -81,9 +82,10 @@ def trace_links(
     """Trace every path from one transmitter to N receivers with Sionna RT.
 
     Line of sight and specular reflections are complete: candidates come from exact beams and are verified by Sionna
-    RT's image method. With diffraction, refraction or diffuse reflection switched on, Sionna RT shoots rays instead,
-    one receiver at a time, which is slow and finds most paths, not all. The answer for a receiver does not depend on
-    the other receivers.
+    RT's image method. So are, if switched on, paths with one diffraction at a vertical edge of the walls (corners, door
+    jambs, open wall ends) and at most two reflections around it. With refraction or diffuse reflection switched on,
+    Sionna RT shoots rays instead, one receiver at a time, for paths of every kind, which is slow and finds most paths,
+    not all. The answer for a receiver does not depend on the other receivers.
 
     Parameters
     ----------
@@ -122,21 +124,21 @@ def trace_links(
     with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
         xml = write_scene(geometry, Path(folder), offset_m=geometry.origin_m, frequency_hz=settings.frequency_hz)
         parts = list(_solve_blocks(geometry, xml, settings, tx_m - shift, rx_m - shift, report))
-    paths = concatenate_paths(parts, settings.max_depth)
-    order = np.lexsort((paths.delay_s, paths.path_rx))
+    paths = join_paths(parts, settings.max_depth)
+    paths.vertices_m[:] += shift
     link_state, gain_db = _link_summary(paths, len(rx_m))
     return TracedLinks(
         tx=tx_m,
         rx=rx_m,
         link_state=link_state,
         gain_db=gain_db,
-        path_rx=paths.path_rx[order],
-        a=paths.a[order],
-        delay_s=paths.delay_s[order],
-        departure_rad=paths.departure_rad[order],
-        arrival_rad=paths.arrival_rad[order],
-        interactions=paths.interactions[order],
-        vertices_m=paths.vertices_m[order] + shift,
+        path_rx=paths.path_rx,
+        a=paths.a,
+        delay_s=paths.delay_s,
+        departure_rad=paths.departure_rad,
+        arrival_rad=paths.arrival_rad,
+        interactions=paths.interactions,
+        vertices_m=paths.vertices_m,
         settings=settings,
         scene_settings=scene_settings,
     )
@@ -166,7 +168,7 @@ def _solve_blocks(
         return
     report(0.02, "starting Sionna RT")
     solver = SceneSolver(xml, settings, tx_m, rx_m)
-    if settings.shoots_rays:
+    if settings.refraction or settings.diffuse_reflection:
         for done, paths in enumerate(solver.shoot()):
             yield paths
             report(0.1 + 0.9 * (done + 1) / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
@@ -185,7 +187,11 @@ def _candidates(
 ) -> Iterator[tuple[Candidates, float, str]]:
     """Exact candidates in blocks, with the share of the work done and its name."""
     walls_m = geometry.vertices_m[geometry.segments]
-    extent = {"height_m": geometry.height_m, "horizontal": len(geometry.floor_m) > 0, "max_depth": settings.max_depth}
+    extent: dict[str, Any] = {
+        "height_m": geometry.height_m,
+        "horizontal": len(geometry.floor_m) > 0,
+        "max_depth": settings.max_depth,
+    }
     beams = trace_beams(walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
     part = 0.2 if settings.diffraction else 1.0
     for candidates, share in specular_candidates(beams, walls_m, tx_m, rx_m, **extent):

@@ -29,6 +29,21 @@ PICTURE = """
 """
 """A partly seen home of two rooms; the first line holds the largest y."""
 
+COMPLETE = """
+????????????
+?##########?
+?#.....#...#
+?#.....#..#?
+?#.........#
+?#.....#..##
+?##########?
+????????????
+"""
+"""All of that home."""
+
+TX = (0.6, 3.6)
+"""Where the transmitter stands."""
+
 
 def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = (-1.0, 2.0)) -> PartialMap:
     """Make a map of a drawing: `.` free, `#` wall, `?` unknown."""
@@ -110,4 +125,4 @@ def use_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
 def small_coverage(monkeypatch: pytest.MonkeyPatch) -> xr.Dataset:
     """Coverage map of `PICTURE` with receivers 0.25 m apart."""
     use_fakes(monkeypatch)
-    return predict_map(map_of(PICTURE), (0.6, 3.6), spacing_m=0.25)
+    return predict_map(map_of(PICTURE), TX, spacing_m=0.25)

@@ -16,7 +16,8 @@ ROOM = np.array(
 """A room of 6 m x 4 m, parted by a wall with a door."""
 
 SPLINTERS = np.array(
-    [[(0.5, 3.2), (1.4, 3.7)], [(4.2, 0.6), (5.1, 1.3)], [(4.9, 0.5), (4.3, 1.4)], [(3.8, 3.0), (4.6, 3.0)]], dtype=float
+    [[(0.5, 3.2), (1.4, 3.7)], [(4.2, 0.6), (5.1, 1.3)], [(4.9, 0.5), (4.3, 1.4)], [(3.8, 3.0), (4.6, 3.0)]],
+    dtype=float,
 )
 """Free-standing walls, tilted, two of them crossing."""
 
@@ -35,7 +36,9 @@ def _blocked(walls: NDArray[np.float64], start: NDArray[np.float64], stop: NDArr
     return bool(((t > 1e-9) & (t < 1 - 1e-9) & (u > -1e-9) & (u < 1 + 1e-9)).any())
 
 
-def _exists(walls: NDArray[np.float64], chain: tuple[int, ...], tx: NDArray[np.float64], rx: NDArray[np.float64]) -> bool:
+def _exists(
+    walls: NDArray[np.float64], chain: tuple[int, ...], tx: NDArray[np.float64], rx: NDArray[np.float64]
+) -> bool:
     """Textbook image method in the plan."""
     images = [tx]
     for wall in walls[list(chain)]:
@@ -93,7 +96,9 @@ def test_lists_each_chain_of_lines_once_for_a_receiver_on_the_lattice() -> None:
     tx = np.array([1.0, 2.0])
     rx = np.array([[4.5, 2.0], [3.0, 2.0], [5.0, 2.5]])
     beams = trace_beams(ROOM, tx, rx, 4)
-    pairs = [(_chain_lines(beams, node), rx_index) for node, rx_index in zip(beams.pair_node, beams.pair_rx, strict=True)]
+    pairs = [
+        (_chain_lines(beams, node), rx_index) for node, rx_index in zip(beams.pair_node, beams.pair_rx, strict=True)
+    ]
     assert len(pairs) == len(set(pairs))
 
 

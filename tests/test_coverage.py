@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from coverage_fakes import PICTURE, FakePredictor, fake_trace, map_of, small_coverage, use_fakes
+from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, fake_trace, map_of, small_coverage, use_fakes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,9 +15,6 @@ from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.map_files import save_map
 from sionna_partial.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-
-TX = (0.6, 3.6)
-COMPLETE = PICTURE.replace("...?", "...#").replace("..#?", "..##").replace("#.???", "#..#?")
 
 
 @pytest.fixture

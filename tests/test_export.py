@@ -11,6 +11,7 @@ import yaml
 from coverage_fakes import small_coverage
 from PIL import Image
 
+from sionna_partial import export
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import ATTRIBUTES
 from sionna_partial.errors import OutputError, SettingsError
@@ -136,15 +137,15 @@ def test_ros_map_loads_as_a_map(coverage, tmp_path):
     assert (loaded.state[np.isnan(p_outage)] == CellState.UNKNOWN).all()
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
-def test_equal_maps_give_equal_files(coverage, tmp_path, suffix):
-    save_coverage(coverage, tmp_path / "first" / f"coverage{suffix}")
-    time.sleep(1.1)  # HDF5's time stamps are whole seconds
-    save_coverage(coverage.copy(deep=True), tmp_path / "second" / f"coverage{suffix}")
-    first = {file.name: file.read_bytes() for file in (tmp_path / "first").iterdir()}
-    second = {file.name: file.read_bytes() for file in (tmp_path / "second").iterdir()}
-    assert first == second
-    assert len(first) == (2 if suffix == ".yaml" else 1)
+def test_equal_maps_give_equal_files(coverage, tmp_path):
+    files = []
+    for folder in (tmp_path / "first", tmp_path / "second"):
+        for suffix in SUFFIXES:
+            save_coverage(coverage.copy(deep=True), folder / f"coverage{suffix}")
+        files.append({file.name: file.read_bytes() for file in folder.iterdir()})
+        time.sleep(1.1)  # HDF5's time stamps are whole seconds
+    assert files[0] == files[1]
+    assert len(files[0]) == len(SUFFIXES) + 1
 
 
 def test_files_are_replaced_and_other_files_left_alone(coverage, tmp_path):
@@ -222,5 +223,6 @@ def test_what_is_no_coverage_map_is_refused(coverage, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_every_variable_but_the_walls_parts_is_in_the_tables():
+def test_formats_and_tables_are_complete():
+    assert export.FORMATS == SUFFIXES
     assert set(ATTRIBUTES) - set(TABLE_VARIABLES) == {"wall_parts"}

@@ -109,8 +109,8 @@ def test_axes_are_labelled_in_metres(coverage):
     assert all(panel.get_xlabel() == "x [m]" for panel in others)
     assert [panel.get_title() for panel in (first, *others)] == [
         "Link state",
-        "Path gain, mean",
-        "Path gain, standard deviation",
+        "Mean path gain",
+        "Standard deviation of the path gain",
     ]
 
 
@@ -121,6 +121,7 @@ def test_the_comparison_has_a_column_for_each_map(coverage):
     assert [panel.get_title() for panel in shown[:3]] == ["truth", "nothing observed", "partial map"]
     np.testing.assert_array_equal(shown[0].images[0].get_array(), shown[2].images[0].get_array())
     assert shown[3].images[0].get_clim() == (-150, -60)
+    assert [shown[row].get_ylabel().split("\n")[0] for row in (0, 3)] == ["Link state", "Mean path gain"]
 
 
 def test_the_comparison_shows_unseen_walls_of_the_first_map_in_grey(coverage):

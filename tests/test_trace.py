@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
@@ -292,3 +293,82 @@ def test_progress_ends_at_one() -> None:
     assert seen[0] == 0.0
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
+
+
+def _screen() -> tuple[PartialMap, float]:
+    """A wall that ends in the middle of the map, and x of its end [m]."""
+    state = _map((80, 120))
+    state[40, :60] = CellState.WALL
+    return PartialMap(state, 0.1), 5.95
+
+
+def _field(links: TracedLinks, count: int) -> NDArray[np.complex128]:
+    """Complex sum (count,) of all paths of each receiver."""
+    phased = links.a * np.exp(-2j * np.pi * 28e9 * links.delay_s)
+    return np.bincount(links.path_rx, phased.real, count) + 1j * np.bincount(links.path_rx, phased.imag, count)
+
+
+def test_the_field_behind_an_open_wall_end_follows_the_fresnel_integral() -> None:
+    partial, edge_x = _screen()
+    tx = np.array([edge_x, 0.55, 1.5])
+    rx = np.column_stack([edge_x + np.linspace(-0.15, 0.15, 16), np.full(16, 7.05), np.full(16, 1.5)])
+    settings = TraceSettings(max_depth=1, diffraction=True)
+    total = _field(trace_links(partial, tx, rx, settings=settings, scene_settings=NO_FLOOR), len(rx))
+    direct = WAVELENGTH_M / (4 * np.pi * np.linalg.norm(rx - tx, axis=1))
+    before, after = 4.05 - tx[1], 7.05 - 4.05
+    clearance = (rx[:, 0] - edge_x) * before / (before + after)
+    v = -clearance * np.sqrt(2 * (before + after) / (WAVELENGTH_M * before * after))
+    s, c = fresnel(v)
+    knife_edge = np.abs((0.5 - c) - 1j * (0.5 - s)) / np.sqrt(2)
+    np.testing.assert_allclose(np.abs(total) / direct, knife_edge, atol=0.05)
+
+
+def test_diffracted_paths_are_reciprocal_and_need_no_rays() -> None:
+    """The paths are; Sionna RT's coefficients of a dielectric wedge are not, as they depend on the lit face."""
+    a, b = np.array([0.75, 0.83, 1.2]), np.array([5.21, 0.61, 2.1])
+    settings = TraceSettings(max_depth=3, diffraction=True, samples_per_tx=1)
+    there, back = (trace_links(_room(), p, q[None], settings=settings) for p, q in ((a, b), (b, a)))
+    diffracted = (there.interactions == 8).any(axis=1)
+    assert diffracted.sum() == (back.interactions == 8).any(axis=1).sum() > 10
+    assert ((there.interactions == 8).sum(axis=1) <= 1).all()
+    assert ((there.interactions == 1)[diffracted].sum(axis=1) <= 2).all()
+    np.testing.assert_allclose(np.sort(there.delay_s), np.sort(back.delay_s), rtol=1e-5)
+
+
+@pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
+def test_diffraction_is_independent_of_the_other_receivers(partial: PartialMap) -> None:
+    settings = TraceSettings(diffraction=True)
+    tx, rx = (1.05, 2.95, 1.5), _grid(partial, 0.3)
+    together, again = (trace_links(partial, tx, rx, settings=settings) for _ in range(2))
+    for name in ("a", "delay_s", "interactions", "vertices_m", "gain_db"):
+        assert getattr(together, name).tobytes() == getattr(again, name).tobytes()
+    some = np.arange(0, len(rx), 17)
+    apart = trace_links(partial, tx, rx[some], settings=settings)
+    np.testing.assert_array_equal(apart.gain_db, together.gain_db[some])
+
+
+@pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
+def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
+    tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::47] + [0.021, 0.013, 0.3]
+    links = trace_links(partial, tx, rx, settings=TraceSettings(max_depth=3, diffraction=True))
+    scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
+    paths = load_sionna().PathSolver(deterministic=True)(
+        scene, max_depth=3, refraction=False, diffraction=True, edge_diffraction=True, samples_per_src=100_000
+    )
+    kind = np.moveaxis(paths.interactions.numpy().reshape(3, len(rx), -1), 0, 2)
+    place = np.moveaxis(paths.vertices.numpy().reshape(3, len(rx), -1, 3), 0, 2)
+    upright = ((kind == 8) & (place[..., 2] > 1e-3) & (place[..., 2] < 3.0 - 1e-3)).any(axis=2)
+    # Where three walls meet, Sionna RT diffracts at whichever of three wedges a ray happens to find first.
+    junction = ((kind == 8) & np.isclose(place[..., 0], 3.05) & (np.abs(place[..., 1] - 2.1) > 2.0)).any(axis=2)
+    valid = paths.valid.numpy().reshape(len(rx), -1) & upright
+    delay = paths.tau.numpy().reshape(len(rx), -1)
+    power = sum(part.numpy().reshape(len(rx), -1).astype(float) ** 2 for part in paths.a)
+    recalled = []
+    for index, path in zip(*np.nonzero(valid), strict=True):
+        ours = _paths_of(links, index)
+        same = np.abs(links.delay_s[ours] - delay[index, path]) < 1e-11
+        if not junction[index, path]:
+            same &= np.abs(np.abs(links.a[ours]) / np.sqrt(power[index, path]) - 1) < 0.01
+        recalled.append((same & (links.interactions[ours] == kind[index, path]).all(axis=1)).any())
+    assert len(recalled) > 100
+    assert np.mean(recalled) > 0.999

@@ -1,0 +1,73 @@
+"""Links of a known model, and predictors trained on them, for the tests."""
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from sionna_partial.constants import LinkState
+from sionna_partial.features import LinkFeatures
+from sionna_partial.fitting import PredictorSettings
+from sionna_partial.networks import free_space_gain_db
+from sionna_partial.predictor import Predictor
+
+QUIET = pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning:keras")
+"""Keras converts TensorFlow arrays in a way that NumPy deprecates."""
+
+FREQUENCY_HZ = 28e9
+QUICK = PredictorSettings(steps=15, minimum_links=50)
+OUTAGE, LOS, NLOS = LinkState.OUTAGE, LinkState.LOS, LinkState.NLOS
+
+
+def make_links(count, seed=0):
+    """Return features, and truth from a known model: links are as the partial trace says where all was seen."""
+    rng = np.random.default_rng(seed)
+    distance_m = rng.uniform(0.5, 15.0, count)
+    unobserved_m = distance_m * rng.uniform(0.0, 1.0, count)
+    partial_state = rng.integers(0, 3, count)
+    free_db = free_space_gain_db(distance_m, FREQUENCY_HZ)
+    partial_db = np.select([partial_state == OUTAGE, partial_state == LOS], [-150.0, free_db + 1.0], free_db - 20.0)
+    phi = LinkFeatures(partial_state, unobserved_m, distance_m, partial_db)
+    kept = rng.uniform(size=count) < p_kept(phi)
+    state = np.where(kept, partial_state, np.where(partial_state == OUTAGE, NLOS, OUTAGE))
+    mean_db, std_db = true_gain(phi, state)
+    gain_db = np.where(state == OUTAGE, -150.0, mean_db + std_db * rng.normal(size=count))
+    return phi, state, gain_db
+
+
+def p_kept(phi):
+    """Probability that the true state is the partial one."""
+    return 1.0 / (1.0 + np.exp(0.8 * phi.unobserved_distance_m - 3.0))
+
+
+def true_gain(phi, state):
+    free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
+    mean_db = np.where(state == LOS, free_db + 1.0, free_db - 20.0 - phi.unobserved_distance_m)
+    return mean_db, np.where(state == LOS, 1.0 + 0.2 * phi.unobserved_distance_m, 6.0)
+
+
+def arrays(prediction):
+    return {field.name: getattr(prediction, field.name) for field in dataclasses.fields(prediction)}
+
+
+def assert_valid(prediction):
+    total = prediction.p_los + prediction.p_nlos + prediction.p_outage
+    np.testing.assert_allclose(total, 1.0, atol=1e-12)
+    for name, values in arrays(prediction).items():
+        assert np.isfinite(values).all(), name
+        if "_mean_" in name:
+            assert (values >= -150.0).all(), name
+        else:
+            assert (values >= 0.0).all(), name
+
+
+@functools.cache
+def quick_predictor():
+    return Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
+
+
+@functools.cache
+def trained_predictor():
+    settings = PredictorSettings(steps=400, batch_size=512, learning_rate=0.02)
+    return Predictor.fit(*make_links(12_000), settings=settings)

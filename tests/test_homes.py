@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import SettingsError
+from sionna_partial.homes import DOOR_M, STYLES, make_home
+from sionna_partial.partial_map import PartialMap
+
+SEEDS = range(12)
+
+
+def free_area_m2(home: PartialMap) -> float:
+    return float((home.state == CellState.FREE).sum()) * home.resolution_m**2
+
+
+@given(seed=st.integers(0, 10**9), kind=st.sampled_from([None, *STYLES]))
+def test_every_home_is_complete_connected_and_tight(seed, kind):
+    home = make_home(seed, kind, resolution_m=0.1)
+    free = home.state == CellState.FREE
+    assert home.is_complete
+    assert home.interior_cells == free.sum()
+    assert home.observed_fraction == 1.0
+    assert ndimage.label(free)[1] == 1
+    around = ndimage.binary_dilation(free, np.ones((3, 3))) & ~free
+    assert (home.state[around] == CellState.WALL).all()
+    assert not (home.state[[0, -1]] == CellState.FREE).any()
+    assert not (home.state[:, [0, -1]] == CellState.FREE).any()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_wide_body_gets_nearly_everywhere(seed):
+    """Nothing but corners and niches is cut off from a disc of 0.4 m, though doors and furniture narrow the ways."""
+    home = make_home(seed)
+    free = home.state == CellState.FREE
+    clearance_m = (ndimage.distance_transform_edt(free) - 0.5) * home.resolution_m
+    labels, _ = ndimage.label(clearance_m >= 0.2)
+    body = labels == np.argmax(np.bincount(labels[labels > 0]))
+    reached = ndimage.distance_transform_edt(~body) * home.resolution_m <= 0.45
+    assert (reached & free).sum() >= 0.97 * free.sum()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rooms_are_behind_doors(seed):
+    """A body wider than any door is shut in: homes have doors and rooms, and are no single hall."""
+    rooms = 0
+    for kind in STYLES:
+        home = make_home(seed, kind)
+        clearance_m = ndimage.distance_transform_edt(home.state == CellState.FREE) * home.resolution_m
+        labels, _ = ndimage.label(clearance_m > DOOR_M[1] / 2 + home.resolution_m)
+        rooms += (np.bincount(labels.ravel())[1:] * home.resolution_m**2 > 0.5).sum()
+    assert rooms >= 4
+
+
+def test_equal_seeds_give_equal_homes_and_others_differ():
+    homes = [make_home(seed) for seed in range(6)]
+    assert homes == [make_home(seed) for seed in range(6)]
+    assert len({home.state.tobytes() for home in homes}) == 6
+
+
+def test_kinds_differ_in_size_and_none_draws_one():
+    median = {kind: np.median([free_area_m2(make_home(seed, kind)) for seed in SEEDS]) for kind in STYLES}
+    assert median["apartment"] < median["house"] < median["office"]
+    for kind in STYLES:
+        areas = [free_area_m2(make_home(seed, kind)) for seed in SEEDS]
+        low, high = STYLES[kind].area
+        assert all(0.25 * low < area < 1.2 * high for area in areas), areas
+    assert np.std([free_area_m2(make_home(seed)) for seed in SEEDS]) > 20
+
+
+def test_homes_are_turned_and_straight():
+    """Walls run along the grid in some homes and across it in others."""
+    straight = []
+    for seed in range(20):
+        free = make_home(seed, "apartment").state == CellState.FREE
+        edge = free[1:] != free[:-1]
+        runs = (edge[:, 1:] & edge[:, :-1]).sum() / edge.sum()
+        straight.append(runs > 0.9)
+    assert 0.05 < np.mean(straight) < 0.7
+
+
+def test_resolution_keeps_the_plan():
+    fine, coarse = make_home(3, resolution_m=0.05), make_home(3, resolution_m=0.1)
+    assert coarse.resolution_m == 0.1
+    assert free_area_m2(coarse) == pytest.approx(free_area_m2(fine), rel=0.1)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True, "0", None])
+def test_seed_must_be_a_whole_number(seed):
+    with pytest.raises(SettingsError, match=r"seed = .* is not allowed: give a whole number of 0 or more\."):
+        make_home(seed)
+
+
+def test_kind_must_be_known():
+    with pytest.raises(
+        SettingsError, match=r"kind = 'castle' is not allowed: choose one of \('apartment', 'house', 'off"
+    ):
+        make_home(0, "castle")
+
+
+@pytest.mark.parametrize("resolution_m", [0.0, 0.5, float("nan"), "fine"])
+def test_resolution_must_be_in_range(resolution_m):
+    with pytest.raises(SettingsError, match=r"resolution_m = .* is not allowed: give a number in \[0\.01, 0\.2\]"):
+        make_home(0, resolution_m=resolution_m)

@@ -1,0 +1,183 @@
+"""The house rules that a machine can check: one direction, light imports, declared dependencies, public names."""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib import import_module, metadata
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import sionna_partial
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "sionna_partial"
+
+MODULES = (
+    *("constants", "errors", "resources", "settings", "files", "llvm", "llvm_probe"),
+    *("partial_map", "map_turn", "ros_map", "map_files", "homes", "explore"),
+    *("wall_lines", "wall_cells", "wall_chains", "wall_bridges", "wall_graph", "outlines", "scene"),
+    *("plan", "beams", "candidates", "diffraction", "solver", "trace", "features"),
+    *("networks", "fitting", "predictor_files", "predictor"),
+    *("coverage", "plot", "export", "demo", "info", "cli"),
+)
+"""Reading order: a module imports only from those before it."""
+
+IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit"}
+"""Imported where they are needed, after `load_llvm`, never at the top of a module."""
+
+HEAVY = IN_FUNCTIONS | {
+    *(
+        "numpy",
+        "scipy",
+        "numba",
+        "skimage",
+        "shapely",
+        "trimesh",
+        "matplotlib",
+        "xarray",
+        "rasterio",
+        "h5netcdf",
+        "h5py",
+    ),
+    *("PIL", "yaml", "pandas"),
+}
+"""Not loaded by `import sionna_partial`, nor by `--help`."""
+
+NOT_IMPORTED = {
+    "karellen-llvm-core": "a shared library, which sionna_partial.llvm finds and loads",
+    "tensorflow-cpu": "the backend that keras imports",
+}
+"""Declared dependencies that no module imports, and why they are needed."""
+
+
+def tree_of(module: str) -> ast.Module:
+    return ast.parse((PACKAGE / f"{module}.py").read_text(encoding="utf-8"))
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """Full names of the modules that are imported anywhere in a tree."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            yield str(node.module)
+
+
+def imported_at_the_top(tree: ast.Module) -> set[str]:
+    """Top-level names of the modules that are imported when a module is, types aside."""
+    statements = [
+        node for node in tree.body if not (isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test))
+    ]
+    outside = [node for node in statements if not isinstance(node, ast.FunctionDef | ast.ClassDef)]
+    return {name.partition(".")[0] for node in outside for name in imported(node)}
+
+
+def declared(kind: str) -> set[str]:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = project["dependencies"] if kind == "run" else project["optional-dependencies"][kind]
+    return {re.split(r"[^\w.-]", line)[0] for line in lines}
+
+
+def loaded_by(code: str) -> set[str]:
+    """Top-level modules in a Python of its own after some code."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
+    report = "import sys, json; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+    result = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 0, result.stderr
+    return set(json.loads(result.stdout.splitlines()[-1]))
+
+
+class TestOneDirection:
+    def test_every_module_has_its_place(self) -> None:
+        assert sorted(MODULES) == sorted(path.stem for path in PACKAGE.glob("*.py") if path.stem != "__init__")
+
+    @pytest.mark.parametrize("module", MODULES)
+    def test_module_imports_only_from_those_before_it(self, module: str) -> None:
+        names = {name.split(".")[1] for name in imported(tree_of(module)) if name.startswith("sionna_partial.")}
+        assert names <= set(MODULES[: MODULES.index(module)])
+
+    @pytest.mark.parametrize("module", MODULES)
+    def test_libraries_that_need_llvm_first_are_imported_in_functions(self, module: str) -> None:
+        assert not imported_at_the_top(tree_of(module)) & IN_FUNCTIONS
+
+
+class TestLightImports:
+    def test_package(self) -> None:
+        assert not loaded_by("import sionna_partial") & (HEAVY | {"typer", "rich"})
+
+    @pytest.mark.parametrize("command", ["", "predict", "export-scene", "explore", "demo", "info"])
+    def test_help(self, command: str) -> None:
+        arguments = [*filter(None, [command]), "--help"]
+        run = f"try:\n    app({arguments})\nexcept SystemExit as end:\n    code = end.code\nassert code == 0"
+        assert not loaded_by(f"from sionna_partial.cli import app\n{run}") & HEAVY
+
+
+class TestPublicNames:
+    @pytest.mark.parametrize("name", sionna_partial.__all__)
+    def test_name_resolves_to_what_it_says(self, name: str) -> None:
+        for module in MODULES:
+            import_module(f"sionna_partial.{module}")
+        value = getattr(sionna_partial, name)
+        assert not isinstance(value, ModuleType)
+        assert getattr(value, "__name__", name) == name
+        assert name in dir(sionna_partial)
+
+    def test_names_for_type_checkers_are_those_that_load(self) -> None:
+        tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+        typed = {
+            alias.name: str(node.module).removeprefix("sionna_partial.")
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("sionna_partial.")
+            for alias in node.names
+        }
+        assert typed == sionna_partial._MODULE_OF
+        assert {*typed, "__version__"} == set(sionna_partial.__all__)
+
+    def test_function_explore_is_not_hidden_by_its_module(self) -> None:
+        code = "import sionna_partial.explore as first, sionna_partial as sp\nassert sp.explore.__name__ == 'explore'"
+        loaded_by(code)
+
+    def test_unknown_name(self) -> None:
+        with pytest.raises(AttributeError, match="module 'sionna_partial' has no attribute 'teleport'"):
+            sionna_partial.teleport  # noqa: B018
+
+    def test_version_is_that_of_the_project(self) -> None:
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        assert sionna_partial.__version__ == project["version"]
+
+
+class TestDependencies:
+    @pytest.fixture
+    def used(self) -> set[str]:
+        """Distributions that the package imports."""
+        own = {*sys.stdlib_module_names, "sionna_partial"}
+        names = {name.partition(".")[0] for module in MODULES for name in imported(tree_of(module))} - own
+        distributions = metadata.packages_distributions()
+        return {distributions[name][0].lower().replace("_", "-") for name in names}
+
+    def test_what_is_imported_is_declared(self, used: set[str]) -> None:
+        assert used <= declared("run")
+
+    def test_what_is_declared_is_imported(self, used: set[str]) -> None:
+        assert declared("run") == used | NOT_IMPORTED.keys()
+
+    def test_what_is_declared_is_locked(self) -> None:
+        lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
+        locked = set(re.findall(r"^([\w.-]+)==", lock, flags=re.MULTILINE))
+        assert declared("run") | declared("dev") <= locked
+
+    def test_lock_holds_nothing_of_the_machine_that_made_it(self) -> None:
+        lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
+        pinned = re.compile(r"[\w.-]+==\S+( ;.*)? \\|    --hash=sha256:[0-9a-f]{64}( \\)?|\s*#.*|")
+        assert [line for line in lines if not pinned.fullmatch(line)] == []
+        assert not re.search(r"file:/|://|/opt|/work|/tmp", "\n".join(lines))

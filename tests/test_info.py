@@ -1,0 +1,78 @@
+"""The report of what is found: every fault comes with what to do."""
+
+import platform
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from sionna_partial import info
+from sionna_partial.errors import BackendError, SceneError
+from sionna_partial.info import Finding
+from sionna_partial.llvm import LlvmLibrary
+
+
+@pytest.fixture(autouse=True)
+def _sound_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "paper.keras").touch()
+    monkeypatch.setattr(info, "_PREDICTORS_FOLDER", tmp_path)
+    monkeypatch.setattr(info, "load_llvm", lambda: LlvmLibrary(Path("/lib/libLLVM.so.19.1"), "19.1.7", "system"))
+    monkeypatch.setattr(info, "demo_homes", lambda: {"flat": {}, "office": {}})
+    monkeypatch.setattr(platform, "system", lambda: "Linux")
+    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+
+
+def found() -> dict[str, Finding]:
+    return {finding.name: finding for finding in info.findings()}
+
+
+def test_sound_machine_needs_nothing() -> None:
+    findings = found()
+    assert not [finding for finding in findings.values() if finding.remedy]
+    values = {name: finding.value for name, finding in findings.items()}
+    assert values["LLVM"] == "19.1.7, solves paths"
+    assert values["LLVM library"] == "/lib/libLLVM.so.19.1"
+    assert values["LLVM source"] == "system"
+    assert values["predictors"] == "paper"
+    assert values["demo scenes"] == "flat, office"
+    assert values["numpy"] == metadata.version("numpy")
+
+
+def test_unusable_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> None:
+        raise BackendError("unset it")
+
+    monkeypatch.setattr(info, "load_llvm", fail)
+    assert found()["LLVM"] == Finding("LLVM", "not usable", "unset it")
+
+
+def test_missing_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name in ("keras", "shapely"):
+            raise metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(metadata, "version", version)
+    monkeypatch.setattr(metadata, "requires", lambda _: ["keras<4,>=3", "shapely>=2", "scipy", 'ruff; extra == "dev"'])
+    findings = found()
+    remedy = "run pip install {}, or pip install sionna-partial again."
+    assert findings["keras"] == Finding("keras", "not installed", remedy.format("keras"))
+    assert findings["shapely"] == Finding("shapely", "not installed", remedy.format("shapely"))
+    assert not {"scipy", "ruff"} & findings.keys()
+
+
+def test_missing_data(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def fail() -> None:
+        raise SceneError("install again")
+
+    (tmp_path / "paper.keras").unlink()
+    monkeypatch.setattr(info, "demo_homes", fail)
+    findings = found()
+    remedy = f"'{tmp_path}' holds none: install sionna-partial again."
+    assert findings["predictors"] == Finding("predictors", "none", remedy)
+    assert findings["demo scenes"] == Finding("demo scenes", "none", "install again")
+
+
+def test_other_platform(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    assert found()["Python"].remedy.startswith("sionna-partial is made for x86-64 Linux")

@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+from predictor_links import FREQUENCY_HZ, LOS, NLOS, QUIET, arrays, assert_valid, make_links, quick_predictor
+
+from sionna_partial.constants import LinkState
+from sionna_partial.features import LinkFeatures
+from sionna_partial.networks import GAIN_NETWORKS, free_space_gain_db
+
+pytestmark = QUIET
+
+
+@pytest.fixture(scope="module")
+def quick():
+    return quick_predictor()
+
+
+def test_free_space():
+    """Friis at 1 m and 28 GHz is -61.38 dB, and falls by 6.02 dB for twice the distance."""
+    found = free_space_gain_db(np.array([0.0, 0.01, 1.0, 2.0]), FREQUENCY_HZ)
+    np.testing.assert_allclose(found, [-21.384, -21.384, -61.384, -67.405], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs", "units"),
+    [
+        ("gain_los_given_los", ["distance_m", "unobserved_distance_m", "gain_db"], 20),
+        ("gain_los_given_nlos_outage", ["distance_m"], 10),
+        ("gain_nlos_given_nlos_outage", ["distance_m", "unobserved_distance_m", "gain_db"], 20),
+        ("gain_nlos_given_los", ["distance_m"], 10),
+    ],
+)
+def test_gain_network_is_that_of_the_table(quick, name, inputs, units):
+    network = quick.model.get_layer(name)
+    assert list(network.input) == inputs
+    assert network.output.shape == (None, 2)
+    dense = [layer for layer in network.layers if type(layer).__name__ == "Dense"]
+    hidden, heads = dense[:2], dense[2:]
+    assert [layer.kernel.shape for layer in hidden] == [(len(inputs), units), (units, units)]
+    assert [layer.activation.__name__ for layer in hidden] == ["relu", "relu"]
+    assert [layer.kernel.shape for layer in heads] == [(units, 1), (units, 1)]
+
+
+def test_rows_cover_the_table_once():
+    served = [(row.link_state, partial) for row in GAIN_NETWORKS for partial in row.partial_states]
+    assert sorted(served) == [(state, partial) for state in (LOS, NLOS) for partial in LinkState]
+
+
+@pytest.mark.parametrize("state", LinkState)
+def test_classifiers_are_logistic(quick, state):
+    classifier = quick.model.get_layer(f"state_given_{state.name.lower()}")
+    assert list(classifier.input) == ["distance_m", "unobserved_distance_m"]
+    assert [weights.shape for weights in classifier.get_weights()] == [(2, 3), (3,)]
+    indoor = quick.model.get_layer(f"indoor_given_{state.name.lower()}")
+    assert list(indoor.input) == ["unobserved_distance_m"]
+    assert [weights.shape for weights in indoor.get_weights()] == [(1, 1), (1,)]
+
+
+def test_links_do_not_depend_on_each_other(quick):
+    phi, _, _ = make_links(300, seed=3)
+    together, alone = quick.predict(phi), quick.predict(phi.take(slice(7, 8)))
+    for name, values in arrays(alone).items():
+        np.testing.assert_allclose(values, arrays(together)[name][7:8], rtol=1e-5, err_msg=name)
+
+
+def test_many_blocks(quick):
+    phi, _, _ = make_links(10, seed=3)
+    many = phi.take(np.arange(140_000) % 10)
+    np.testing.assert_allclose(quick.predict(many).gain_mean_db[-10:], quick.predict(phi).gain_mean_db, rtol=1e-5)
+
+
+@pytest.mark.parametrize("partial_state", LinkState)
+def test_sane_far_beyond_the_training_links(quick, partial_state):
+    distance_m = np.array([0.0, 1e-6, 0.1, 1.0, 10.0, 60.0, 1e4, 1e9, 1e200])
+    for share in (0.0, 1.0):
+        for gain_db in (-150.0, -40.0, 1e300):
+            states, gains_db = np.full(9, partial_state), np.full(9, gain_db)
+            assert_valid(quick.predict(LinkFeatures(states, share * distance_m, distance_m, gains_db)))

@@ -1,0 +1,198 @@
+import io
+import json
+import re
+import zipfile
+
+import numpy as np
+import pytest
+from predictor_links import LOS, OUTAGE, QUICK, QUIET, make_links, quick_predictor
+
+from sionna_partial.errors import OutputError, PredictorError
+from sionna_partial.networks import FEATURES, import_keras
+from sionna_partial.predictor import Predictor
+from sionna_partial.predictor_files import FORMAT, digest
+
+pytestmark = QUIET
+
+
+@pytest.fixture(scope="module")
+def quick():
+    return quick_predictor()
+
+
+@pytest.fixture
+def saved(quick, tmp_path):
+    quick.save(tmp_path / "mine.keras")
+    return tmp_path / "mine.keras"
+
+
+def test_card(quick, saved):
+    card = json.loads(saved.with_suffix(".json").read_text())
+    assert card["format"] == FORMAT
+    assert card["features"] == list(FEATURES) == ["distance_m", "unobserved_distance_m", "gain_db"]
+    assert card["sha256"] == digest(saved.read_bytes()) == quick.fingerprint == quick.sha256
+    assert card["homes"] == ["a", "b"]
+    assert card["settings"]["steps"] == QUICK.steps
+    assert sum(card["links"].values()) == 900
+    assert card["links"]["LOS given OUTAGE"] == 0
+    phi = make_links(900)[0]
+    seen = phi.distance_m[phi.link_state == OUTAGE]
+    assert card["scaling"]["state_given_outage"]["distance_m"] == pytest.approx([seen.min(), seen.max()])
+    assert card["versions"]["keras"] == import_keras().__version__
+
+
+def test_stock_keras_loads_it(quick, saved):
+    model = import_keras().saving.load_model(saved, safe_mode=True)
+    phi = make_links(20)[0]
+    outputs = model({name: getattr(phi, name)[:, None] for name in FEATURES})
+    probabilities = np.asarray(outputs["state_given_los"])[phi.link_state == LOS]
+    np.testing.assert_allclose(probabilities[:, LOS], quick.predict(phi).p_los[phi.link_state == LOS], rtol=1e-5)
+
+
+def _repack(archive, change):
+    """Return the archive with `change` applied to its configuration."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(archive)) as source, zipfile.ZipFile(packed, "w") as target:
+        for name in source.namelist():
+            content = source.read(name)
+            target.writestr(name, change(content.decode()) if name == "config.json" else content)
+    return packed.getvalue()
+
+
+def _forge(path, archive):
+    """Put an archive in the place of another, with a card that vouches for it."""
+    card = json.loads(path.with_suffix(".json").read_text())
+    path.write_bytes(archive)
+    path.with_suffix(".json").write_text(json.dumps({**card, "sha256": digest(archive)}))
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(PredictorError, match=r"none\.keras' cannot be read \(No such file.*check the path"):
+        Predictor.load(tmp_path / "none.keras")
+
+
+def test_missing_card(saved):
+    saved.with_suffix(".json").unlink()
+    with pytest.raises(PredictorError, match=r"mine\.json' cannot be read"):
+        Predictor.load(saved)
+
+
+@pytest.mark.parametrize("damage", [lambda b: b[:-500], lambda b: b"", lambda b: b[:900] + b"\x00" + b[901:]])
+def test_truncated_or_changed_file(saved, damage):
+    saved.write_bytes(damage(saved.read_bytes()))
+    with pytest.raises(PredictorError, match=r"mine\.keras' has SHA-256 .* the file is truncated, was changed"):
+        Predictor.load(saved)
+
+
+@pytest.mark.parametrize("archive", [b"", b"no archive at all", b"PK\x03\x04" + bytes(50)])
+def test_no_archive(saved, archive):
+    _forge(saved, archive)
+    with pytest.raises(PredictorError, match=r"mine\.keras' is no Keras archive"):
+        Predictor.load(saved)
+
+
+def test_archive_without_weights(saved):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(saved) as source, zipfile.ZipFile(packed, "w") as target:
+        for name in ("metadata.json", "config.json"):
+            target.writestr(name, source.read(name))
+    _forge(saved, packed.getvalue())
+    with pytest.raises(PredictorError, match=r"mine\.keras' cannot be loaded by Keras"):
+        Predictor.load(saved)
+
+
+def test_foreign_code_is_refused(saved):
+    for old, new, found in (
+        ('"ReLU"', '"Lambda"', "holds Lambda,"),
+        ('"module": "keras.layers"', '"module": "os"', r"holds .*os\.Dense"),
+        ('"module": "keras.layers"', '"module": "kerasx"', r"holds .*kerasx\.Dense"),
+    ):
+        original = saved.read_bytes()
+        _forge(saved, _repack(original, lambda text, old=old, new=new: text.replace(old, new)))
+        with pytest.raises(PredictorError, match=f"{found}.* which no predictor of ours has: it may run foreign code"):
+            Predictor.load(saved)
+        _forge(saved, original)
+
+
+def test_zip_bomb_is_refused(saved):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
+        target.writestr("config.json", bytes(70_000_000))
+    _forge(saved, packed.getvalue())
+    with pytest.raises(PredictorError, match="unpacks to more than 64,000,000 bytes"):
+        Predictor.load(saved)
+
+
+def test_huge_file_is_refused(saved):
+    with saved.open("r+b") as stream:
+        stream.truncate(64_000_001)
+    with pytest.raises(PredictorError, match="has more than 64,000,000 bytes"):
+        Predictor.load(saved)
+
+
+def test_other_keras_model(saved):
+    keras = import_keras()
+    place = keras.Input((1,), name="distance_m")
+    keras.Model({"distance_m": place}, {"gain": keras.layers.Dense(1)(place)}).save(saved)
+    _forge(saved, saved.read_bytes())
+    with pytest.raises(PredictorError, match=r"has inputs \['distance_m'\] and outputs"):
+        Predictor.load(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": "other"}, "format = 'other', but this version reads"),
+        ({"features": ["unobserved_distance_m", "distance_m", "gain_db"]}, "features = ['unobserved_distance_m'"),
+        ({"link_states": {"LOS": 0}}, "link_states = {'LOS': 0}"),
+        ({"outputs": {}}, "outputs = {}"),
+        ({"sha256": "0" * 64}, f"but its card says '{'0' * 64}'"),
+        ({"sha256": None}, "names no sha256"),
+        ({"settings": {"steps": 0}}, "is damaged (SettingsError"),
+        ({"settings": {"tricks": 1}}, "is damaged (TypeError"),
+        ({"settings": None}, "is damaged (TypeError"),
+        ({"homes": 7}, "is damaged (TypeError"),
+        ({"links": {"LOS given LOS": "many"}}, "is damaged (ValueError"),
+        ({"links": []}, "is damaged (AttributeError"),
+        ({"metrics": 1}, "is damaged (TypeError"),
+    ],
+    ids=str,
+)
+def test_bad_card(saved, change, message):
+    path = saved.with_suffix(".json")
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        Predictor.load(saved)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "\xff"])
+def test_card_that_is_no_json(saved, text):
+    saved.with_suffix(".json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(PredictorError, match=r"mine\.json' is not JSON"):
+        Predictor.load(saved)
+
+
+def test_card_that_is_no_object(saved):
+    saved.with_suffix(".json").write_text("[]")
+    with pytest.raises(PredictorError, match="format = None, but this version reads"):
+        Predictor.load(saved)
+
+
+@pytest.mark.parametrize("name", ["mine.h5", "paper.pkl", "default"])
+def test_other_suffix(quick, tmp_path, name):
+    message = f"{name}' is no predictor: give the path of a .keras file"
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        Predictor.load(tmp_path / name)
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        quick.save(tmp_path / name)
+    assert not any(tmp_path.iterdir())
+
+
+def test_unwritable_folder_leaves_nothing(quick, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match="could not be written"):
+        quick.save(tmp_path / "file" / "mine.keras")
+    (tmp_path / "mine.keras").mkdir()
+    with pytest.raises(OutputError, match="could not be written"):
+        quick.save(tmp_path / "mine.keras")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine.keras"]
