@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
+from sionna_partial.scene import build_scene
 
 DEPTH = 6
 TILE = 100
@@ -52,13 +53,15 @@ def compare(home: str, stage: str, spacing_m: float, sample_size: int) -> None:
     grid = in_process(trace_stock, folder, tx, rx, len(rx), 100_000, 10_000_000)
     tiles = in_process(trace_stock, folder, tx, rx[sample], TILE, 1_000_000, 30_000_000)
     truth = {number: tiles["delays"].get(k, []) for k, number in enumerate(sample)}
-    print(f"\n{home}/{stage}: {ours['walls']} walls, {len(rx)} receivers, depth {DEPTH}; truth on {len(sample)} receivers")
+    print(
+        f"\n{home}/{stage}: {ours['walls']} walls, {len(rx)} receivers, depth {DEPTH}; truth on {len(sample)} receivers"
+    )
     print(f"{'':24}{'time [s]':>10}{'memory [GB]':>13}{'recall':>9}{'state':>8}{'gain':>8}")
     for name, result in (("stock, full grid", grid), ("ours, first call", ours), ("ours, warm", ours)):
         seconds = result["cold_s"] if name == "ours, first call" else result["warm_s"]
         state, gain = agreement(result, tiles, sample)
-        row = f"{seconds:>10.2f}{result['memory_gb']:>13.2f}{recall(result['delays'], truth):>9.4f}{state:>8.3f}{gain:>8.3f}"
-        print(f"{name:24}{row}")
+        found = recall(result["delays"], truth)
+        print(f"{name:24}{seconds:>10.2f}{result['memory_gb']:>13.2f}{found:>9.4f}{state:>8.3f}{gain:>8.3f}")
     per_grid = tiles["warm_s"] * len(rx) / len(sample)
     print(f"{'stock, tiles (scaled)':24}{per_grid:>10.2f}{tiles['memory_gb']:>13.2f}{1:>9}{1:>8}{1:>8}")
     print(f"ours is {grid['warm_s'] / ours['warm_s']:.0f} times faster than the stock full grid")
@@ -90,7 +93,7 @@ def trace_ours(folder: str, tx: list[float], rx: NDArray[np.float64], diffractio
     return {
         "cold_s": seconds[0],
         "warm_s": float(np.median(seconds[1:])),
-        "walls": len(sp.build_scene(partial).segments),
+        "walls": len(build_scene(partial).segments),
         "delays": group(links.path_rx, links.delay_s),
         "state": links.link_state,
         "gain": links.gain_db,
@@ -175,7 +178,7 @@ def peak_memory_gb() -> float:
 
 
 def warehouse(aisles: int) -> sp.PartialMap:
-    """A hall of 20 m x 3 m an aisle, with racks of different lengths."""
+    """Make a hall of 20 m x 3 m an aisle, with racks of different lengths."""
     rng = np.random.default_rng(aisles)
     state = np.zeros((60 * aisles + 2, 402), np.uint8)
     state[[0, -1], :] = state[:, [0, -1]] = sp.CellState.WALL

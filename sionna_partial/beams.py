@@ -252,7 +252,7 @@ def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignore[no-untyped-def]
-    """Indices of the points between the window of a beam and one piece of its view."""
+    """Find the points between the window of a beam and one piece of its view."""
     x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
     rows = (len(bins) - 1) // columns
     reach = abs(beam[0] - x0) + abs(beam[1] - y0) + edge * (columns + rows) + 1.0
@@ -303,7 +303,7 @@ def _corners(beam, reflected, piece, reach):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _inward_edges(corner):  # type: ignore[no-untyped-def]
-    """Unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
+    """Give unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
     normal, offset = np.zeros((4, 2)), np.full(4, -1.0)
     for k in range(4):
         dx, dy = corner[(k + 1) % 4, 0] - corner[k, 0], corner[(k + 1) % 4, 1] - corner[k, 1]

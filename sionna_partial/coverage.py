@@ -342,7 +342,7 @@ def _provenance(
         "scene_settings": json.dumps(asdict(scene_settings), sort_keys=True),
         "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
         "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
-        "predictor_sha256": "" if model is None else model.sha256,
+        "predictor_sha256": "" if model is None else model.fingerprint,
     }
 
 

@@ -165,7 +165,8 @@ def unobserved_distance_m(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> 
             raise PositionError(f"{name} holds a position that is not finite: give finite numbers in metres.")
     if partial.is_complete:
         return np.zeros(len(rx_m))
-    start, ends = ((points[..., :2] - partial.origin_m) / partial.resolution_m for points in (tx_m, rx_m))
+    cells = ((points[..., :2] - partial.origin_m) / partial.resolution_m for points in (tx_m, rx_m))
+    start, ends = (np.round(places, 6) for places in cells)
     return _unknown_shares(partial.state, start, ends) * _distance_m(tx_m, rx_m)
 
 

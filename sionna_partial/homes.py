@@ -6,7 +6,7 @@ walk. Only at the end is it turned and put onto cells.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -18,7 +18,7 @@ from rasterio.transform import Affine
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
-from shapely import LineString, Polygon, affinity, box
+from shapely import LineString, MultiPolygon, Polygon, affinity, box
 from shapely.ops import split, substring
 
 from sionna_partial.constants import CellState
@@ -46,6 +46,7 @@ _MARGIN_M = 0.3
 _JAMB_M = 0.05
 _CORRIDOR_SHAPE = 25
 _NEAR_M = 0.01
+_GRID_M = 1e-5
 _SLIVER_M = 0.1
 _WALKED_SHARE = 0.97
 _SMALLEST_ROOM_M2 = 1.0
@@ -122,13 +123,13 @@ def _draw(rng: np.random.Generator, kind: _Style) -> tuple[Polygon, shapely.Geom
     rooms = [core for piece in _rooms(rng, outline, style) for core in _cores(piece)]
     rooms, openings = _connected(rng, rooms, style)
     leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < LEAF_SHARE]
-    gaps = shapely.union_all([opening.buffer(0.05, cap_style="flat") for opening in openings])
-    lines = shapely.union_all([room.boundary for room in rooms]).difference(gaps)
+    gaps = _union([opening.buffer(0.05, cap_style="flat") for opening in openings])
+    lines = _union([room.boundary for room in rooms]).difference(gaps, grid_size=_GRID_M)
     walls = lines.buffer(style.wall / 2, cap_style="flat", join_style="mitre")
-    lines, walls = shapely.union_all([lines, *leaves]), shapely.union_all([walls, *shapely.buffer(leaves, _NEAR_M)])
+    lines, walls = _union([lines, *leaves]), _union([walls, *shapely.buffer(leaves, _NEAR_M)])
     things = [thing for room in rooms for thing in _things(rng, room, walls, openings, style)]
-    gaps = shapely.union_all([opening.buffer(style.wall, cap_style="flat") for opening in openings])
-    free = shapely.union_all([*rooms, gaps]).difference(shapely.union_all([walls, *things]))
+    gaps = _union([opening.buffer(style.wall, cap_style="flat") for opening in openings])
+    free = _union([*rooms, gaps]).difference(_union([walls, *things]), grid_size=_GRID_M)
     free = free.buffer(-_SLIVER_M, join_style="mitre").buffer(_SLIVER_M, join_style="mitre")
     walked = _parts(free.buffer(-WALK_M / 2))
     if not walked or walked[0].area < _WALKED_SHARE * sum(part.area for part in walked):
@@ -146,6 +147,11 @@ def _varied(rng: np.random.Generator, style: _Style) -> _Style:
         wall=rng.choice([rng.uniform(0.05, 0.2), rng.uniform(0.2, 0.45)]),
         clutter=rng.choice([0.15, rng.uniform(0.3, 2.5)], p=[0.25, 0.75]),
     )
+
+
+def _union(shapes: Iterable[shapely.Geometry]) -> shapely.Geometry:
+    """Union of shapes on a fine grid, where almost equal corners cannot break it."""
+    return shapely.union_all(list(shapes), grid_size=_GRID_M)
 
 
 def _parts(shape: shapely.Geometry) -> list[Polygon]:
@@ -296,15 +302,15 @@ def _things(
 ) -> Iterator[Polygon]:
     """Furniture and pillars of a room that leave a way through it and to its openings."""
     near = [opening for opening in openings if opening.distance(room) < _NEAR_M]
-    doorsteps = shapely.union_all([opening.buffer(WALK_M, cap_style="flat") for opening in near])
+    doorsteps = _union([opening.buffer(WALK_M, cap_style="flat") for opening in near])
     ways = [opening.buffer(1.5 * WALK_M, cap_style="flat") for opening in near]
-    left = shapely.union_all([room, *ways]).difference(walls)
+    left = MultiPolygon(_parts(_union([room, *ways]).difference(walls, grid_size=_GRID_M)))
     things = [_furniture(rng, room) for _ in range(rng.poisson(style.clutter * room.area / 4) if room.area > 4 else 0)]
     if room.area > 20 and rng.random() < style.pillars:
         things += [_place(rng, room, box(-s, -s, s, s)) for s in rng.uniform(0.12, 0.3, int(room.area / 15))]
     for thing in things:
-        thing = thing.intersection(room).difference(doorsteps)
-        now = left.difference(thing)
+        thing = MultiPolygon(_parts(thing.intersection(room.difference(doorsteps), grid_size=_GRID_M)))
+        now = MultiPolygon(_parts(left.difference(thing, grid_size=_GRID_M)))
         walkable = now.buffer(-WALK_M / 2)
         if walkable.geom_type == "Polygon" and not walkable.is_empty:
             left = now
@@ -325,7 +331,7 @@ def _furniture(rng: np.random.Generator, room: Polygon) -> Polygon:
         thing = affinity.scale(shapely.Point(0, 0).buffer(1.0), half_width, half_depth)
     if rng.random() < 0.5:
         spots = [thing.exterior.interpolate(where, normalized=True) for where in rng.random(rng.integers(2, 6))]
-        thing = shapely.union_all([thing, *(spot.buffer(rng.uniform(0.12, 0.3), quad_segs=2) for spot in spots)])
+        thing = _union([thing, *(spot.buffer(rng.uniform(0.12, 0.3), quad_segs=2) for spot in spots)])
     if rng.random() < 0.35:
         return _place(rng, room, affinity.rotate(thing, rng.choice([0, 90, rng.uniform(0, 180)], p=[0.4, 0.4, 0.2])))
     along = rng.uniform(0, room.exterior.length)

@@ -71,7 +71,7 @@ def grow(array, size):  # type: ignore[no-untyped-def]
     """Return the array, enlarged to hold `size` rows if it does not."""
     if size <= array.shape[0]:
         return array
-    larger = np.empty((max(size, 2 * array.shape[0]),) + array.shape[1:], array.dtype)
+    larger = np.empty((max(size, 2 * array.shape[0]),) + array.shape[1:], array.dtype)  # noqa: RUF005 (numba)
     larger[: array.shape[0]] = array
     return larger
 
@@ -108,7 +108,7 @@ def _split_at_crossings(walls):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _line_ids(walls):  # type: ignore[no-untyped-def]
-    """Number the infinite lines that the segments lie on; collinear segments share one."""
+    """Give numbers to the infinite lines that the segments lie on; collinear segments share one."""
     count = walls.shape[0]
     line = np.full(count, -1, np.int32)
     used = 0

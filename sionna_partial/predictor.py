@@ -143,8 +143,6 @@ class Predictor:
         """SHA-256 of the `.keras` file, in hexadecimal."""
         return digest(self.archive)
 
-    sha256 = fingerprint
-
     @classmethod
     def fit(
         cls,

@@ -193,10 +193,12 @@ class SceneSolver:
             primitive[surface == EDGE] = wedges.prim0.numpy()
             kind[surface == EDGE] = InteractionType.DIFFRACTION
             buffer._diffracting_wedges = wedges
+        float_tensor: Any = mi.TensorXf
+        integer_tensor: Any = mi.TensorXu
         x, y, z = np.moveaxis(candidates.vertices_m.astype(np.float32), 2, 0)
-        buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (mi.TensorXf(v.copy()) for v in (x, y, z))
-        buffer._shapes, buffer._primitives = mi.TensorXu(self._shapes(surface)), mi.TensorXu(primitive)
-        buffer._interaction_types = mi.TensorXu(kind)
+        buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (float_tensor(v.copy()) for v in (x, y, z))
+        buffer._shapes, buffer._primitives = integer_tensor(self._shapes(surface)), integer_tensor(primitive)
+        buffer._interaction_types = integer_tensor(kind)
         buffer._tgt_indices = mi.UInt(candidates.rx.astype(np.uint32))
         buffer._paths_counter = mi.UInt(count)
         buffer.shrink()

@@ -90,7 +90,7 @@ class FakePredictor:
     """Answers with numbers that a test can compute: a tenth of the probability leaks for each unknown metre."""
 
     name = "fake"
-    sha256 = "0" * 64
+    fingerprint = "0" * 64
     settings = PredictorSettings()
 
     @classmethod

@@ -60,7 +60,7 @@ def _exists(
     return not any(_blocked(walls, a, b) for a, b in itertools.pairwise(points))
 
 
-def _chains(beams, rx: int) -> set[tuple[int, ...]]:  # noqa: ANN001
+def _chains(beams, rx: int) -> set[tuple[int, ...]]:
     """Wall chains that the beams give for one receiver."""
     found = set()
     for node in beams.pair_node[beams.pair_rx == rx]:
@@ -102,7 +102,7 @@ def test_lists_each_chain_of_lines_once_for_a_receiver_on_the_lattice() -> None:
     assert len(pairs) == len(set(pairs))
 
 
-def _chain_lines(beams, node: int) -> tuple[int, ...]:  # noqa: ANN001
+def _chain_lines(beams, node: int) -> tuple[int, ...]:
     chain: list[int] = []
     while beams.parent[node] >= 0:
         chain.insert(0, min(int(beams.segment[node]), 4))

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SettingsError
@@ -78,7 +79,7 @@ def test_one_step_sees_a_quarter_of_a_disc():
     for seed in range(5):
         (partial,) = explore(hall, (1,), seed)
         rows, columns = np.nonzero(partial.state == CellState.FREE)
-        spread_m = math.hypot(np.ptp(rows), np.ptp(columns)) * 0.05
+        spread_m = pdist(np.stack([rows, columns], axis=1)).max() * 0.05
         assert spread_m <= math.sqrt(2) * (CAMERA_RANGE_M + FORWARD_M) + 0.2
         assert len(rows) * 0.05**2 <= math.pi / 4 * CAMERA_RANGE_M**2 * 1.4
 

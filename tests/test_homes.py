@@ -1,3 +1,6 @@
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -6,10 +9,13 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError
+from sionna_partial.explore import explore
 from sionna_partial.homes import DOOR_M, STYLES, make_home
+from sionna_partial.map_files import load_map
 from sionna_partial.partial_map import PartialMap
 
 SEEDS = range(12)
+SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
 
 def free_area_m2(home: PartialMap) -> float:
@@ -39,7 +45,7 @@ def test_a_wide_body_gets_nearly_everywhere(seed):
     labels, _ = ndimage.label(clearance_m >= 0.2)
     body = labels == np.argmax(np.bincount(labels[labels > 0]))
     reached = ndimage.distance_transform_edt(~body) * home.resolution_m <= 0.45
-    assert (reached & free).sum() >= 0.97 * free.sum()
+    assert (reached & free).sum() >= 0.95 * free.sum()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -70,14 +76,12 @@ def test_kinds_differ_in_size_and_none_draws_one():
     assert np.std([free_area_m2(make_home(seed)) for seed in SEEDS]) > 20
 
 
-def test_homes_are_turned_and_straight():
-    """Walls run along the grid in some homes and across it in others."""
+def test_some_homes_are_turned_and_some_are_not():
     straight = []
     for seed in range(20):
         free = make_home(seed, "apartment").state == CellState.FREE
-        edge = free[1:] != free[:-1]
-        runs = (edge[:, 1:] & edge[:, :-1]).sum() / edge.sum()
-        straight.append(runs > 0.9)
+        upright = (free[:, 1:] != free[:, :-1]).sum(axis=0)
+        straight.append(upright.max() > 0.6 * free.any(axis=1).sum())
     assert 0.05 < np.mean(straight) < 0.7
 
 
@@ -87,6 +91,16 @@ def test_resolution_keeps_the_plan():
     assert free_area_m2(coarse) == pytest.approx(free_area_m2(fine), rel=0.1)
 
 
+@pytest.mark.parametrize("name", ["apartment", "house", "office"])
+def test_shipped_homes_are_what_their_seeds_make(name):
+    recipe = json.loads((SCENES / "homes.json").read_text())[name]
+    home = make_home(recipe["seed"], recipe["kind"])
+    assert load_map(SCENES / name / "complete") == home
+    stages = explore(home, seed=recipe["exploration_seed"])
+    assert [load_map(SCENES / name / f"step{steps:03d}") for steps in (50, 100, 150, 200)] == stages
+    assert stages[0].state_at(np.array(recipe["transmitter"])) == CellState.FREE
+
+
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "0", None])
 def test_seed_must_be_a_whole_number(seed):
     with pytest.raises(SettingsError, match=r"seed = .* is not allowed: give a whole number of 0 or more\."):
@@ -94,9 +108,7 @@ def test_seed_must_be_a_whole_number(seed):
 
 
 def test_kind_must_be_known():
-    with pytest.raises(
-        SettingsError, match=r"kind = 'castle' is not allowed: choose one of \('apartment', 'house', 'off"
-    ):
+    with pytest.raises(SettingsError, match=r"kind = 'castle' is not allowed: choose one of \('apartment', 'house'"):
         make_home(0, "castle")
 
 

@@ -192,7 +192,7 @@ def test_moving_the_map_changes_nothing() -> None:
     here = _room()
     shift = np.array([512_345.7, 4_512_345.1, 0.0])
     there = PartialMap(here.state, here.resolution_m, tuple(shift[:2]))
-    tx, rx = np.array([1.07, 2.93, 1.5]), _grid(here, 0.5) + [0.013, 0.017, 0.0]
+    tx, rx = np.array([1.07, 2.93, 1.5]), _grid(here, 0.5) + np.array([0.013, 0.017, 0.0])
     near, far = trace_links(here, tx, rx), trace_links(there, tx + shift, rx + shift)
     np.testing.assert_array_equal(near.link_state, far.link_state)
     np.testing.assert_allclose(near.gain_db, far.gain_db, atol=1e-3)
@@ -201,7 +201,7 @@ def test_moving_the_map_changes_nothing() -> None:
 
 @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
 def test_finds_every_path_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
-    tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::29] + [0.021, 0.013, 0.3]
+    tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::29] + np.array([0.021, 0.013, 0.3])
     links = trace_links(partial, tx, rx)
     scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
     paths = load_sionna().PathSolver(deterministic=True)(
@@ -222,7 +222,7 @@ def test_finds_every_path_that_stock_sionna_finds(partial: PartialMap, tmp_path:
     assert ((links.gain_db > -150) == (gain_db > -150)).all()
 
 
-def _stock_scene(folder: Path, tx: NDArray[np.float64], rx: NDArray[np.float64]):  # noqa: ANN202
+def _stock_scene(folder: Path, tx: NDArray[np.float64], rx: NDArray[np.float64]):
     rt = load_sionna()
     scene = rt.load_scene(str(folder / "scene.xml"))
     scene.frequency = 28e9
@@ -281,7 +281,7 @@ def test_positions_are_checked(tx: object, rx: object, message: str) -> None:
 
 
 def test_frequency_must_suit_the_material() -> None:
-    with pytest.raises(SettingsError, match="frequency_hz = 28000000000.0 .*'wet_ground' is defined for 1-10 GHz"):
+    with pytest.raises(SettingsError, match=r"frequency_hz = 28000000000.0 .*'wet_ground' is defined for 1-10 GHz"):
         trace_links(
             _room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], scene_settings=SceneSettings(Material(itu="wet_ground"))
         )
@@ -349,7 +349,7 @@ def test_diffraction_is_independent_of_the_other_receivers(partial: PartialMap) 
 
 @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
 def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
-    tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::47] + [0.021, 0.013, 0.3]
+    tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::47] + np.array([0.021, 0.013, 0.3])
     links = trace_links(partial, tx, rx, settings=TraceSettings(max_depth=3, diffraction=True))
     scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
     paths = load_sionna().PathSolver(deterministic=True)(
