@@ -20,9 +20,9 @@ from sionna_partial.scene import export_scene
 STEPS = (50, 100, 150, 200)
 
 HOMES: dict[str, dict[str, Any]] = {
-    "apartment": {"kind": "apartment", "seed": 15, "exploration_seed": 1, "transmitter": [5.2, 3.9, 1.5]},
-    "house": {"kind": "house", "seed": 29, "exploration_seed": 1, "transmitter": [7.2, 12.0, 1.5]},
-    "office": {"kind": "office", "seed": 162, "exploration_seed": 0, "transmitter": [7.0, 9.5, 1.5]},
+    "apartment": {"kind": "apartment", "seed": 15, "exploration_seed": 1, "transmitter": [7.4, 4.9, 1.5]},
+    "house": {"kind": "house", "seed": 29, "exploration_seed": 1, "transmitter": [3.5, 6.3, 1.5]},
+    "office": {"kind": "office", "seed": 162, "exploration_seed": 5, "transmitter": [8.4, 9.8, 1.5]},
 }
 """How each home is made, and where a transmitter stands [m] that the robot has passed within 50 steps."""
 
