@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
-from sionna_partial.scene import build_scene
+from sionna_partial.tracing.scene import build_scene
 
 DEPTH = 6
 TILE = 100
@@ -103,7 +103,7 @@ def trace_ours(folder: str, tx: list[float], rx: NDArray[np.float64], diffractio
 
 def trace_stock(folder: str, tx: list[float], rx: NDArray[np.float64], tile: int, rays: int, table: int) -> dict:
     """Time stock `PathSolver` on tiles of receivers."""
-    from sionna_partial.solver import load_sionna
+    from sionna_partial.tracing.solver import load_sionna
 
     rt = load_sionna()
     start = time.perf_counter()

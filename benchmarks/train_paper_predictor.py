@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.explore import explore
-from sionna_partial.features import LinkFeatures, link_features
-from sionna_partial.fitting import PredictorSettings
-from sionna_partial.homes import make_home
-from sionna_partial.networks import free_space_gain_db
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.predictor import SHIPPED_FOLDER, LinkPrediction, Predictor
-from sionna_partial.trace import trace_links
+from sionna_partial.learning.features import LinkFeatures, link_features
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.networks import free_space_gain_db
+from sionna_partial.learning.predictor import SHIPPED_FOLDER, LinkPrediction, Predictor
+from sionna_partial.maps.explore import explore
+from sionna_partial.maps.homes import make_home
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.trace import trace_links
 
 STAGES = (0, 50, 100, 150, 200)
 FIRST_HOME = 10_000

@@ -3,20 +3,19 @@
 The public names load their modules, and the libraries that those need, when they are first used.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sionna_partial.constants import CellState, LinkState
     from sionna_partial.coverage import predict_map
     from sionna_partial.errors import SionnaPartialError
-    from sionna_partial.explore import explore
     from sionna_partial.export import save_coverage
-    from sionna_partial.features import LinkFeatures, link_features
-    from sionna_partial.homes import make_home
-    from sionna_partial.map_files import (
+    from sionna_partial.learning.features import LinkFeatures, link_features
+    from sionna_partial.learning.predictor import LinkPrediction, Predictor
+    from sionna_partial.maps.explore import explore
+    from sionna_partial.maps.homes import make_home
+    from sionna_partial.maps.map_files import (
         load_map,
         map_from_array,
         map_from_habitat,
@@ -24,12 +23,11 @@ if TYPE_CHECKING:
         map_from_slam,
         save_map,
     )
-    from sionna_partial.partial_map import PartialMap
+    from sionna_partial.maps.partial_map import PartialMap
     from sionna_partial.plot import plot_coverage
-    from sionna_partial.predictor import LinkPrediction, Predictor
-    from sionna_partial.scene import export_scene
     from sionna_partial.settings import Material, SceneSettings, TraceSettings
-    from sionna_partial.trace import TracedLinks, trace_links
+    from sionna_partial.tracing.scene import export_scene
+    from sionna_partial.tracing.trace import TracedLinks, trace_links
 
 __version__ = "0.1.0"
 
@@ -37,14 +35,21 @@ _PUBLIC = {
     "constants": ("CellState", "LinkState"),
     "errors": ("SionnaPartialError",),
     "settings": ("Material", "SceneSettings", "TraceSettings"),
-    "partial_map": ("PartialMap",),
-    "map_files": ("load_map", "map_from_array", "map_from_habitat", "map_from_occupancy", "map_from_slam", "save_map"),
-    "homes": ("make_home",),
-    "explore": ("explore",),
-    "scene": ("export_scene",),
-    "trace": ("TracedLinks", "trace_links"),
-    "features": ("LinkFeatures", "link_features"),
-    "predictor": ("LinkPrediction", "Predictor"),
+    "maps.partial_map": ("PartialMap",),
+    "maps.map_files": (
+        "load_map",
+        "map_from_array",
+        "map_from_habitat",
+        "map_from_occupancy",
+        "map_from_slam",
+        "save_map",
+    ),
+    "maps.homes": ("make_home",),
+    "maps.explore": ("explore",),
+    "tracing.scene": ("export_scene",),
+    "tracing.trace": ("TracedLinks", "trace_links"),
+    "learning.features": ("LinkFeatures", "link_features"),
+    "learning.predictor": ("LinkPrediction", "Predictor"),
     "coverage": ("predict_map",),
     "export": ("save_coverage",),
     "plot": ("plot_coverage",),
@@ -79,17 +84,6 @@ __all__ = [
     "save_map",
     "trace_links",
 ]
-
-
-class _Package(ModuleType):
-    """Keeps the import system from putting the module `explore` in the place of the function `explore`."""
-
-    def __setattr__(self, name: str, value: object) -> None:
-        if not (name in _MODULE_OF and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> object:

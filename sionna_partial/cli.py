@@ -113,7 +113,7 @@ def predict(
     suffixes = [_parse_format(name) for name in formats]
     scene_settings = SceneSettings(material=parse_material(material))
     trace_settings = TraceSettings(frequency_hz=frequency, max_depth=max_depth)
-    from sionna_partial.map_files import load_map
+    from sionna_partial.maps.map_files import load_map
 
     partial = load_map(map_path, strict=strict)
     with _progress() as report:
@@ -149,8 +149,8 @@ def export_scene_command(
     """Write a map as a scene folder that stock Sionna RT loads."""
     settings = SceneSettings(material=parse_material(material))
     settings.material.require_frequency(frequency)
-    from sionna_partial.map_files import load_map
-    from sionna_partial.scene import export_scene
+    from sionna_partial.maps.map_files import load_map
+    from sionna_partial.tracing.scene import export_scene
 
     scene = export_scene(load_map(map_path, strict=strict), out, settings, frequency_hz=frequency)
     _print_files([scene])
@@ -164,9 +164,9 @@ def explore(
     seed: Annotated[int, typer.Option(help="Seed of the home and of the robot.")] = 0,
 ) -> None:
     """Explore a home with a robot, and write its partial maps."""
-    from sionna_partial.explore import explore as explore_home
-    from sionna_partial.homes import make_home
-    from sionna_partial.map_files import load_map, save_map
+    from sionna_partial.maps.explore import explore as explore_home
+    from sionna_partial.maps.homes import make_home
+    from sionna_partial.maps.map_files import load_map, save_map
 
     complete = load_map(home) if home else make_home(seed)
     maps = {f"steps_{count:03d}.yaml": partial for count, partial in _by_steps(explore_home, complete, steps, seed)}

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.features import LinkFeatures, link_features
-from sionna_partial.map_files import load_map
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.predictor import LinkPrediction, Predictor
+from sionna_partial.learning.features import LinkFeatures, link_features
+from sionna_partial.learning.predictor import LinkPrediction, Predictor
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number
-from sionna_partial.trace import Progress, trace_links
+from sionna_partial.tracing.trace import Progress, trace_links
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""

@@ -15,12 +15,12 @@ from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SceneError
 from sionna_partial.export import FORMATS, save_coverage
 from sionna_partial.files import atomic_write
-from sionna_partial.map_files import load_map
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.learning.predictor import Predictor
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plot import figure_png, plot_comparison
-from sionna_partial.predictor import Predictor
 from sionna_partial.resources import demo_homes, scenes_folder
-from sionna_partial.trace import Progress
+from sionna_partial.tracing.trace import Progress
 
 TRUTH, NOTHING, PARTIAL = "truth", "nothing observed", "partial map"
 """Titles of the three coverage maps that are compared (paper, Fig. 5)."""

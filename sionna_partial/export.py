@@ -19,8 +19,8 @@ from xarray.backends import H5NetCDFStore
 from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, require_coverage
 from sionna_partial.errors import OutputError
 from sionna_partial.files import atomic_write
+from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 from sionna_partial.plot import figure_png, plot_coverage
-from sionna_partial.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
 """What CSV and GeoTIFF hold; `wall_parts` serves pictures alone."""

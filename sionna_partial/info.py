@@ -10,12 +10,10 @@ from pathlib import Path
 from sionna_partial import __version__
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.llvm import load_llvm
-from sionna_partial.resources import demo_homes
+from sionna_partial.resources import PREDICTORS_FOLDER, demo_homes
 
 LIBRARIES = ("sionna-rt", "mitsuba", "drjit", "tensorflow-cpu", "keras", "numpy")
 """PyPI packages whose versions matter in a report; the others are named where they are missing."""
-
-_PREDICTORS_FOLDER = Path(__file__).resolve().parent / "predictors"
 
 
 @dataclass(frozen=True)
@@ -90,8 +88,8 @@ def _library(name: str) -> Finding:
 
 
 def _predictors() -> Finding:
-    found = ", ".join(sorted(path.stem for path in _PREDICTORS_FOLDER.glob("*.keras")))
-    remedy = "" if found else f"'{_PREDICTORS_FOLDER}' holds none: install sionna-partial again."
+    found = ", ".join(sorted(path.stem for path in PREDICTORS_FOLDER.glob("*.keras")))
+    remedy = "" if found else f"'{PREDICTORS_FOLDER}' holds none: install sionna-partial again."
     return Finding("predictors", found or "none", remedy)
 
 

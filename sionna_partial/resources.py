@@ -11,6 +11,9 @@ HOMES_FILE = "homes.json"
 
 _PACKAGE = Path(__file__).resolve().parent
 
+PREDICTORS_FOLDER = _PACKAGE / "predictors"
+"""Trained predictors that come with the package."""
+
 
 def scenes_folder() -> Path:
     """Folder of the demo scenes: inside the installed package, or at the top of the repository.

@@ -10,12 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
-from sionna_partial.features import LinkFeatures
-from sionna_partial.fitting import PredictorSettings
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.predictor import LinkPrediction
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.predictor import LinkPrediction
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.trace import TracedLinks
+from sionna_partial.tracing.trace import TracedLinks
 
 PICTURE = """
 ????????????

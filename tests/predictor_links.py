@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from sionna_partial.constants import LinkState
-from sionna_partial.features import LinkFeatures
-from sionna_partial.fitting import PredictorSettings
-from sionna_partial.networks import free_space_gain_db
-from sionna_partial.predictor import Predictor
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.networks import free_space_gain_db
+from sionna_partial.learning.predictor import Predictor
 
 QUIET = pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning:keras")
 """Keras converts TensorFlow arrays in a way that NumPy deprecates."""

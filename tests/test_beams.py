@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sionna_partial.beams import trace_beams
-from sionna_partial.candidates import CEILING, FLOOR, specular_candidates
+from sionna_partial.tracing.beams import trace_beams
+from sionna_partial.tracing.candidates import CEILING, FLOOR, specular_candidates
 
 ROOM = np.array(
     [[(0, 0), (6, 0)], [(6, 0), (6, 4)], [(6, 4), (0, 4)], [(0, 4), (0, 0)], [(3, 0), (3, 1.5)], [(3, 2.5), (3, 4)]],

@@ -18,8 +18,8 @@ from typer.testing import CliRunner, Result
 from sionna_partial import __version__, cli, info
 from sionna_partial.errors import BackendError, MapError, OutputError
 from sionna_partial.info import Finding
-from sionna_partial.map_files import load_map, save_map
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.map_files import load_map, save_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 
 
@@ -210,7 +210,7 @@ class TestPredict:
 
     def test_strict(self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         read: list[Any] = []
-        monkeypatch.setattr("sionna_partial.map_files.load_map", lambda path, strict: read.append((path, strict)))
+        monkeypatch.setattr("sionna_partial.maps.map_files.load_map", lambda path, strict: read.append((path, strict)))
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path, "--strict")
         assert read == [(tmp_path, False), (tmp_path, True)]
@@ -219,13 +219,13 @@ class TestPredict:
         self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap
     ) -> None:
         def read(path: Path, strict: bool) -> PartialMap:
-            logging.getLogger("sionna_partial.map_turn").warning("origin yaw %g rad", 0.5)
+            logging.getLogger("sionna_partial.maps.map_turn").warning("origin yaw %g rad", 0.5)
             with warnings.catch_warnings():
                 warnings.simplefilter("always")
                 warnings.warn("many cells of shade 205", UserWarning, stacklevel=1)
             return room
 
-        monkeypatch.setattr("sionna_partial.map_files.load_map", read)
+        monkeypatch.setattr("sionna_partial.maps.map_files.load_map", read)
         result = run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
         assert result.stderr.splitlines()[:2] == ["warning: origin yaw 0.5 rad", "warning: many cells of shade 205"]
 
@@ -261,8 +261,8 @@ class TestExplore:
             asked.append((home, steps, seed))
             return [room] * len(steps)
 
-        monkeypatch.setattr("sionna_partial.homes.make_home", lambda seed: asked.append(seed) or room)
-        monkeypatch.setattr(import_module("sionna_partial.explore"), "explore", explore)
+        monkeypatch.setattr("sionna_partial.maps.homes.make_home", lambda seed: asked.append(seed) or room)
+        monkeypatch.setattr(import_module("sionna_partial.maps.explore"), "explore", explore)
         words = ["--seed", "7", "--steps", "20", "--steps", "100"]
         result = run("explore", "--out", tmp_path / "maps", *words)
         assert result.exit_code == 0, result.output
@@ -273,7 +273,7 @@ class TestExplore:
 
     def test_own_home(self, monkeypatch: pytest.MonkeyPatch, map_path: Path, tmp_path: Path, room: PartialMap) -> None:
         explore = lambda home, steps, seed: [home] * len(steps)  # noqa: E731
-        monkeypatch.setattr(import_module("sionna_partial.explore"), "explore", explore)
+        monkeypatch.setattr(import_module("sionna_partial.maps.explore"), "explore", explore)
         result = run("explore", "--home", map_path, "--out", tmp_path / "maps")
         assert result.exit_code == 0, result.output
         assert load_map(tmp_path / "maps" / "complete.yaml") == room

@@ -12,8 +12,8 @@ from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, WALL_PARTS, predict_map, require_coverage
 from sionna_partial.errors import MapError, PositionError, SettingsError
-from sionna_partial.map_files import save_map
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.map_files import save_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 
 

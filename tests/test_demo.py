@@ -9,8 +9,8 @@ from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table, demo_scene, run_demo
 from sionna_partial.errors import OutputError, SceneError
-from sionna_partial.map_files import save_map
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.map_files import save_map
+from sionna_partial.maps.partial_map import PartialMap
 
 FILES = ["comparison.png", "coverage.csv", "coverage.nc", "coverage.pgm", "coverage.png", "coverage.tif"]
 FILES += ["coverage.yaml", "table.txt"]

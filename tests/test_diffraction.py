@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from test_beams import ROOM, SPLINTERS, _exists
 
-from sionna_partial.candidates import CEILING, EDGE, FLOOR, Candidates
-from sionna_partial.diffraction import Wedges, diffraction_candidates
+from sionna_partial.tracing.candidates import CEILING, EDGE, FLOOR, Candidates
+from sionna_partial.tracing.diffraction import Wedges, diffraction_candidates
 
 TX = np.array([1.07, 1.93, 1.2])
 

@@ -9,10 +9,10 @@ from scipy.spatial.distance import pdist
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.explore import CAMERA_RANGE_M, FORWARD_M, explore
-from sionna_partial.homes import make_home
-from sionna_partial.map_files import load_map
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.explore import CAMERA_RANGE_M, FORWARD_M, explore
+from sionna_partial.maps.homes import make_home
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
 
 GIBSON = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson"
 

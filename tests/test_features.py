@@ -9,10 +9,10 @@ from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import PositionError, PredictorError
-from sionna_partial.features import LinkFeatures, link_features, unobserved_distance_m
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.learning.features import LinkFeatures, link_features, unobserved_distance_m
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.trace import TracedLinks
+from sionna_partial.tracing.trace import TracedLinks
 
 SYMBOLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
 

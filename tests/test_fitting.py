@@ -19,10 +19,10 @@ from predictor_links import (
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.features import LinkFeatures
-from sionna_partial.fitting import PredictorSettings
-from sionna_partial.networks import free_space_gain_db
-from sionna_partial.predictor import Predictor
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.networks import free_space_gain_db
+from sionna_partial.learning.predictor import Predictor
 
 pytestmark = QUIET
 

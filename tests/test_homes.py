@@ -9,10 +9,10 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError
-from sionna_partial.explore import explore
-from sionna_partial.homes import DOOR_M, STYLES, make_home
-from sionna_partial.map_files import load_map
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.explore import explore
+from sionna_partial.maps.homes import DOOR_M, STYLES, make_home
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
 
 SEEDS = range(12)
 SCENES = Path(__file__).resolve().parents[1] / "scenes"

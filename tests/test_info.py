@@ -15,7 +15,7 @@ from sionna_partial.llvm import LlvmLibrary
 @pytest.fixture(autouse=True)
 def _sound_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     (tmp_path / "paper.keras").touch()
-    monkeypatch.setattr(info, "_PREDICTORS_FOLDER", tmp_path)
+    monkeypatch.setattr(info, "PREDICTORS_FOLDER", tmp_path)
     monkeypatch.setattr(info, "load_llvm", lambda: LlvmLibrary(Path("/lib/libLLVM.so.19.1"), "19.1.7", "system"))
     monkeypatch.setattr(info, "demo_homes", lambda: {"flat": {}, "office": {}})
     monkeypatch.setattr(platform, "system", lambda: "Linux")

@@ -15,7 +15,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from sionna_partial import map_files
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.map_files import (
+from sionna_partial.maps.map_files import (
     load_map,
     map_from_array,
     map_from_habitat,
@@ -23,7 +23,7 @@ from sionna_partial.map_files import (
     map_from_slam,
     save_map,
 )
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)

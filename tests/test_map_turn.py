@@ -13,8 +13,8 @@ from scipy.ndimage import label
 from sionna_partial import map_turn
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.map_turn import turn_grid
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.map_turn import turn_grid
+from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 GRID = np.array([[0, 1, 2], [0, 0, 1]], dtype=np.uint8)

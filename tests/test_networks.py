@@ -3,8 +3,8 @@ import pytest
 from predictor_links import FREQUENCY_HZ, LOS, NLOS, QUIET, arrays, assert_valid, make_links, quick_predictor
 
 from sionna_partial.constants import LinkState
-from sionna_partial.features import LinkFeatures
-from sionna_partial.networks import GAIN_NETWORKS, free_space_gain_db
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.networks import GAIN_NETWORKS, free_space_gain_db
 
 pytestmark = QUIET
 

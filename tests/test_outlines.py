@@ -12,8 +12,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from sionna_partial.constants import CellState
-from sionna_partial.outlines import Outlines, wall_outlines
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.walls.outlines import Outlines, wall_outlines
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
@@ -340,7 +340,7 @@ def test_large_warehouse_is_quick_and_few() -> None:
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="reference homes are not here")
 @pytest.mark.parametrize("home", ["Shelbiana", "Kerrtown", "Brevort"])
 def test_real_homes_have_faithful_and_few_outlines(home: str) -> None:
-    from sionna_partial.map_files import load_map
+    from sionna_partial.maps.map_files import load_map
 
     partial = load_map(SHARED / "gibson" / home / "map.yaml")
     outlines = wall_outlines(partial)

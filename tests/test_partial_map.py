@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from sionna_partial import partial_map
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 

@@ -11,7 +11,7 @@ from PIL import Image
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SettingsError
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plot import STATE_COLOURS, figure_png, mix_state_colours, plot_comparison, plot_coverage
 
 LOS, NLOS, OUTAGE = (

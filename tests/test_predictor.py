@@ -7,8 +7,8 @@ from predictor_links import LOS, OUTAGE, QUIET, arrays, assert_valid, make_links
 
 from sionna_partial import predictor as predictor_module
 from sionna_partial.errors import PredictorError
-from sionna_partial.networks import STD_RANGE_DB
-from sionna_partial.predictor import LinkPrediction, Predictor
+from sionna_partial.learning.networks import STD_RANGE_DB
+from sionna_partial.learning.predictor import LinkPrediction, Predictor
 
 pytestmark = QUIET
 

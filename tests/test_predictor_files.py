@@ -8,9 +8,9 @@ import pytest
 from predictor_links import LOS, OUTAGE, QUICK, QUIET, make_links, quick_predictor
 
 from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.networks import FEATURES, import_keras
-from sionna_partial.predictor import Predictor
-from sionna_partial.predictor_files import FORMAT, digest
+from sionna_partial.learning.networks import FEATURES, import_keras
+from sionna_partial.learning.predictor import Predictor
+from sionna_partial.learning.predictor_files import FORMAT, digest
 
 pytestmark = QUIET
 

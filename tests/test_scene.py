@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from sionna_partial.constants import CellState
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.llvm import load_llvm
-from sionna_partial.map_files import load_map
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.scene import FAR_M, build_scene, export_scene, write_scene
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+from sionna_partial.tracing.scene import FAR_M, build_scene, export_scene, write_scene
 
 CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
 ROOM = """
@@ -89,7 +89,7 @@ def test_floor_of_the_whole_map_and_no_floor() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 15), st.integers(1, 15))
 def test_floor_and_its_triangles_cover_the_observed_area_once(seed: int, ny: int, nx: int) -> None:
-    from sionna_partial.scene import _triangles
+    from sionna_partial.tracing.scene import _triangles
 
     state = np.random.default_rng(seed).choice(3, (ny, nx)).astype(np.uint8)
     partial = PartialMap(state, 0.1)

@@ -10,11 +10,11 @@ from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.scene import export_scene
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.solver import load_sionna
-from sionna_partial.trace import TracedLinks, trace_links
+from sionna_partial.tracing.scene import export_scene
+from sionna_partial.tracing.solver import load_sionna
+from sionna_partial.tracing.trace import TracedLinks, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 NO_FLOOR = SceneSettings(floor_extent="none")

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import PositionError, PredictorError
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.trace import TracedLinks
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.trace import TracedLinks
 
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
 

@@ -9,7 +9,7 @@ from scipy.ndimage import affine_transform, binary_dilation
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.partial_map import MAX_CELLS
+from sionna_partial.maps.partial_map import MAX_CELLS
 
 logger = logging.getLogger(__name__)
 

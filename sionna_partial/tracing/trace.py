@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.beams import trace_beams
-from sionna_partial.candidates import Candidates, specular_candidates
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.diffraction import diffraction_candidates
 from sionna_partial.errors import PositionError
-from sionna_partial.map_files import load_map
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.scene import SceneGeometry, build_scene, write_scene
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.solver import SceneSolver, SolvedPaths, join_paths
+from sionna_partial.tracing.beams import trace_beams
+from sionna_partial.tracing.candidates import Candidates, specular_candidates
+from sionna_partial.tracing.diffraction import diffraction_candidates
+from sionna_partial.tracing.scene import SceneGeometry, build_scene, write_scene
+from sionna_partial.tracing.solver import SceneSolver, SolvedPaths, join_paths
 
 Progress = Callable[[float, str], None]
 """Called with the share of the work done, in [0, 1], and what is being done."""

@@ -14,8 +14,8 @@ from scipy.special import log_softmax
 
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.features import LinkFeatures
-from sionna_partial.networks import (
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.networks import (
     GAIN_NETWORKS,
     INDOOR_INPUTS,
     INDOOR_NETWORKS,

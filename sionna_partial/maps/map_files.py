@@ -13,8 +13,8 @@ from scipy.ndimage import binary_dilation
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import SCENE_FILES, atomic_write
-from sionna_partial.partial_map import MAX_CELLS, PartialMap
-from sionna_partial.ros_map import read_ros_map, states_from_percent, write_ros_map
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
 
 ACCEPTED = "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), or an exported scene (folder or scene.xml)"
 """What load_map reads."""

@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import require
 
 FORWARD_M = 0.25

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.candidates import CEILING, EDGE, FLOOR, Candidates
-from sionna_partial.diffraction import Wedges
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.candidates import CEILING, EDGE, FLOOR, Candidates
+from sionna_partial.tracing.diffraction import Wedges
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
 """Mitsuba variant of Sionna RT on a CPU."""

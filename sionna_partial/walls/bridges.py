@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sionna_partial.constants import CellState
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.wall_cells import MAX_FREE_GAP_M, MAX_GAP_CELLS, MIN_RUN_CELLS
-from sionna_partial.wall_chains import WallGraph, step_back
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.walls.cells import MAX_FREE_GAP_M, MAX_GAP_CELLS, MIN_RUN_CELLS
+from sionna_partial.walls.chains import WallGraph, step_back
 
 _LOOK_EDGES = 5
 _AHEAD_COSINE = 0.8

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.wall_bridges import find_bridges
-from sionna_partial.wall_chains import WallGraph
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.walls.bridges import find_bridges
+from sionna_partial.walls.chains import WallGraph
 
 _KEY = 1 << 32
 

@@ -14,11 +14,11 @@ from scipy import ndimage
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
-from sionna_partial.map_files import save_map
-from sionna_partial.outlines import wall_outlines
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.map_files import save_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
-from sionna_partial.wall_cells import row_runs
+from sionna_partial.walls.cells import row_runs
+from sionna_partial.walls.outlines import wall_outlines
 
 FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""

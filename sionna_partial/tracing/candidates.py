@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sionna_partial.beams import Beams
+from sionna_partial.tracing.beams import Beams
 
 FLOOR = -2
 """Surface index of the floor in a candidate."""

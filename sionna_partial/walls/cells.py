@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 
 MAX_GAP_CELLS = 2
 """Longest gap in a wall that is closed [cells]."""

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.features import LinkFeatures, link_numbers, link_states
-from sionna_partial.fitting import PredictorSettings, fit_indoor_networks, fit_networks
-from sionna_partial.networks import (
+from sionna_partial.learning.features import LinkFeatures, link_numbers, link_states
+from sionna_partial.learning.fitting import PredictorSettings, fit_indoor_networks, fit_networks
+from sionna_partial.learning.networks import (
     GAIN_NETWORKS,
     INDOOR_NETWORKS,
     STATE_NETWORKS,
@@ -20,13 +20,11 @@ from sionna_partial.networks import (
     import_keras,
     network_ranges,
 )
-from sionna_partial.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.learning.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.resources import PREDICTORS_FOLDER
 
 if TYPE_CHECKING:
     import keras
-
-SHIPPED_FOLDER = Path(__file__).parent / "predictors"
-"""Predictors that come with the package."""
 
 SHIPPED = ("paper",)
 """Their names; the first is the default."""
@@ -295,7 +293,7 @@ class Predictor:
             If a file is missing, damaged, changed, or of another kind.
         """
         name = SHIPPED[0] if name_or_path is None else name_or_path
-        path = SHIPPED_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
+        path = PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
         model, archive, card = read_files(path)
         try:
             settings = PredictorSettings(**card["settings"])

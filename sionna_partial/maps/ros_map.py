@@ -16,8 +16,8 @@ from PIL import Image
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import atomic_write
-from sionna_partial.map_turn import turn_grid
-from sionna_partial.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.map_turn import turn_grid
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
 
 MODES = ("trinary", "scale", "raw")
 """Ways in which map_server reads an image."""

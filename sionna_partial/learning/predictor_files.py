@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write
-from sionna_partial.networks import FEATURES, OUTPUT_WIDTHS, import_keras
+from sionna_partial.learning.networks import FEATURES, OUTPUT_WIDTHS, import_keras
 
 if TYPE_CHECKING:
     import keras

@@ -7,11 +7,11 @@ import shapely
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
-from sionna_partial.partial_map import PartialMap
-from sionna_partial.wall_cells import wall_cells
-from sionna_partial.wall_chains import Chain, WallGraph, wall_chains
-from sionna_partial.wall_graph import wall_graph
-from sionna_partial.wall_lines import fit_runs
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.walls.cells import wall_cells
+from sionna_partial.walls.chains import Chain, WallGraph, wall_chains
+from sionna_partial.walls.graph import wall_graph
+from sionna_partial.walls.lines import fit_runs
 
 _REACH_CELLS = 1.0
 _OFFSET_CELLS = 0.6

@@ -12,9 +12,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sionna_partial.beams import Beams, trace_beams_in
-from sionna_partial.candidates import CEILING, EDGE, FLOOR, Candidates, merge_heights, unfold
-from sionna_partial.plan import Plan, PointBins, bin_points, grow, prepare_plan
+from sionna_partial.tracing.beams import Beams, trace_beams_in
+from sionna_partial.tracing.candidates import CEILING, EDGE, FLOOR, Candidates, merge_heights, unfold
+from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow, prepare_plan
 
 MAX_REFLECTIONS = 2
 """Largest number of reflections around the diffraction."""

@@ -22,7 +22,7 @@ from shapely import LineString, MultiPolygon, Polygon, affinity, box
 from shapely.ops import split, substring
 
 from sionna_partial.constants import CellState
-from sionna_partial.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import require, require_number
 
 HomeKind = Literal["apartment", "house", "office"]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, LinkState
-from sionna_partial.features import LinkFeatures
+from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.llvm import load_llvm
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sionna_partial.plan import Plan, PointBins, bin_points, grow, prepare_plan
+from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow, prepare_plan
 
 TOLERANCE_M = 1e-4
 """Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that

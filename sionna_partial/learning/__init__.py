@@ -1,0 +1,1 @@
+"""Traced links -> features -> predicted distributions."""

@@ -1,0 +1,1 @@
+"""Floor plans: read, written, made and explored."""

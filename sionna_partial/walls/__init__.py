@@ -1,0 +1,1 @@
+"""Wall cells -> few clean outlines; `outlines` is the way in."""
