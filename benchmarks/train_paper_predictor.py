@@ -24,10 +24,11 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState,
 from sionna_partial.learning.features import LinkFeatures, link_features
 from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.networks import free_space_gain_db
-from sionna_partial.learning.predictor import SHIPPED_FOLDER, LinkPrediction, Predictor
+from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.maps.explore import explore
 from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.tracing.trace import trace_links
 
 STAGES = (0, 50, 100, 150, 200)
@@ -64,13 +65,13 @@ class Links:
 def main() -> None:
     """Make the links, train, measure, print the table, and write the predictor."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--homes", type=int, default=60, help="training homes")
-    parser.add_argument("--held-out", type=int, default=20, help="homes to measure on")
+    parser.add_argument("--homes", type=int, default=100, help="training homes")
+    parser.add_argument("--held-out", type=int, default=40, help="homes to measure on")
     parser.add_argument("--links", type=int, default=400, help="links in a home, traced at each stage")
     parser.add_argument("--steps", type=int, default=PredictorSettings.steps, help="gradient steps of each network")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=SHIPPED_FOLDER / "paper.keras")
+    parser.add_argument("--out", type=Path, default=PREDICTORS_FOLDER / "paper.keras")
     arguments = parser.parse_args()
     first = FIRST_HOME + 1000 * arguments.seed
     seeds = range(first, first + arguments.homes + arguments.held_out)

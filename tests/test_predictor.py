@@ -93,7 +93,7 @@ def test_save_and_load(quick, saved):
 
 
 def test_shipped_names(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(predictor_module, "SHIPPED_FOLDER", tmp_path)
+    monkeypatch.setattr(predictor_module, "PREDICTORS_FOLDER", tmp_path)
     quick.save(tmp_path / "paper.keras")
     assert Predictor.load().name == Predictor.load("paper").name == "paper"
     assert Predictor.load().fingerprint == quick.fingerprint
