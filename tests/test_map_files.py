@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from sionna_partial import map_files
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
+from sionna_partial.maps import map_files
 from sionna_partial.maps.map_files import (
     load_map,
     map_from_array,

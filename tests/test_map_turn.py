@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from scipy.ndimage import label
 
-from sionna_partial import map_turn
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps import map_turn
 from sionna_partial.maps.map_turn import turn_grid
 from sionna_partial.maps.partial_map import PartialMap
 

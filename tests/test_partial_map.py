@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from sionna_partial import partial_map
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
+from sionna_partial.maps import partial_map
 from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from predictor_links import LOS, OUTAGE, QUIET, arrays, assert_valid, make_links, quick_predictor
 
-from sionna_partial import predictor as predictor_module
 from sionna_partial.errors import PredictorError
+from sionna_partial.learning import predictor as predictor_module
 from sionna_partial.learning.networks import STD_RANGE_DB
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
 
