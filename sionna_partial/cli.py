@@ -15,6 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 from sionna_partial import __version__
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.errors import SionnaPartialError
+from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".yaml")
@@ -116,6 +117,7 @@ def predict(
     from sionna_partial.maps.map_files import load_map
 
     partial = load_map(map_path, strict=strict)
+    require_writable(out)
     with _progress() as report:
         report(0.0, "loading the predictor")
         from sionna_partial.coverage import predict_map
@@ -131,11 +133,12 @@ def predict(
             trace_settings=trace_settings,
             progress=lambda share, message: report(0.9 * share, message),
         )
-        files = [out / f"coverage{suffix}" for suffix in suffixes]
-        for index, file in enumerate(files):
-            report(0.9 + 0.1 * index / len(files), f"writing {file.name}")
-            save_coverage(coverage, file)
-    _print_files(files)
+        names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
+        with atomic_files(out) as folder:
+            for index, name in enumerate(names):
+                report(0.9 + 0.1 * index / len(names), f"writing {name}")
+                save_coverage(coverage, folder / name)
+    _print_files([out / name for name in names])
 
 
 @app.command("export-scene")
@@ -181,6 +184,7 @@ def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-output"),
 ) -> None:
     """Predict a half-explored home, and compare with the truth."""
+    require_writable(out)
     with _progress() as report:
         report(0.0, "loading the predictor")
         from sionna_partial.demo import run_demo
@@ -213,6 +217,9 @@ def join_numbers(args: Sequence[str], option: str) -> list[str]:
     rest = list(args)
     while rest:
         arg = rest.pop(0)
+        if arg.startswith(f"{option}="):
+            rest.insert(0, arg.removeprefix(f"{option}="))
+            arg = option
         if arg == option:
             words = list(itertools.takewhile(_is_number, rest)) or rest[:1]
             del rest[: len(words)]
@@ -279,9 +286,14 @@ def _progress() -> Iterator[Callable[[float, str], None]]:
         TextColumn("{task.percentage:3.0f} %"),
         TimeElapsedColumn(),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task("starting", total=1.0)
-        yield lambda share, message: bar.update(task, completed=share, description=message)
+        try:
+            yield lambda share, message: bar.update(task, completed=share, description=message)
+        except BaseException:
+            bar.live.transient, console.quiet = True, not console.is_terminal  # the error that follows stands alone
+            raise
         bar.update(task, completed=1.0, description="done")
 
 

@@ -21,7 +21,7 @@ from sionna_partial.learning.features import LinkFeatures, link_features
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number
+from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
 from sionna_partial.tracing.trace import Progress, trace_links
 
 MAX_RECEIVERS = 2_000_000
@@ -147,7 +147,8 @@ def predict_map(
         If LLVM or Sionna RT cannot be used.
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    trace_settings, scene_settings = trace_settings or TraceSettings(), scene_settings or SceneSettings()
+    trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
+    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
     scene_settings.material.require_frequency(trace_settings.frequency_hz)
     tx_m = _transmitter(partial, tx)
     receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
@@ -231,15 +232,25 @@ def _receivers(
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     nearest_m = max(MIN_LEG_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4 * math.pi))
     cell_state = partial.state_at(points)
-    valid = (cell_state != CellState.WALL) & (np.linalg.norm(points - tx_m, axis=-1) >= nearest_m)
+    far = np.linalg.norm(points - tx_m, axis=-1) >= nearest_m
+    valid = far & (cell_state != CellState.WALL)
     for corner in itertools.product((-MIN_LEG_M, MIN_LEG_M), repeat=2):
         valid &= partial.state_at(points[..., :2] + corner) != CellState.WALL
     if not valid.any():
-        raise PositionError(
-            f"none of the {valid.size} receivers can stand: all are inside walls or at the transmitter; "
-            f"spacing_m = {spacing_m:g}, give a smaller one."
-        )
+        raise _no_receiver(spacing_m, frequency_hz, nearest_m, near=not far.any())
     return _Receivers(x_m, y_m, cell_state, valid, points[valid])
+
+
+def _no_receiver(spacing_m: float, frequency_hz: float, nearest_m: float, *, near: bool) -> PositionError:
+    if near and nearest_m > MIN_LEG_M:
+        return PositionError(
+            f"every receiver is within {nearest_m:.3g} m of the transmitter, where Friis' formula does not hold at "
+            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
+        )
+    return PositionError(
+        "no receiver can stand anywhere, all are inside walls or at the transmitter: "
+        f"spacing_m = {spacing_m:g}, give a smaller one."
+    )
 
 
 def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -14,7 +14,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SceneError
 from sionna_partial.export import FORMATS, save_coverage
-from sionna_partial.files import atomic_write
+from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -171,11 +171,12 @@ def _report_part(report: Progress, start: float, length: float, title: str, shar
 
 
 def _write(coverages: Mapping[str, xr.Dataset], table: str, out: Path) -> dict[str, Path]:
-    files = {name: out / name for name in (*(f"coverage{suffix}" for suffix in FORMATS), "comparison.png", "table.txt")}
-    for suffix in FORMATS:
-        save_coverage(coverages[PARTIAL], files[f"coverage{suffix}"])
-    with atomic_write(files["comparison.png"]) as stream:
-        stream.write(figure_png(plot_comparison(coverages)))
-    with atomic_write(files["table.txt"], "w") as stream:
-        stream.write(table)
-    return files
+    names = (*(f"coverage{suffix}" for suffix in FORMATS), "comparison.png", "table.txt")
+    with atomic_files(out) as folder:
+        for suffix in FORMATS:
+            save_coverage(coverages[PARTIAL], folder / f"coverage{suffix}")
+        with atomic_write(folder / "comparison.png") as stream:
+            stream.write(figure_png(plot_comparison(coverages)))
+        with atomic_write(folder / "table.txt", "w") as stream:
+            stream.write(table)
+    return {name: out / name for name in names}

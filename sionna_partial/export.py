@@ -18,7 +18,7 @@ from xarray.backends import H5NetCDFStore
 
 from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, require_coverage
 from sionna_partial.errors import OutputError
-from sionna_partial.files import atomic_write
+from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 from sionna_partial.plot import figure_png, plot_coverage
 
@@ -57,7 +57,7 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
         For another suffix, or if writing fails; nothing half written is left behind.
     """
     require_coverage(coverage)
-    target = Path(path)
+    target = output_path(path)
     suffix = target.suffix.lower()
     if suffix not in _WRITERS:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(_WRITERS)}.")

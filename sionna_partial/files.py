@@ -4,6 +4,7 @@ import errno
 import os
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -23,8 +24,16 @@ _REMEDIES = {
     errno.ENOTDIR: "a part of the path is a file; choose another folder.",
     errno.EEXIST: "a part of the path is a file; choose another folder.",
     errno.EISDIR: "this path is a folder; give the name of a file.",
+    errno.ENOENT: "nothing can be made there; choose another folder.",
     errno.ENAMETOOLONG: "choose a shorter name.",
 }
+
+
+def output_path(path: object) -> Path:
+    """Return a path to write to, or raise an OutputError if it is none."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in os.fspath(path):
+        raise OutputError(f"path = {path!r} is not a path: give the name of a file or folder.")
+    return Path(path)
 
 
 @contextmanager
@@ -49,7 +58,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     OutputError
         If writing fails; `path` is then as it was before.
     """
-    target = Path(path)
+    target = output_path(path)
     with _workplace(target, target.parent) as place:
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
@@ -107,7 +116,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     OutputError
         If writing fails, or if `path` is a file or a folder with other content; `path` is then as it was before.
     """
-    target = Path(path)
+    target = output_path(path)
     with _workplace(target, target.parent, inside=True) as place:
         folder = place / "new"
         folder.mkdir()
@@ -119,6 +128,86 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
             _swap_entries(folder, target, place / "old")
         else:
             os.replace(folder, target)
+
+
+@contextmanager
+def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Open a folder whose files appear in the folder `path` together, when all have been written completely.
+
+    Files of the same names are replaced, others are kept. If one cannot be replaced, all are put back.
+
+    Parameters
+    ----------
+    path : path-like
+        The folder where the files shall be. It need not be there.
+
+    Yields
+    ------
+    pathlib.Path
+        The folder to write into.
+
+    Raises
+    ------
+    OutputError
+        If writing fails; `path` is then as it was before.
+    """
+    target = output_path(path)
+    with _workplace(target, target) as place:
+        folder = place / "new"
+        folder.mkdir()
+        yield folder
+        for file in folder.iterdir():
+            if (target / file.name).is_dir():
+                raise _output_error(target / file.name, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
+        _swap_entries(folder, target, place / "old")
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Open a folder for files that libraries exchange, and remove it in the end.
+
+    Yields
+    ------
+    pathlib.Path
+
+    Raises
+    ------
+    OutputError
+        If the disk of temporary files is full or cannot be written.
+    """
+    try:
+        with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
+            yield Path(folder)
+    except OSError as error:
+        cause = error.__cause__ if isinstance(error, OutputError) else error
+        if not isinstance(cause, OSError) or cause.errno not in _REMEDIES:
+            raise
+        raise OutputError(
+            f"no temporary file could be written ({cause.strerror}): free some space in the folder of temporary "
+            "files, or set TMPDIR to one that you may write to."
+        ) from error
+
+
+def require_writable(folder: str | os.PathLike[str]) -> None:
+    """Find out, before long work, whether files can be made in a folder, and leave nothing behind.
+
+    Parameters
+    ----------
+    folder : path-like
+        It need not be there.
+
+    Raises
+    ------
+    OutputError
+        If none can be made.
+    """
+    target = output_path(folder)
+    with suppress(_TriedError), _workplace(target, target):
+        raise _TriedError
+
+
+class _TriedError(Exception):
+    """Makes a workplace vanish together with the folders that were made for it."""
 
 
 @contextmanager
@@ -136,6 +225,8 @@ def _workplace(target: Path, parent: Path, *, inside: bool = False) -> Iterator[
         yield place
     except BaseException as error:
         _clean(place, made)
+        if isinstance(error, OutputError) and isinstance(error.__cause__, OSError) and str(place) in str(error):
+            raise _output_error(target, error.__cause__) from error  # the user knows no hidden folder
         if isinstance(error, OSError) and not isinstance(error, SionnaPartialError):
             raise _output_error(target, error) from error
         raise

@@ -81,7 +81,7 @@ def plot_coverage(coverage: xr.Dataset) -> Figure:
     """Draw link state, mean gain and its standard deviation.
 
     The link state is shown as the colours of the three states mixed by their probabilities. Walls are black, the area
-    that the map does not know is hatched, the transmitter is a star.
+    that the map does not know is hatched, the transmitter is a star. On a complete map the outside is left blank.
 
     Parameters
     ----------
@@ -222,6 +222,7 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: _Layer, reference: xr.Dataset
     wall = _walls(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
     axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=layer.norm, cmap=layer.cmap)
+    axis.imshow(_shade(_outside(coverage), 1.0, shade=255), extent=extent, origin="lower", interpolation="nearest")
     _hatch_unknown(axis, coverage)
     if reference is not None:
         axis.imshow(_shade(_walls(reference), _UNSEEN_OPACITY), extent=_extent(reference), origin="lower", zorder=3)
@@ -248,10 +249,15 @@ def _walls(coverage: xr.Dataset) -> NDArray[np.bool_]:
     return wall.reshape(bits.shape[0] * fine, bits.shape[1] * fine)
 
 
-def _shade(wall: NDArray[np.bool_], opacity: float) -> NDArray[np.uint8]:
-    """Paint walls black, the rest transparent."""
-    picture = np.zeros((*wall.shape, 4), dtype=np.uint8)
-    picture[..., 3] = np.uint8(255 * opacity) * wall
+def _outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
+    """Where nobody can be: the unknown cells of a complete map."""
+    return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
+
+
+def _shade(where: NDArray[np.bool_], opacity: float, shade: int = 0) -> NDArray[np.uint8]:
+    """Paint some cells in a shade of grey, black by default, and leave the rest transparent."""
+    picture = np.full((*where.shape, 4), shade, dtype=np.uint8)
+    picture[..., 3] = np.uint8(255 * opacity) * where
     return picture
 
 
@@ -269,8 +275,9 @@ def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[
 
 
 def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
-    """Hatch the cells that the map does not know."""
-    unknown = np.pad(~coverage["observed"].to_numpy(), 1, mode="edge").astype(float)
+    """Hatch the cells that the map does not know but a receiver may be in."""
+    hatched = ~coverage["observed"].to_numpy() & ~_outside(coverage)
+    unknown = np.pad(hatched, 1, mode="edge").astype(float)
     if not unknown.any():
         return
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])

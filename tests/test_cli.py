@@ -90,9 +90,9 @@ class TestPredict:
             "scene_settings": SceneSettings(),
             "trace_settings": TraceSettings(),
         }
-        files = [tmp_path / "out" / f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
-        assert calls[1:] == [("coverage", file) for file in files]
-        assert result.stdout.splitlines() == [f"wrote {file}" for file in files]
+        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
+        assert [(coverage, path.name) for coverage, path in calls[1:]] == [("coverage", name) for name in names]
+        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in names]
 
     def test_every_option(self, map_path: Path, calls: list[Any], tmp_path: Path) -> None:
         options = "--rx-height 1 --spacing 0.3 --frequency 60e9 --max-depth 2 --predictor paper --material 4,0.1,0.2"
@@ -199,7 +199,33 @@ class TestPredict:
         monkeypatch.setattr("sionna_partial.export.save_coverage", fail)
         result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path)
         assert result.exit_code == 2
-        assert result.stderr.splitlines()[-1] == f"error: {error}"
+        assert result.stderr == f"error: {error}\n"
+
+    def test_files_are_written_together_or_not_at_all(
+        self, map_path: Path, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    ) -> None:
+        def write_some(_: object, path: Path) -> None:
+            path.write_text("new")
+            if path.suffix == ".csv":
+                raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr("sionna_partial.export.save_coverage", write_some)
+        out = tmp_path / "out"
+        result = run("predict", map_path, "--tx", 1, 1, "--out", out)
+        assert result.exit_code == 2
+        assert result.stderr.startswith(f"error: path = '{out}' could not be written (No space left on device)")
+        assert not out.exists()
+        result = run("predict", map_path, "--tx", 1, 1, "--out", out, "--format", "nc", "--format", "nc")
+        assert result.exit_code == 0
+        assert [path.name for path in out.iterdir()] == ["coverage.nc"]
+        assert result.stdout == f"wrote {out / 'coverage.nc'}\n"
+
+    def test_unwritable_folder_is_named_before_the_work(self, map_path: Path, calls: list[Any], tmp_path: Path) -> None:
+        result = run("predict", map_path, "--tx", 1, 1, "--out", map_path / "out")
+        assert result.exit_code == 2
+        assert result.stderr.startswith(f"error: path = '{map_path / 'out'}' could not be written")
+        assert len(result.stderr.splitlines()) == 1
+        assert not calls
 
     def test_interrupt(self, map_path: Path, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         def interrupt(*_: object, **__: object) -> None:
@@ -331,6 +357,7 @@ class TestHelp:
 def test_join_numbers_leaves_the_rest_alone() -> None:
     args = ["map.yaml", "--tx", "1", "-2", "--out", "-3", "4"]
     assert cli.join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
+    assert cli.join_numbers(["--tx=-1", "2", "--out=x", "3"], "--tx") == ["--tx=-1 2", "--out=x", "3"]
 
 
 def test_parse_material() -> None:

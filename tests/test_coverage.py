@@ -142,8 +142,23 @@ def test_a_map_of_one_cell(fakes):
     partial = unknown_map(1, 1)
     coverage = predict_map(partial, (0.1, 0.1), spacing_m=0.5)
     assert coverage.sizes == {"y": 1, "x": 1}
-    with pytest.raises(PositionError, match=r"none of the 1 receivers can stand.*spacing_m = 0\.5, give a smaller one"):
+    with pytest.raises(PositionError, match=r"no receiver can stand anywhere.*: spacing_m = 0\.5, give a smaller one"):
         predict_map(partial, (0.25, 0.25), spacing_m=0.5)
+
+
+def test_a_frequency_too_low_for_the_map_is_named(no_work):
+    message = r"every receiver is within 23\.9 m of the transmitter.* frequency_hz = 1e\+06: give a higher frequency"
+    with pytest.raises(PositionError, match=message):
+        predict_map(unknown_map(), (1.0, 1.0), trace_settings=TraceSettings(frequency_hz=1e6))
+
+
+@pytest.mark.parametrize("name", ["scene_settings", "trace_settings"])
+def test_settings_of_another_kind_are_named(no_work, name):
+    kind = name.title().replace("_", "")
+    for wrong in (5, {}):
+        message = rf"{name} = {wrong} is not allowed: give {kind}\(\.\.\.\), or None for the default\."
+        with pytest.raises(SettingsError, match=message):
+            predict_map(unknown_map(), (1.0, 1.0), **{name: wrong})
 
 
 def test_no_receiver_stands_at_the_transmitter(fakes):

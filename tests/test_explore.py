@@ -149,9 +149,11 @@ def test_stages_do_not_depend_on_which_are_asked_for():
     assert explore(home, (20, 40, 60), 1)[1:] == explore(home, np.array([40, 60]), 1)
 
 
-@pytest.mark.parametrize("steps", [(), (5, 5), (10, 5), (-1,), (1.5,), (True,), 50, None])
+@pytest.mark.parametrize("steps", [(), (5, 5), (10, 5), (-1,), (1.5,), (True,), 50, None, (10**9,)])
 def test_steps_must_increase(steps):
-    with pytest.raises(SettingsError, match=r"steps = .* is not allowed: give increasing whole numbers of 0 or more"):
+    with pytest.raises(
+        SettingsError, match=r"steps = .* is not allowed: give increasing whole numbers of 0 to 100,000"
+    ):
         explore(plan(CLOSET), steps)
 
 
@@ -159,6 +161,11 @@ def test_steps_must_increase(steps):
 def test_seed_must_be_a_whole_number(seed):
     with pytest.raises(SettingsError, match=r"seed = .* is not allowed: give a whole number of 0 or more\."):
         explore(plan(CLOSET), seed=seed)
+
+
+def test_home_must_be_a_map():
+    with pytest.raises(MapError, match=r"home is of type str: give a PartialMap, such as load_map returns\."):
+        explore("home.yaml")
 
 
 def test_home_must_have_free_cells():

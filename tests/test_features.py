@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.errors import PositionError, PredictorError
+from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.learning.features import LinkFeatures, link_features, unobserved_distance_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -243,3 +243,8 @@ def test_bad_features(change, message):
 def test_nothing_to_concatenate():
     with pytest.raises(PredictorError, match="parts is empty: give at least one LinkFeatures"):
         LinkFeatures.concatenate([])
+
+
+def test_swapped_arguments_are_named():
+    with pytest.raises(MapError, match=r"partial is of type str: give a PartialMap, such as load_map returns\."):
+        link_features("map.yaml", None)

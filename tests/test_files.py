@@ -2,12 +2,20 @@
 
 import errno
 import os
+import re
 from pathlib import Path
 
 import pytest
 
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.files import atomic_folder, atomic_path, atomic_write
+from sionna_partial.files import (
+    atomic_files,
+    atomic_folder,
+    atomic_path,
+    atomic_write,
+    require_writable,
+    temporary_folder,
+)
 
 
 def tree(folder: Path) -> dict[str, bytes | None]:
@@ -218,3 +226,81 @@ def test_failed_swap_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
         write_scene(folder, b"new ")
     assert len(moves) == 1 + 2 * failing
     assert tree(tmp_path) == scene_tree(b"old ")
+
+
+@pytest.mark.parametrize("path", [5, None, b"a.bin", "a\0.bin"])
+def test_what_is_no_path_is_named(tmp_path: Path, path: object) -> None:
+    message = re.escape(f"path = {path!r} is not a path: give the name of a file or folder.")
+    for write in (atomic_path, atomic_write, atomic_folder, atomic_files):
+        with pytest.raises(OutputError, match=message), write(path):  # type: ignore[operator]
+            pytest.fail("must not be entered")
+    with pytest.raises(OutputError, match=message):
+        require_writable(path)  # type: ignore[arg-type]
+
+
+def test_writable_folder_is_left_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(b"old")
+    require_writable(tmp_path)
+    require_writable(tmp_path / "new" / "deep")
+    assert tree(tmp_path) == {"a.bin": b"old"}
+
+
+@pytest.mark.parametrize(
+    ("folder", "message"),
+    [
+        ("a.bin", r"path = '.*a\.bin' could not be written .*: a part of the path is a file"),
+        ("a.bin/deep", "a part of the path is a file; choose another folder"),
+        ("/proc/new", r"path = '/proc/new' could not be written \(No such file.*: nothing can be made there; choose"),
+    ],
+)
+def test_unwritable_folder_is_named(tmp_path: Path, folder: str, message: str) -> None:
+    (tmp_path / "a.bin").write_bytes(b"old")
+    with pytest.raises(OutputError, match=message):
+        require_writable(tmp_path / folder)
+    assert tree(tmp_path) == {"a.bin": b"old"}
+
+
+def test_files_appear_together_and_keep_others(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(b"old")
+    (tmp_path / "other").write_bytes(b"kept")
+    with atomic_files(tmp_path) as folder:
+        for name in ("a.bin", "b.bin"):
+            (folder / name).write_bytes(b"new")
+        assert (tmp_path / "a.bin").read_bytes() == b"old"
+    assert tree(tmp_path) == {"a.bin": b"new", "b.bin": b"new", "other": b"kept"}
+    with atomic_files(tmp_path / "new" / "deep") as folder:
+        (folder / "c.bin").write_bytes(b"new")
+    assert (tmp_path / "new" / "deep" / "c.bin").read_bytes() == b"new"
+
+
+def test_failed_files_leave_what_was(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(b"old")
+    for target in (tmp_path, tmp_path / "new" / "deep"):
+        message = re.escape(f"path = '{target}' could not be written (No space left on device): the disk is full")
+        with pytest.raises(OutputError, match=message), atomic_files(target) as folder:  # noqa: PT012
+            (folder / "a.bin").write_bytes(b"new")
+            with atomic_write(folder / "b.bin"):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert tree(tmp_path) == {"a.bin": b"old"}
+
+
+def test_folder_in_the_way_of_a_file_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").mkdir()
+    message = re.escape(f"path = '{tmp_path / 'a.bin'}' could not be written (Is a directory): this path is a folder")
+    with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
+        (folder / "a.bin").write_bytes(b"new")
+    assert tree(tmp_path) == {"a.bin": None}
+
+
+def test_full_temporary_folder_is_named() -> None:
+    message = r"no temporary file could be written \(No space left on device\): free some space .* or set TMPDIR"
+    with pytest.raises(OutputError, match=message), temporary_folder() as folder:
+        Path("/dev/full").write_bytes(b"some")
+    assert not folder.exists()
+    with pytest.raises(OutputError, match=message), temporary_folder() as folder, atomic_write(folder / "a"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_other_errors_pass_through_a_temporary_folder() -> None:
+    with pytest.raises(ConnectionResetError), temporary_folder():
+        raise ConnectionResetError(errno.ECONNRESET, "reset")

@@ -63,6 +63,12 @@ def test_npz_wall_height_can_be_given(tmp_path: Path) -> None:
     assert load_map(tmp_path / "home.npz", wall_height_m=4.0).wall_height_m == 4.0
 
 
+def test_no_map_is_not_written(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"partial is of type ndarray: give a PartialMap, such as load_map returns\."):
+        save_map(SMALL.state, tmp_path / "home.npz")  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_other_suffix_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"home.pgm' has the suffix '.pgm': choose .yaml, .yml or .npz"):
         save_map(SMALL, tmp_path / "home.pgm")

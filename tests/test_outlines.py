@@ -287,6 +287,53 @@ def test_ragged_rooms_keep_their_regions(thickness: int, share: float) -> None:
     assert len(outlines.segments) < 70 + 900 * share
 
 
+def noisy_plan(thickness: int, share: float, around: float) -> PartialMap:
+    """A hall with three stubs; `share` of its face cells are lost, `around` of the cells beside are walls."""
+    rng = np.random.default_rng(0)
+    wall = np.zeros((360, 560), dtype=bool)
+    wall[:, :thickness] = wall[:, -thickness:] = wall[:thickness] = wall[-thickness:] = True
+    wall[:180, 280 : 280 + thickness] = wall[240:, 280 : 280 + thickness] = wall[180 : 180 + thickness, :100] = True
+    wall = np.pad(wall, 20)
+    lost = wall & ~ndimage.binary_erosion(wall) & (rng.random(wall.shape) < share)
+    more = ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < around)
+    state = np.pad(np.full((360, 560), CellState.FREE), 20, constant_values=CellState.UNKNOWN)
+    state[wall] = CellState.FREE
+    return PartialMap(np.where((wall & ~lost) | more, CellState.WALL, state).astype(np.uint8), 0.05)
+
+
+@pytest.mark.parametrize(
+    ("thickness", "share", "around", "most"),
+    [
+        (1, 0.0, 0.3, 20),
+        (2, 0.0, 0.3, 260),
+        (4, 0.0, 0.0, 20),
+        (4, 0.05, 0.05, 24),
+        (4, 0.15, 0.15, 110),
+        (4, 0.3, 0.3, 320),
+    ],
+)
+def test_noisy_walls_have_few_segments(thickness: int, share: float, around: float, most: int) -> None:
+    partial = noisy_plan(thickness, share, around)
+    outlines = wall_outlines(partial)
+    assert_sound(outlines)
+    assert 8 <= len(outlines.segments) <= most
+    by_wall, by_line = regions(partial, outlines, scale=3)
+    assert len(set(zip(by_wall.tolist(), by_line.tolist(), strict=True))) == len(set(by_wall.tolist()))
+    assert farthest_from_walls(partial, outlines) < 1.8
+    assert farthest_from_outlines(partial, outlines) < 2.8
+
+
+def test_niche_of_a_clean_wall_stays() -> None:
+    """One recess is no raggedness: the outline keeps its corners and stays parallel to the axes."""
+    wall = np.zeros((12, 70), dtype=bool)
+    wall[2:7, 5:65] = True
+    wall[5:7, 30:40] = False
+    partial = PartialMap(np.where(wall, CellState.WALL, CellState.FREE).astype(np.uint8), 0.05)
+    pairs = in_cells(partial, wall_outlines(partial))
+    assert len(pairs) == 8
+    assert (np.abs(pairs[:, 0] - pairs[:, 1]).min(axis=1) == 0).all()
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 24), st.integers(1, 24), st.floats(0.05, 0.7), st.sampled_from([0, 2]))
 def test_random_maps_give_sound_outlines(seed: int, ny: int, nx: int, share: float, other: int) -> None:

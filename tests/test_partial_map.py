@@ -63,6 +63,11 @@ def test_equality(other: object) -> None:
     assert other != PLAN
 
 
+def test_ragged_state_is_refused() -> None:
+    with pytest.raises(MapError, match=r"state is not a rectangular array: give a two-dimensional array \(ny, nx\)\."):
+        PartialMap([[0], [0, 1]], 0.1)  # type: ignore[arg-type]
+
+
 # --- cells ------------------------------------------------------------------------------------------------------------
 
 
@@ -241,6 +246,8 @@ def test_positions_may_be_free_or_unknown() -> None:
         ((10.75, -3.25), "tx has shape (2,): give x, y, z in metres, (3,) or (N, 3)"),
         (np.zeros((1, 1, 3)), "tx has shape (1, 1, 3): give x, y, z"),
         ("here", "tx = 'here' is not numeric: give x, y, z in metres"),
+        ((10**400, 1.0, 1.5), "is not numeric: give x, y, z in metres"),
+        ((1e308, -3.25, 1.5), "tx = (1e+308, -3.25, 1.5) is outside the map"),
         ([(1, 2, 3), (1, 2)], "is not numeric: give x, y, z in metres"),
         ((np.nan, -3.25, 1.5), "tx = (nan, -3.25, 1.5) is not finite: give finite numbers in metres"),
         ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),

@@ -71,6 +71,13 @@ def test_missing_file(tmp_path):
         Predictor.load(tmp_path / "none.keras")
 
 
+def test_name_that_is_no_path():
+    with pytest.raises(
+        PredictorError, match=r"name_or_path = 3 is not a path: give 'paper'.*, or the path of a \.keras"
+    ):
+        Predictor.load(3)
+
+
 def test_missing_card(saved):
     saved.with_suffix(".json").unlink()
     with pytest.raises(PredictorError, match=r"mine\.json' cannot be read"):

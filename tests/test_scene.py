@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
-from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -237,3 +237,10 @@ def test_far_maps_are_moved_to_the_origin(origin_m: tuple[float, float], tmp_pat
     shift = np.subtract(origin_m, offset)
     np.testing.assert_allclose(mesh(folder, "walls").vertices - [*shift, 0.0], here.vertices, atol=1e-4)
     assert load_map(folder).origin_m == pytest.approx(origin_m)
+
+
+def test_only_maps_and_scene_settings_are_taken() -> None:
+    with pytest.raises(MapError, match="partial is of type ndarray: give a PartialMap"):
+        build_scene(np.zeros((3, 3)))  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match=r"settings = 5 is not allowed: give SceneSettings"):
+        build_scene(PartialMap(np.zeros((3, 3), np.uint8), 0.1), 5)  # type: ignore[arg-type]

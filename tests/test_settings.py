@@ -136,6 +136,12 @@ def test_frequency_outside_the_material(name: str, frequency_hz: float, spans: s
         Material(itu=name).require_frequency(frequency_hz)
 
 
+@pytest.mark.parametrize("frequency_hz", [float("nan"), float("inf"), -1.0, 0.0, 28.0])
+def test_no_frequency_for_any_material(frequency_hz: float) -> None:
+    with pytest.raises(SettingsError, match=r"frequency_hz = .* is not allowed: give a number in \[1e\+06, 1e\+12\]\."):
+        Material().require_frequency(frequency_hz)
+
+
 @given(st.sampled_from(sorted(ITU_BANDS_GHZ)), st.floats(0.001, 1000.0))
 def test_frequency_is_allowed_inside_a_band_alone(name: str, frequency_ghz: float) -> None:
     inside = any(low <= frequency_ghz * 1e9 / 1e9 <= high for low, high in ITU_BANDS_GHZ[name])

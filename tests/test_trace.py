@@ -272,12 +272,19 @@ def test_shot_and_exact_paths_agree_where_both_apply() -> None:
         ((9.0, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = .* is outside the map"),
         ((1.0, 1.0, 1.5), [[1.0, 1.0, 3.0]], r"rx\[0\] = .* is not between floor and ceiling"),
         ([(1.0, 1.0, 1.5)], [[1.0, 1.0, 1.0]], r"tx has shape \(1, 3\): give one transmitter"),
+        ((1.0, 1.0, 1.5), [[1.0, 1.0, 1.0], [1.0]], r"rx = .* is not numeric: give x, y, z in metres\."),
         ((1.0, 1.0, 1.5), (1.0, 1.0, 1.0), r"rx has shape \(3,\): give receivers as \(N, 3\)"),
     ],
 )
 def test_positions_are_checked(tx: object, rx: object, message: str) -> None:
     with pytest.raises(PositionError, match=message):
         trace_links(_room(), tx, rx)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ["settings", "scene_settings"])
+def test_settings_of_another_kind_are_named(name: str) -> None:
+    with pytest.raises(SettingsError, match=rf"^{name} = 5 is not allowed: give \w+Settings\(\.\.\.\), or None"):
+        trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], **{name: 5})  # type: ignore[arg-type]
 
 
 def test_frequency_must_suit_the_material() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import PositionError, PredictorError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.tracing.trace import TracedLinks
 
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
@@ -123,7 +123,13 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     -------
     LinkFeatures
         Of N links.
+
+    Raises
+    ------
+    MapError
+        If `partial` is no PartialMap.
     """
+    require_map("partial", partial)
     return LinkFeatures(
         link_state=links.link_state,
         unobserved_distance_m=unobserved_distance_m(partial, links.tx, links.rx),

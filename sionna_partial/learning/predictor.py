@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -293,6 +294,11 @@ class Predictor:
             If a file is missing, damaged, changed, or of another kind.
         """
         name = SHIPPED[0] if name_or_path is None else name_or_path
+        if not isinstance(name, (str, PathLike)):
+            known = " or ".join(map(repr, SHIPPED))
+            raise PredictorError(
+                f"name_or_path = {name!r} is not a path: give {known}, or the path of a {SUFFIX} file."
+            )
         path = PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
         model, archive, card = read_files(path)
         try:

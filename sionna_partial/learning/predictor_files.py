@@ -7,7 +7,6 @@ classes of Keras that our networks are made of, and is loaded in safe mode.
 import hashlib
 import io
 import json
-import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write
+from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.learning.networks import FEATURES, OUTPUT_WIDTHS, import_keras
 
 if TYPE_CHECKING:
@@ -40,8 +39,8 @@ _FIXED_ENTRIES = {
 
 def pack(model: "keras.Model") -> bytes:
     """Return the bytes of the `.keras` archive of a model, without dates and addresses that differ from run to run."""
-    with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
-        path = Path(folder, f"model{SUFFIX}")
+    with temporary_folder() as folder:
+        path = folder / f"model{SUFFIX}"
         model.save(path)
         packed = io.BytesIO()
         with zipfile.ZipFile(path) as source, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
@@ -184,8 +183,8 @@ def _classes(entry: Any) -> Iterator[str]:
 def _unpack(path: Path, archive: bytes) -> "keras.Model":
     """Load the bytes that were checked: the file may change meanwhile."""
     keras = import_keras()
-    with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
-        copy = Path(folder, f"model{SUFFIX}")
+    with temporary_folder() as folder:
+        copy = folder / f"model{SUFFIX}"
         copy.write_bytes(archive)
         try:
             model = keras.saving.load_model(copy, compile=False, safe_mode=True)

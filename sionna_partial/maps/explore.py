@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.settings import require
 
 FORWARD_M = 0.25
@@ -32,6 +32,9 @@ FIELD_OF_VIEW_DEG = 90
 
 CAMERA_RANGE_M = 3.2
 """Range of the camera [m] (the 64 cells of 0.05 m that Active Neural SLAM's mapper predicts ahead)."""
+
+MAX_STEPS = 100_000
+"""Largest number of actions: many times what a large building takes."""
 
 ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
 """Radii of the robot [m]: it takes the largest with which it gets around in the home."""
@@ -66,7 +69,8 @@ def explore(home: PartialMap, steps: Sequence[int] = (50, 100, 150, 200), seed: 
     home : PartialMap
         What is there to be seen. Its unknown cells stop the robot and its view, and stay unknown.
     steps : sequence of int
-        Numbers of actions [1], increasing, after which the map is returned. After 0 nothing has been seen.
+        Numbers of actions [1], increasing, at most `MAX_STEPS`, after which the map is returned. After 0 nothing has
+        been seen.
     seed : int
         Seed of start and heading, at least 0.
 
@@ -79,11 +83,12 @@ def explore(home: PartialMap, steps: Sequence[int] = (50, 100, 150, 200), seed: 
     Raises
     ------
     MapError
-        If the home has no free cell.
+        If the home has no free cell, or is no PartialMap.
     SettingsError
-        If `steps` are not increasing whole numbers, or `seed` is not a whole number, of 0 or more.
+        If `steps` are not increasing whole numbers of 0 to `MAX_STEPS`, or `seed` is not a whole number of 0 or more.
     """
     _check(steps, seed)
+    require_map("home", home)
     free = np.argwhere(home.state == _FREE)
     if not len(free):
         raise MapError("home has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
@@ -105,7 +110,8 @@ def explore(home: PartialMap, steps: Sequence[int] = (50, 100, 150, 200), seed: 
 def _check(steps: Sequence[int], seed: int) -> None:
     counts = list(steps) if np.iterable(steps) else []
     rising = len(counts) > 0 and all(_whole(count) for count in counts) and bool(np.all(np.diff(counts) > 0))
-    require(rising, "steps", steps, "give increasing whole numbers of 0 or more, such as (50, 100, 150, 200).")
+    remedy = f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200)."
+    require(rising and counts[-1] <= MAX_STEPS, "steps", steps, remedy)
     require(_whole(seed), "seed", seed, "give a whole number of 0 or more.")
 
 

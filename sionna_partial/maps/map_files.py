@@ -12,8 +12,8 @@ from scipy.ndimage import binary_dilation
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.files import SCENE_FILES, atomic_write
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.files import SCENE_FILES, atomic_write, output_path
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, require_map
 from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
 
 ACCEPTED = "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), or an exported scene (folder or scene.xml)"
@@ -85,10 +85,13 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
 
     Raises
     ------
+    MapError
+        If `partial` is no PartialMap.
     OutputError
         For another suffix, or if writing fails; nothing half written is left behind.
     """
-    target = Path(path)
+    require_map("partial", partial)
+    target = output_path(path)
     suffix = target.suffix.lower()
     if suffix in (".yaml", ".yml"):
         write_ros_map(partial, target, extra)

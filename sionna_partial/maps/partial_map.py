@@ -52,9 +52,7 @@ class PartialMap:
     interior_cells: int | None = None
 
     def __post_init__(self) -> None:
-        state = np.asarray(self.state)
-        _check_state(state)
-        state = np.array(state, dtype=np.uint8)
+        state = _checked_state(self.state)
         state.setflags(write=False)
         object.__setattr__(self, "state", state)
         object.__setattr__(self, "resolution_m", _number("resolution_m", self.resolution_m, 1e-3, 10.0))
@@ -176,7 +174,7 @@ class PartialMap:
         """
         try:
             points = np.asarray(points_m, dtype=np.float64)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise PositionError(f"{name} = {points_m!r} is not numeric: give x, y, z in metres.") from error
         if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
             raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
@@ -186,6 +184,7 @@ class PartialMap:
         finite = ~np.any(~np.isfinite(flat), axis=1)
         placed = np.where(finite[:, None], flat, 0.0)
         x, y, z = placed.T
+        state = self.state_at(np.clip(placed[:, :2], (x0, y0), (x1, y1)))
         faults: tuple[tuple[NDArray[np.bool_], str, str], ...] = (
             (~finite, "is not finite", "give finite numbers in metres."),
             (
@@ -198,7 +197,7 @@ class PartialMap:
                 f"is not between floor and ceiling (0 to {height:g} m)",
                 "change its height z or the map's wall_height_m.",
             ),
-            (self.state_at(placed) == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
+            (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
         )
         for fault, what, remedy in faults:
             if fault.any():
@@ -210,7 +209,18 @@ class PartialMap:
         return points
 
 
-def _check_state(state: NDArray[np.generic]) -> None:
+def require_map(name: str, value: object) -> None:
+    """Raise a MapError that names `name` unless `value` is a PartialMap."""
+    if not isinstance(value, PartialMap):
+        raise MapError(f"{name} is of type {type(value).__name__}: give a PartialMap, such as load_map returns.")
+
+
+def _checked_state(values: object) -> NDArray[np.uint8]:
+    """Return cell states as a new array, or raise a MapError."""
+    try:
+        state = np.asarray(values)
+    except ValueError as error:
+        raise MapError("state is not a rectangular array: give a two-dimensional array (ny, nx).") from error
     if state.ndim != 2 or state.size == 0:
         raise MapError(f"state has shape {state.shape}: give a two-dimensional array (ny, nx) with at least one cell.")
     if state.dtype.kind not in "iub":
@@ -224,6 +234,7 @@ def _check_state(state: NDArray[np.generic]) -> None:
         raise MapError(
             f"state has values {state.min()} to {state.max()}: use CellState integers FREE 0, WALL 1, UNKNOWN 2."
         )
+    return np.array(state, dtype=np.uint8)
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:

@@ -22,6 +22,9 @@ TOLERANCE_M = 1e-4
 """Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that
 checks the candidates computes in single precision."""
 
+_FAR_M = 1e6
+"""Length at which beams that hit nothing are cut off [m]. It is fixed, so that no receiver depends on the others."""
+
 _ROOT_ANGLE_RAD = 0.1234567
 """Direction of the first root beam [rad]: no wall of a lattice map is parallel to it."""
 
@@ -255,8 +258,7 @@ def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignor
     """Find the points between the window of a beam and one piece of its view."""
     x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
     rows = (len(bins) - 1) // columns
-    reach = abs(beam[0] - x0) + abs(beam[1] - y0) + edge * (columns + rows) + 1.0
-    corner = _corners(beam, reflected, piece, reach)
+    corner = _corners(beam, reflected, piece)
     normal, offset = _inward_edges(corner)
     found = np.empty(16, np.int32)
     count = 0
@@ -285,15 +287,15 @@ def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignor
 
 
 @njit(cache=True)
-def _corners(beam, reflected, piece, reach):  # type: ignore[no-untyped-def]
-    """Corners (4, 2) of the part of a beam between its window and one piece of its view, cut off beyond `reach`."""
+def _corners(beam, reflected, piece):  # type: ignore[no-untyped-def]
+    """Corners (4, 2) of the part of a beam between its window and one piece of its view, cut off where it is far."""
     sx, sy = beam[0], beam[1]
     corner = np.empty((4, 2))
     for k in range(2):
         t, w = piece[2 * k], piece[2 * k + 1]
         dx = (1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)
         dy = (1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)
-        far = 2.0 * reach / np.hypot(dx, dy)
+        far = _FAR_M / np.hypot(dx, dy)
         r_far = 1.0 / w if w * far > 1.0 else far
         r_near = 1.0 if reflected else 0.0
         corner[k] = (sx + r_near * dx, sy + r_near * dy)

@@ -15,8 +15,8 @@ from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.map_files import save_map
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, settings_or_default
 from sionna_partial.walls.cells import row_runs
 from sionna_partial.walls.outlines import wall_outlines
 
@@ -73,7 +73,8 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     -------
     SceneGeometry
     """
-    settings = settings or SceneSettings()
+    require_map("partial", partial)
+    settings = settings_or_default("settings", settings, SceneSettings)
     outlines = wall_outlines(
         partial, tolerance_cells=settings.outline_tolerance_cells, bridge_gap_m=settings.bridge_gap_m
     )
@@ -124,9 +125,8 @@ def export_scene(
     OutputError
         If writing fails; nothing half written is left behind.
     """
-    settings = settings or SceneSettings()
-    settings.material.require_frequency(frequency_hz)
     geometry = build_scene(partial, settings)
+    geometry.material.require_frequency(frequency_hz)
     far = max(abs(value) for value in partial.bounds_m) > FAR_M
     offset_m = partial.origin_m if far else (0.0, 0.0)
     with atomic_folder(folder) as place:

@@ -63,6 +63,23 @@ def load_sionna() -> ModuleType:
     return sionna.rt
 
 
+class _IncoherentScene:
+    """A Mitsuba scene that traces every ray for itself.
+
+    `ImageMethod` tells Embree that its rays are coherent. Neighbours in a packet then decide whether a wall is hit: one
+    path in 600 was lost, and which ones depended on the other receivers.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        self._scene = scene
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scene, name)
+
+    def ray_intersect(self, ray: Any, **options: Any) -> Any:
+        return self._scene.ray_intersect(ray, **{**options, "coherent": False})
+
+
 class SceneSolver:
     """Solves paths from one transmitter in one exported scene.
 
@@ -225,7 +242,7 @@ class SceneSolver:
         dr.make_opaque(self._tx, targets, *still)
         patterns = self._scene.tx_array.antenna_pattern.patterns
         buffer = self._image_method(
-            scene=self._scene.mi_scene,
+            scene=_IncoherentScene(self._scene.mi_scene),
             paths=buffer,
             src_positions=self._tx,
             tgt_positions=targets,

@@ -1,7 +1,7 @@
 """The one door to the path solver: scene + transmitter + receivers -> TracedLinks."""
 
-import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PositionError
+from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
 from sionna_partial.tracing.beams import trace_beams
 from sionna_partial.tracing.candidates import Candidates, specular_candidates
 from sionna_partial.tracing.diffraction import diffraction_candidates
@@ -109,11 +110,14 @@ def trace_links(
     PositionError
         For a transmitter or receiver that is not finite, outside the map or inside a wall.
     SettingsError
-        For a frequency that the material does not cover.
+        For a frequency that the material does not cover, or settings of another kind.
     BackendError
         If LLVM or Sionna RT cannot be used.
+    OutputError
+        If no temporary file can be written.
     """
-    settings, scene_settings = settings or TraceSettings(), scene_settings or SceneSettings()
+    settings = settings_or_default("settings", settings, TraceSettings)
+    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
     scene_settings.material.require_frequency(settings.frequency_hz)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     tx_m, rx_m = _positions(partial, tx, rx)
@@ -121,8 +125,8 @@ def trace_links(
     report(0.0, "building the scene")
     geometry = build_scene(partial, scene_settings)
     shift = np.array([*geometry.origin_m, 0.0])
-    with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
-        xml = write_scene(geometry, Path(folder), offset_m=geometry.origin_m, frequency_hz=settings.frequency_hz)
+    with temporary_folder() as folder:
+        xml = write_scene(geometry, folder, offset_m=geometry.origin_m, frequency_hz=settings.frequency_hz)
         parts = list(_solve_blocks(geometry, xml, settings, tx_m - shift, rx_m - shift, report))
     paths = join_paths(parts, settings.max_depth)
     paths.vertices_m[:] += shift
@@ -149,7 +153,9 @@ def _positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> tuple[NDArr
     tx_m = partial.require_positions("tx", tx)
     if tx_m.ndim != 1:
         raise PositionError(f"tx has shape {tx_m.shape}: give one transmitter (3,), and call once for each.")
-    rx_m = np.zeros((0, 3)) if np.size(rx) == 0 else partial.require_positions("rx", rx)
+    with suppress(ValueError):  # nested lists of unequal lengths have no size
+        rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
+    rx_m = partial.require_positions("rx", rx)
     if rx_m.ndim != 2:
         raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
     return tx_m, rx_m

@@ -24,6 +24,9 @@ PINHOLE_CELLS = 6
 
 _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
+_BLOB_CELLS = 15
+_NEAR_CELLS = 7
+_CROSS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,8 @@ class CleanWalls:
 def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     """Clean the wall cells of a map.
 
-    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length on walls of two or
-    more cells are levelled; gaps of at most two cells in straight walls are closed (gaps of FREE cells up to
+    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled, on
+    thick walls also tilted ones; gaps of at most two cells in straight walls are closed (gaps of FREE cells up to
     `MAX_FREE_GAP_M`); walls two cells thick are thinned to the cells that face FREE ones. Thin walls, posts and
     specks stay.
 
@@ -66,6 +69,7 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
             _shave_bumps(view)
         for view in _orientations(wall):
             _fill_notches(view)
+    _level_spikes(wall)
     for cells, is_free in ((wall, free), (wall.T, free.T)):
         _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
     return _thin(wall, free)
@@ -92,20 +96,33 @@ def _fill_pinholes(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _fill_notches(wall: NDArray[np.bool_]) -> None:
     """Fill, in place, notches of one or two cells in faces that look towards larger rows."""
+    before = wall.copy()
     row, start, end = row_runs(~wall)
-    keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 2)
+    keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        if wall[i - 2 : i, a - 1 : b + 1].all():
+        if before[i - 1, a - 1 : b + 1].all():
             wall[i, a:b] = True
 
 
 def _shave_bumps(wall: NDArray[np.bool_]) -> None:
     """Remove, in place, bumps of one or two cells from faces that look towards larger rows."""
+    before = wall.copy()
     row, start, end = row_runs(wall)
-    keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 2)
+    keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        if wall[i - 2 : i, a - 1 : b + 1].all() and not wall[i + 1 : i + 2, a - 1 : b + 1].any():
+        if before[i - 1, a - 1 : b + 1].all() and not before[i + 1 : i + 2, a - 1 : b + 1].any():
             wall[i, a:b] = False
+
+
+def _level_spikes(wall: NDArray[np.bool_]) -> None:
+    """Fill, in place, cells that a thick wall has on three sides, and remove those that stick out of one."""
+    beside = ndimage.binary_dilation(_thick(wall))
+    for _ in range(2):
+        sides = ndimage.convolve(wall.astype(np.uint8), _CROSS, mode="constant")
+        wall |= beside & (sides >= 3)
+        padded = np.pad(wall, 1)
+        _peel(padded, np.pad(beside & wall & (sides <= 1), 1))
+        wall[:] = padded[1:-1, 1:-1]
 
 
 def _close_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], resolution_m: float, bridge_gap_m: float) -> None:
@@ -154,13 +171,24 @@ def _run_lengths(wall: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 def _thick(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Cells of walls of three cells or more, also where a tilted one holds no square of three by three."""
-    squares = ndimage.binary_opening(wall, structure=_SQUARE)
+    squares = _consistent(wall, ndimage.binary_opening(wall, structure=_SQUARE))
     crosses = ndimage.binary_opening(wall, structure=ndimage.generate_binary_structure(2, 1))
     label, count = ndimage.label(crosses, structure=_SQUARE)
     solid = np.zeros(count + 1, dtype=bool)
     solid[label[squares]] = True
     solid[0] = False
     return squares | solid[label]
+
+
+def _consistent(wall: NDArray[np.bool_], squares: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Add short thin parts of walls that are mostly thick, and leave out short thick parts of thin walls."""
+    closed = ndimage.minimum_filter(ndimage.maximum_filter(squares, _NEAR_CELLS), _NEAR_CELLS) & wall
+    label, count = ndimage.label(closed, structure=_SQUARE)
+    size, thick = (np.bincount(mask, minlength=count + 1) for mask in (label.ravel(), label[squares]))
+    wall_label, _ = ndimage.label(wall, structure=_SQUARE)
+    wall_size = np.zeros(count + 1, dtype=np.int64)
+    wall_size[label[closed]] = np.bincount(wall_label.ravel())[wall_label[closed]]
+    return closed & ((2 * thick > size) & ((thick > _BLOB_CELLS) | (2 * thick > wall_size)))[label]
 
 
 def _peel(wall: NDArray[np.bool_], candidates: NDArray[np.bool_]) -> None:

@@ -4,9 +4,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+RAGGED_FACTOR = 2.0
+"""How much farther than the tolerance a line may be from ragged walls."""
+
 _CORNERS = 64
 _RESIDUAL_COST = 16.0
 _STEEPEST = 1.05
+_RAGGED_TURNS = 4
+_RAGGED_SPACING = 10.0
+_LEVEL_CELLS = 1.0
 
 
 def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -14,15 +20,18 @@ def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.
 
     A run is allowed if one line passes within `tolerance` of the middle of every unit edge, measured along x or y
     (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
-    lie within half a cell of the line that it samples. The split minimises the number of runs plus eight times
-    their residual variances [cells^2]; a line is the least-squares one where that keeps the tolerance.
+    lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
+    more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
+    notches of one cell then need no runs of their own. The split minimises the number of runs plus eight times their
+    residual variances [cells^2]; a line is the least-squares one where that keeps the tolerance, and a ragged one is
+    parallel to an axis where that moves its ends by half a cell at most.
 
     Parameters
     ----------
     points : (n, 2) float64 array
         Corners of the polyline [cells].
     tolerance : float
-        Largest deviation [cells].
+        Largest deviation where the polyline is not ragged [cells].
 
     Returns
     -------
@@ -67,39 +76,43 @@ def _best_split(points, tolerance):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: ignore[no-untyped-def]
     """Lengthen the run that begins at `start` while a line fits, and note where that makes a split cheaper."""
-    polygon, size = _all_lines()
+    near, near_size = _all_lines()
+    far, far_size = _all_lines()
     sums = np.zeros(6)
-    sign = 0.0
+    sign, turn, reversals, i = 0.0, 0.0, 0, int(swap)
     for k in range(start, len(points) - 1):
-        x0, y0, x1, y1, steps = _middles(points, start, k, swap)
-        ahead = x1 - x0 if steps > 1 else points[k + 1, int(swap)] - points[k, int(swap)]
+        ahead, aside = points[k + 1, i] - points[k, i], points[k + 1, 1 - i] - points[k, 1 - i]
         if ahead * sign < 0.0:
             return
         sign = ahead if sign == 0.0 else sign
-        size = _clip(polygon, size, x0, y0, tolerance)
-        if steps > 1:
-            size = _clip(polygon, size, x1, y1, tolerance)
-        if size == 0:
+        reversals += int(aside * turn < 0.0)
+        turn = aside if aside != 0.0 else turn
+        element = _middles(points, start, k, swap)
+        near_size = _clip_element(near, near_size, element, tolerance)
+        far_size = _clip_element(far, far_size, element, RAGGED_FACTOR * tolerance)
+        if far_size == 0:
             return
-        _accumulate(sums, x0, y0, x1, y1, steps)
-        total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums)
-        if total < cost[k + 1] - 1e-12:
-            cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
+        _accumulate(sums, element)
+        length = abs(points[k + 1, i] - points[start, i])
+        if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
+            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums)
+            if total < cost[k + 1] - 1e-12:
+                cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
 
 
 @njit(cache=True)
 def _line(points, tolerance, swap):  # type: ignore[no-untyped-def]
-    """Point on and direction of the line that fits a run."""
-    polygon, size = _all_lines()
-    sums = np.zeros(6)
-    for k in range(len(points) - 1):
-        x0, y0, x1, y1, steps = _middles(points, 0, k, swap)
-        size = _clip(polygon, size, x0, y0, tolerance)
-        size = _clip(polygon, size, x1, y1, tolerance)
-        _accumulate(sums, x0, y0, x1, y1, steps)
+    """Point on and direction of the line that fits a run; a ragged one is parallel to an axis if that is as good."""
+    polygon, size, sums = _lines_within(points, tolerance, swap)
+    ragged = size == 0
+    if ragged:
+        tolerance = RAGGED_FACTOR * tolerance
+        polygon, size, sums = _lines_within(points, tolerance, swap)
     mean_x, mean_y = sums[1] / sums[0], sums[2] / sums[0]
     spread = sums[3] - sums[1] * mean_x
     slope = (sums[4] - sums[1] * mean_y) / spread if spread > 1e-9 else 0.0
+    if ragged and abs(slope * (points[-1, int(swap)] - points[0, int(swap)])) <= _LEVEL_CELLS:
+        slope = 0.0
     offset = mean_y - slope * mean_x
     if size > 0 and not _fits(points, tolerance, swap, slope, offset):
         slope, offset = polygon[:size, 0].mean(), polygon[:size, 1].mean()
@@ -108,6 +121,29 @@ def _line(points, tolerance, swap):  # type: ignore[no-untyped-def]
     if swap:
         return np.array([y, x, slope / norm, 1.0 / norm])
     return np.array([x, y, 1.0 / norm, slope / norm])
+
+
+@njit(cache=True)
+def _lines_within(points, tolerance, swap):  # type: ignore[no-untyped-def]
+    """Polygon of the lines that fit a run, its number of corners, and the sums over the run."""
+    polygon, size = _all_lines()
+    sums = np.zeros(6)
+    for k in range(len(points) - 1):
+        element = _middles(points, 0, k, swap)
+        size = _clip_element(polygon, size, element, tolerance)
+        _accumulate(sums, element)
+    return polygon, size, sums
+
+
+@njit(cache=True)
+def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped-def]
+    """Keep the lines that pass the middles of an element's first and last unit edge within the tolerance."""
+    x0, y0, x1, y1, steps = element
+    if size > 0:
+        size = _clip(polygon, size, x0, y0, tolerance)
+    if size > 0 and steps > 1:
+        size = _clip(polygon, size, x1, y1, tolerance)
+    return size
 
 
 @njit(cache=True)
@@ -134,8 +170,9 @@ def _middles(points, origin, k, swap):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _accumulate(sums, x0, y0, x1, y1, steps):  # type: ignore[no-untyped-def]
-    """Add `steps` equally spaced points to the sums of 1, x, y, xx, xy, yy."""
+def _accumulate(sums, element):  # type: ignore[no-untyped-def]
+    """Add the middles of an element's unit edges to the sums of 1, x, y, xx, xy, yy."""
+    x0, y0, x1, y1, steps = element
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     spread = (steps + 1.0) / (12.0 * (steps - 1.0)) if steps > 1 else 0.0
     dx, dy = x1 - x0, y1 - y0

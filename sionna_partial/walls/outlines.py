@@ -16,7 +16,6 @@ from sionna_partial.walls.lines import fit_runs
 _REACH_CELLS = 1.0
 _OFFSET_CELLS = 0.6
 _MIN_SHIFT_CELLS = 0.25
-_ROUNDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,8 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     partial : PartialMap
     tolerance_cells : float
         Largest distance of an outline from the lattice line through the cell centres [cells]. From 0.5 on, the
-        staircase of a tilted wall becomes one straight line.
+        staircase of a tilted wall becomes one straight line. Twice as much is allowed where a wall is ragged, that is
+        where its face turns to and fro at least once in 10 cells.
     bridge_gap_m : float
         Longest gap in a seen wall that is closed [m]; never more than two cells.
 
@@ -71,14 +71,11 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     chains = wall_chains(graph)
     places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
     fits = [_fit(places, shift, chain, tolerance_cells) for chain in chains]
-    plain = {index for index, chain in enumerate(chains) if graph.points[chain.points[0], 0] % 2 == 0}
-    for _ in range(_ROUNDS):
-        lines = _polylines(graph, places, chains, fits, plain)
-        crossing = _crossing_chains(lines)
-        if not crossing - plain:
-            break
-        plain |= crossing
-    return _assemble([line + corner for line in lines], partial.resolution_m)
+    plain = [np.full(len(f.lines), graph.points[c.points[0], 0] % 2 == 0) for c, f in zip(chains, fits, strict=True)]
+    while True:
+        lines, runs = _polylines(graph, places, chains, fits, plain)
+        if not _keep_crossing(lines, runs, plain):
+            return _assemble([line + corner for line in lines], partial.resolution_m)
 
 
 def _crop(partial: PartialMap) -> tuple[PartialMap, NDArray[np.float64]]:
@@ -117,43 +114,67 @@ def _fit(places: NDArray[np.float64], shift: NDArray[np.float64], chain: Chain, 
 
 
 def _polylines(
-    graph: WallGraph, places: NDArray[np.float64], chains: list[Chain], fits: list[_Fit], plain: set[int]
-) -> list[NDArray[np.float64]]:
-    """Vertices [cells] of every chain; chains in `plain` (squares, and where lines would cross) keep their corners."""
+    graph: WallGraph,
+    places: NDArray[np.float64],
+    chains: list[Chain],
+    fits: list[_Fit],
+    plain: list[NDArray[np.bool_]],
+) -> tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]]:
+    """Vertices [cells] of every chain, and the run that each of its segments belongs to.
+
+    Runs that are `plain` (squares, and where lines would cross) keep their corners.
+    """
     nodes = _place_nodes(graph, places, chains, fits, plain)
-    lines = []
-    for index, (chain, fit) in enumerate(zip(chains, fits, strict=True)):
-        at = np.array([k for k, point in enumerate(chain.points) if point in nodes], dtype=np.int64)
-        fixed = {int(k): nodes[chain.points[k]] for k in at}
-        breaks = fit.corners if index in plain else fit.corners[fit.starts]
-        route = []
-        for k in sorted({*fixed, *breaks.tolist(), len(chain.points) - 1}):
-            if k in fixed:
-                route.append(fixed[k][None])
-            elif index in plain:
+    lines, runs = [], []
+    for chain, fit, keep in zip(chains, fits, plain, strict=True):
+        before, after = _runs_beside(fit, chain, np.arange(len(chain.points)))
+        fixed = np.array([point in nodes for point in chain.points])
+        breaks = fixed.copy()
+        breaks[fit.corners[keep[after[fit.corners]]]] = True
+        breaks[np.append(fit.corners[fit.starts], len(chain.points) - 1)] = True
+        route, owner = [], []
+        for k in np.nonzero(breaks)[0].tolist():
+            if fixed[k]:
+                route.append(nodes[chain.points[k]][None])
+            elif keep[before[k]] or keep[after[k]]:
                 route.append(places[chain.points[k]][None])
             else:
-                route.append(_meet(fit, chain, places, k))
-        if chain.closed and len(chain.points) - 1 not in fixed:
+                route.append(_meet(fit.lines[[before[k], after[k]]], places[chain.points[k]]))
+            owner += [before[k]] * (len(route[-1]) - 1) + [after[k]]
+        if chain.closed and not fixed[-1]:
+            owner = owner[len(route[0]) - 1 :]
             route[0] = route[-1][-1:]
         lines.append(np.round(np.concatenate(route), 6).astype(np.float64))
-    return lines
+        runs.append(np.array(owner[:-1], dtype=np.int64))
+    return lines, runs
+
+
+def _runs_beside(fit: _Fit, chain: Chain, k: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the runs of a chain before and after its points k."""
+    first = fit.corners[fit.starts]
+    before, after = np.searchsorted(first, k) - 1, np.searchsorted(first, k, side="right") - 1
+    if chain.closed:
+        return before % len(first), np.where(k == len(chain.points) - 1, 0, after)
+    return np.maximum(before, 0), after
 
 
 def _place_nodes(
-    graph: WallGraph, places: NDArray[np.float64], chains: list[Chain], fits: list[_Fit], plain: set[int]
+    graph: WallGraph,
+    places: NDArray[np.float64],
+    chains: list[Chain],
+    fits: list[_Fit],
+    plain: list[NDArray[np.bool_]],
 ) -> dict[int, NDArray[np.float64]]:
     """Places [cells] of chain ends and junctions: where the lines that meet there come closest."""
     is_node = graph.degree != 2
     lines: dict[int, list[NDArray[np.float64]]] = {}
     pinned: set[int] = set()
-    for index, (chain, fit) in enumerate(zip(chains, fits, strict=True)):
-        bounds = np.append(fit.corners[fit.starts], len(chain.points) - 1)
+    for chain, fit, keep in zip(chains, fits, plain, strict=True):
+        before, after = _runs_beside(fit, chain, np.arange(len(chain.points)))
         for k in np.nonzero(is_node[chain.points])[0].tolist():
-            before, after = np.searchsorted(bounds, k) - 1, np.searchsorted(bounds, k, side="right") - 1
-            runs = {max(before, 0), min(after, len(fit.lines) - 1)}
-            lines.setdefault(chain.points[k], []).extend(fit.lines[sorted(runs)])
-            if index in plain:
+            runs = np.unique([before[k], after[k]])
+            lines.setdefault(chain.points[k], []).extend(fit.lines[runs])
+            if keep[runs].any():
                 pinned.add(chain.points[k])
     return {
         point: places[point] if point in pinned else _closest(np.array(through), places[point])
@@ -169,12 +190,8 @@ def _closest(lines: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[
     return place + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
 
 
-def _meet(fit: _Fit, chain: Chain, places: NDArray[np.float64], k: int) -> NDArray[np.float64]:
-    """Vertices (1 or 2, 2) where the run that ends at point k of a chain meets the next."""
-    place = places[chain.points[k]]
-    corner = int(np.searchsorted(fit.corners, k))
-    after = int(np.searchsorted(fit.starts, corner, side="right")) - 1 if corner < len(fit.corners) - 1 else 0
-    pair = fit.lines[[after - 1, after]]
+def _meet(pair: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vertices (1 or 2, 2) where two runs with lines (2, 4) meet near a point."""
     direction = pair[:, 2:]
     cross = direction[0, 0] * direction[1, 1] - direction[0, 1] * direction[1, 0]
     feet = pair[:, :2] + ((place - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
@@ -188,20 +205,28 @@ def _meet(fit: _Fit, chain: Chain, places: NDArray[np.float64], k: int) -> NDArr
     return feet.mean(axis=0)[None]
 
 
-def _crossing_chains(lines: list[NDArray[np.float64]]) -> set[int]:
-    """Chains with a segment that meets another away from a shared vertex."""
-    owner = np.repeat(np.arange(len(lines)), [len(line) - 1 for line in lines])
-    if not len(owner):
-        return set()
+def _keep_crossing(
+    lines: list[NDArray[np.float64]], runs: list[NDArray[np.int64]], plain: list[NDArray[np.bool_]]
+) -> bool:
+    """Make runs plain whose segments meet others away from a shared vertex; say whether there were any."""
+    if not lines:
+        return False
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
-    owner, pairs = owner[(pairs[:, 0] != pairs[:, 1]).any(axis=1)], pairs[(pairs[:, 0] != pairs[:, 1]).any(axis=1)]
+    owner = np.repeat(np.arange(len(lines)), [len(line) - 1 for line in lines])
+    owner = np.stack([owner, np.concatenate(runs)], axis=1)
+    length = (pairs[:, 0] != pairs[:, 1]).any(axis=1)
+    owner, pairs = owner[length], pairs[length]
     segments = shapely.linestrings(pairs)
     first, second = shapely.STRtree(segments).query(segments, predicate="intersects")
     first, second = first[first < second], second[first < second]
     same = (pairs[first][:, :, None] == pairs[second][:, None]).all(axis=3).any(axis=(1, 2))
     touch = shapely.intersection(segments[first], segments[second])
     bad = ~same | (shapely.get_type_id(touch) != 0)
-    return set(owner[first[bad]].tolist()) | set(owner[second[bad]].tolist())
+    found = False
+    for chain, run in owner[np.unique([first[bad], second[bad]])].tolist():
+        found |= not plain[chain][run]
+        plain[chain][run] = True
+    return found
 
 
 def _assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines:
