@@ -127,9 +127,18 @@ def test_the_comparison_has_a_column_for_each_map(coverage):
 def test_the_comparison_shows_unseen_walls_of_the_first_map_in_grey(coverage):
     blind = coverage.assign(wall_parts=0 * coverage["wall_parts"])
     shown = panels(plot_comparison({"truth": coverage, "blind": blind}))
-    grey, black = shown[1].images[1:]
+    grey, black = shown[1].images[2:]
     assert not black.get_array()[..., 3].any()
     assert 0 < grey.get_array()[..., 3].max() < 255
+
+
+def test_the_outside_is_blank_on_a_complete_map_alone(coverage):
+    for complete in (0, 1):
+        coverage.attrs["map_complete"] = complete
+        blank = panels(plot_coverage(coverage))[0].images[1].get_array()
+        expected = ~coverage["observed"].to_numpy() & bool(complete)
+        np.testing.assert_array_equal(blank[..., 3] > 0, expected)
+        assert (blank[..., :3] == 255).all()
 
 
 def test_figures_are_unknown_to_pyplot_and_become_png(coverage):

@@ -14,7 +14,7 @@ from sionna_partial.tracing.solver import SceneSolver
 
 def test_order_of_candidates_changes_no_verdict(tmp_path: Path) -> None:
     """Embree loses hits of rays that are called coherent and are not."""
-    home = sp.make_home(5)
+    home = sp.make_home(9)
     geometry = build_scene(home)
     free = (np.argwhere(home.state == CellState.FREE)[::40, ::-1] + 0.5) * home.resolution_m
     places = np.column_stack([free, np.full(len(free), 1.5)])
