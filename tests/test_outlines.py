@@ -198,6 +198,50 @@ def test_short_gap_is_bridged(gap: str) -> None:
 
 
 @pytest.mark.parametrize(
+    "text",
+    [
+        """
+        ????????????
+        ???????????#
+        .......#####
+        ......?.....
+        .#####......
+        ............
+        """.replace(".#####", "######"),
+        """
+        ????????????
+        ?#########??
+        .........?#?
+        ..........#?
+        ..........#?
+        ..........#?
+        """,
+    ],
+    ids=["step", "corner"],
+)
+def test_unseen_cell_between_two_ends_is_bridged(text: str) -> None:
+    """What cannot be seen through holds a wall: one unknown cell at a step or around a corner."""
+    partial = drawn(text)
+    outlines = wall_outlines(partial)
+    lines = shapely.union_all(shapely.linestrings(outlines.vertices_m[outlines.segments]))
+    assert shapely.get_num_geometries(shapely.line_merge(lines)) == 1
+
+
+@pytest.mark.parametrize("cell", [".", "?"])
+def test_two_cells_around_a_corner_stay_open(cell: str) -> None:
+    partial = drawn(f"""
+        ????????????
+        ?#######????
+        ........{cell}{cell}??
+        ..........#?
+        ..........#?
+        """)
+    outlines = wall_outlines(partial)
+    lines = shapely.union_all(shapely.linestrings(outlines.vertices_m[outlines.segments]))
+    assert shapely.get_num_geometries(lines) == 2
+
+
+@pytest.mark.parametrize(
     ("row", "resolution_m", "bridge_gap_m"),
     [
         (".#####???#####.", 0.05, 0.2),

@@ -11,17 +11,19 @@ from sionna_partial.walls.cells import MAX_FREE_GAP_M, MAX_GAP_CELLS, MIN_RUN_CE
 from sionna_partial.walls.chains import WallGraph, step_back
 
 _LOOK_EDGES = 5
-_AHEAD_COSINE = 0.8
+_AHEAD_COSINE = 0.65
 _STRAIGHT_COSINE = 0.9
 _OPPOSED_COSINE = -0.5
+_TIP = 0.999
 
 
 def find_bridges(graph: WallGraph, partial: PartialMap, bridge_gap_m: float) -> NDArray[np.int64]:
     """Find edges that close short gaps in thin walls.
 
     A gap lies ahead of a wall end or beside a lone cell, is at most `MAX_GAP_CELLS` and `bridge_gap_m` long, and leads
-    to another end that faces it. Across UNKNOWN cells alone it may also lead to a side of a wall; across FREE cells it
-    must be short (`MAX_FREE_GAP_M`) and in line with the walls on both sides.
+    to another end that faces it. Across UNKNOWN cells alone it may also lead to a side of a wall, and around a corner
+    whose one cell was not seen; across FREE cells it must be short (`MAX_FREE_GAP_M`) and in line with the walls on
+    both sides.
 
     Parameters
     ----------
@@ -61,16 +63,20 @@ def _near_pairs(graph: WallGraph, longest: int) -> NDArray[np.int64]:
 def _crossed_states(
     graph: WallGraph, partial: PartialMap, pairs: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether a WALL and whether a FREE cell lies on the line between the points of each pair."""
+    """Whether a WALL and whether a FREE cell lies on the line between the points of each pair.
+
+    Where the line runs along the border of two cells, it takes the one that is UNKNOWN.
+    """
     start, end = graph.points[pairs[:, 0]], graph.points[pairs[:, 1]]
     count = np.abs(end - start).max(axis=1, initial=0) // 2
     walled, free = np.zeros(len(pairs), dtype=bool), np.zeros(len(pairs), dtype=bool)
     for k in range(1, MAX_GAP_CELLS + 1):
         between = k < count
-        column, row = ((start + (end - start) * (k / np.maximum(count, 1))[:, None]) // 2).astype(int).T
-        state = partial.state[row, column]
-        walled |= between & (state == CellState.WALL)
-        free |= between & (state == CellState.FREE)
+        place = start + (end - start) * (k / np.maximum(count, 1))[:, None]
+        cells = [np.floor((place + tip) / 2).astype(int) for tip in (-_TIP, 0.0, _TIP)]
+        states = [partial.state[row, column] for column, row in (cell.T for cell in cells)]
+        walled |= between & (states[1] == CellState.WALL)
+        free |= between & np.all([state != CellState.UNKNOWN for state in states], axis=0)
     return walled, free
 
 
@@ -106,7 +112,9 @@ def _facing(
     to_side = (degree[b] >= 2) & (degree[a] == 1)
     straight = (directions[a] * -directions[b]).sum(axis=1) >= _STRAIGHT_COSINE
     in_line = straight & (np.minimum(cells[a], cells[b]) >= MIN_RUN_CELLS) & (gap_m <= MAX_FREE_GAP_M)
-    return ahead & np.where(free, back & in_line, back | to_side)
+    one_cell = np.abs(graph.points[b] - graph.points[a]).max(axis=1, initial=0) <= 4
+    corner = one_cell & (degree[a] <= 1) & (degree[b] <= 1)
+    return np.where(free, ahead & back & in_line, corner | (ahead & (back | to_side)))
 
 
 def _first_come(graph: WallGraph, pairs: NDArray[np.int64]) -> NDArray[np.int64]:
