@@ -234,8 +234,3 @@ class TraceSettings:
         for name in ("diffraction", "refraction", "diffuse_reflection"):
             value = getattr(self, name)
             require(isinstance(value, bool), name, value, "give True or False.")
-
-    @property
-    def specular_only(self) -> bool:
-        """Whether only line of sight and specular reflection are traced."""
-        return not (self.diffraction or self.refraction or self.diffuse_reflection)

@@ -95,8 +95,8 @@ def test_whole_numbers(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["diffraction", "refraction", "diffuse_reflection"])
 def test_switches(name: str) -> None:
-    assert TraceSettings().specular_only
-    assert not TraceSettings(**{name: True}).specular_only  # type: ignore[arg-type]
+    assert getattr(TraceSettings(), name) is False
+    assert getattr(TraceSettings(**{name: True}), name) is True  # type: ignore[arg-type]
     for value in (1, 0, "yes", None):
         with pytest.raises(SettingsError, match=f"{name} = {value!r} is not allowed: give True or False"):
             TraceSettings(**{name: value})  # type: ignore[arg-type]
