@@ -1,194 +1,200 @@
 """Our trace beside stock Sionna RT: time, memory, recall and agreement, and growth with receivers and walls.
 
-Every measurement runs in a process of its own. Truth is stock Sionna RT in tiles of at most 100 receivers with a hash
-table of 3e7 entries and 1e6 rays, on a seeded sample of the receivers. Run it with
+Every measurement runs in a process of its own; stock and ours run on one core, and ours on all cores besides. Truth is
+stock Sionna RT in tiles of at most 100 receivers with a hash table of 3e7 entries and 1e6 rays, on a seeded sample of
+the receivers. Run it with
 
     python benchmarks/trace.py --out benchmark-output
+
+which takes about half an hour on two cores; `--only growth`, for instance, runs one part.
 """
 
 import argparse
 import json
-import multiprocessing
-import resource
+import math
+import os
+import subprocess
+import sys
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import trimesh
+from agreement import agreement, paths_of, upright
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from stock import isolated, limit_cores, peak_memory_gb, trace_stock
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.scene import build_scene
 
-DEPTH = 6
-TILE = 100
+STOCK_RAYS, STOCK_TABLE = 100_000, 10_000_000
+"""Stock on the full grid: few rays, as its time grows with rays x receivers, and a table large for its memory."""
 
 
 def main() -> None:
     """Measure, print the tables, draw the growth curves."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("benchmark-output"))
-    parser.add_argument("--homes", nargs="+", default=["apartment"], help="names below scenes/")
-    parser.add_argument("--stages", nargs="+", default=["complete", "step100"])
-    parser.add_argument("--spacing", type=float, default=0.15, help="receiver spacing [m]")
-    parser.add_argument("--truth-receivers", type=int, default=200, help="receivers in the sample for truth")
+    parser.add_argument("--maps", nargs="+", default=["house/complete", "house/step100"], help="below scenes/")
+    parser.add_argument("--receivers", type=int, default=3000)
+    parser.add_argument("--sample", type=int, default=100, help="receivers in the sample for truth")
+    parser.add_argument("--only", choices=["plan", "mesh", "predict", "first", "growth"])
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
-    for home in arguments.homes:
-        for stage in arguments.stages:
-            compare(home, stage, arguments.spacing, arguments.truth_receivers)
-    draw_growth(arguments.out / "trace_growth.png")
+    for name in arguments.maps:
+        if arguments.only in (None, "plan"):
+            for diffraction in (False, True):
+                compare(name, arguments.receivers, arguments.sample, diffraction=diffraction)
+        if arguments.only in (None, "mesh"):
+            compare_mesh(name, arguments.receivers, arguments.sample)
+        if arguments.only in (None, "predict"):
+            time_prediction(name)
+    if arguments.only in (None, "first"):
+        time_first_call(arguments.maps[0])
+    if arguments.only in (None, "growth"):
+        draw_growth(arguments.out / "trace_growth.png")
 
 
-def compare(home: str, stage: str, spacing_m: float, sample_size: int) -> None:
-    """Print stock full grid, stock tiles and ours side by side for one map."""
-    folder = str(scenes_folder() / home / stage)
-    partial, tx = sp.load_map(folder), demo_homes()[home]["transmitter"]
-    rx = receivers(partial, spacing_m)
+def compare(name: str, count: int, sample_size: int, *, diffraction: bool) -> None:
+    """Print stock full grid, stock tiles and ours side by side for one floor plan."""
+    folder, tx = str(scenes_folder() / name), np.array(demo_homes()[name.split("/")[0]]["transmitter"])
+    partial = sp.load_map(folder)
+    walls = len(build_scene(partial).segments)
+    kind = "one diffraction and reflections" if diffraction else "reflections"
+    settings = sp.TraceSettings(diffraction=diffraction)
+    _compare(f"{name}: {walls} walls, {kind}", folder, partial, tx, count, sample_size, settings)
+
+
+def compare_mesh(name: str, count: int, sample_size: int) -> None:
+    """Print the same for the scene of a floor plan that is traced as a mesh, like a scan."""
+    tx = np.array(demo_homes()[name.split("/")[0]]["transmitter"])
+    with tempfile.TemporaryDirectory() as folder:
+        parts = [trimesh.load(path, force="mesh") for path in sorted((scenes_folder() / name / "meshes").glob("*.ply"))]
+        trimesh.util.concatenate(parts).export(f"{folder}/scan.ply")
+        partial = sp.load_map(f"{folder}/scan.ply")
+        sp.export_scene(partial, f"{folder}/scan")
+        faces = len(partial.mesh.triangles)
+        settings = sp.TraceSettings(diffraction=False)
+        _compare(f"{name} as a mesh: {faces} triangles", f"{folder}/scan", partial, tx, count, sample_size, settings)
+
+
+def _compare(
+    title: str,
+    folder: str,
+    partial: sp.PartialMap,
+    tx: NDArray[np.float64],
+    count: int,
+    sample_size: int,
+    settings: sp.TraceSettings,
+) -> None:
+    rx = receivers(partial, tx, count)
     sample = np.sort(np.random.default_rng(0).choice(len(rx), min(sample_size, len(rx)), replace=False))
-    ours = in_process(trace_ours, folder, tx, rx)
-    grid = in_process(trace_stock, folder, tx, rx, len(rx), 100_000, 10_000_000)
-    tiles = in_process(trace_stock, folder, tx, rx[sample], TILE, 1_000_000, 30_000_000)
-    truth = {number: tiles["delays"].get(k, []) for k, number in enumerate(sample)}
-    print(
-        f"\n{home}/{stage}: {ours['walls']} walls, {len(rx)} receivers, depth {DEPTH}; truth on {len(sample)} receivers"
+    options = {"max_depth": settings.max_depth, "diffraction": settings.diffraction}
+    runs = {"ours, all cores": isolated(trace_ours, folder, tx, rx, settings)}
+    runs["ours"] = isolated(trace_ours, folder, tx, rx, settings, cores=1)
+    runs["stock, all at once"] = isolated(
+        trace_stock, folder, tx, rx, tile=len(rx), rays=STOCK_RAYS, table=STOCK_TABLE, cores=1, **options
     )
-    print(f"{'':24}{'time [s]':>10}{'memory [GB]':>13}{'recall':>9}{'state':>8}{'gain':>8}")
-    for name, result in (("stock, full grid", grid), ("ours, first call", ours), ("ours, warm", ours)):
-        seconds = result["cold_s"] if name == "ours, first call" else result["warm_s"]
-        state, gain = agreement(result, tiles, sample)
-        found = recall(result["delays"], truth)
-        print(f"{name:24}{seconds:>10.2f}{result['memory_gb']:>13.2f}{found:>9.4f}{state:>8.3f}{gain:>8.3f}")
-    per_grid = tiles["warm_s"] * len(rx) / len(sample)
-    print(f"{'stock, tiles (scaled)':24}{per_grid:>10.2f}{tiles['memory_gb']:>13.2f}{1:>9}{1:>8}{1:>8}")
-    print(f"ours is {grid['warm_s'] / ours['warm_s']:.0f} times faster than the stock full grid")
-    print(f"stock listed {tiles['repeats']} paths of the truth twice; they count once")
-    print("recall: share of truth's paths found; state: link state equal; gain: within 0.5 dB (both on the sample)")
+    tiles = isolated(trace_stock, folder, tx, rx[sample], **options)
+    truth = [upright(partial, paths) for paths in tiles["paths"]] if settings.diffraction else tiles["paths"]
+    print(f"\n{title}, {len(rx)} receivers, depth {settings.max_depth}; truth on {len(sample)} of them")
+    print(f"{'':20}{'time [s]':>10}{'first [s]':>11}{'memory [GB]':>13}{'recall':>9}{'state':>8}{'gain':>8}")
+    scaled = tiles["seconds"] * len(rx) / len(sample)
+    print(
+        f"{'stock, tiles':20}{scaled:>10.2f}{'':>11}{tiles['memory_gb']:>13.2f}  (truth; time scaled to all receivers)"
+    )
+    for label in ("stock, all at once", "ours", "ours, all cores"):
+        run = runs[label]
+        found = [upright(partial, run["paths"][k]) if settings.diffraction else run["paths"][k] for k in sample]
+        match = agreement(partial, tx, rx[sample], found, truth)
+        shares = (
+            match["found"] / match["truth"],
+            *(match[key] / match["links"] for key in ("same_state", "same_gain")),
+        )
+        first = f"{run['first_s']:>11.2f}" if "first_s" in run else f"{'':>11}"
+        numbers = "".join(f"{share:>{width}.4f}" for share, width in zip(shares, (9, 8, 8), strict=True))
+        print(f"{label:20}{run['seconds']:>10.2f}{first}{run['memory_gb']:>13.2f}{numbers}")
+    print(
+        f"on one core, ours is {runs['stock, all at once']['seconds'] / runs['ours']['seconds']:.0f} times faster;",
+        end=" ",
+    )
+    print(
+        f"truth: {match['truth']} paths, and {tiles['repeats']} listed twice, {match['leaks']} through a wall; ours has"
+    )
+    print(f"{match['extra']} more, of which {match['real']} are confirmed to cross no wall", flush=True)
 
 
-def in_process(function: Callable[..., dict], *arguments: object) -> dict:
-    """Run a measurement in a fresh process, so that memory and warm-up are its own."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(function, arguments)
-
-
-def receivers(partial: sp.PartialMap, spacing_m: float) -> NDArray[np.float64]:
-    """Grid of receivers at 1.5 m, none inside a wall."""
+def receivers(partial: sp.PartialMap, tx: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """About `count` receivers at the height of the transmitter on a square grid, none within 1 cm of a wall."""
+    free = (partial.state == sp.CellState.FREE).sum() * partial.resolution_m**2
+    spacing_m = math.sqrt(free / count)
     x0, y0, x1, y1 = partial.bounds_m
     x, y = np.meshgrid(np.arange(x0 + spacing_m / 2, x1, spacing_m), np.arange(y0 + spacing_m / 2, y1, spacing_m))
-    rx = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)])
-    return rx[partial.state_at(rx) != sp.CellState.WALL]
+    rx = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, tx[2])])
+    for dx, dy in ((0.01, 0.01), (0.01, -0.01), (-0.01, 0.01), (-0.01, -0.01)):
+        rx = rx[partial.state_at(rx[:, :2] + (dx, dy)) == sp.CellState.FREE]
+    return rx
 
 
-def trace_ours(folder: str, tx: list[float], rx: NDArray[np.float64], diffraction: bool = False) -> dict:
-    """Time `trace_links`, first call and warm."""
-    partial, settings = sp.load_map(folder), sp.TraceSettings(max_depth=DEPTH, diffraction=diffraction)
-    seconds = []
+def trace_ours(
+    folder: str,
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    settings: sp.TraceSettings,
+    *,
+    cores: int | None = None,
+) -> dict:
+    """Time `trace_links`, first call and warm (median of three)."""
+    limit_cores(cores)
+    partial, seconds = sp.load_map(folder), []
     for _ in range(4):
         start = time.perf_counter()
         links = sp.trace_links(partial, tx, rx, settings=settings)
         seconds.append(time.perf_counter() - start)
-    return {
-        "cold_s": seconds[0],
-        "warm_s": float(np.median(seconds[1:])),
-        "walls": len(build_scene(partial).segments),
-        "delays": group(links.path_rx, links.delay_s),
-        "state": links.link_state,
-        "gain": links.gain_db,
-        "memory_gb": peak_memory_gb(),
-    }
+    memory_gb = peak_memory_gb()
+    result = {"first_s": seconds[0], "seconds": float(np.median(seconds[1:])), "memory_gb": memory_gb}
+    return result | {"paths": paths_of(links), "walls": len(build_scene(partial).segments)}
 
 
-def trace_stock(folder: str, tx: list[float], rx: NDArray[np.float64], tile: int, rays: int, table: int) -> dict:
-    """Time stock `PathSolver` on tiles of receivers."""
-    from sionna_partial.tracing.solver import load_sionna
-
-    rt = load_sionna()
-    start = time.perf_counter()
-    delays, state, gain, repeats = {}, [], [], 0
-    for first in range(0, len(rx), tile):
-        part = rx[first : first + tile]
-        scene = stock_scene(rt, folder, tx, part)
-        paths = rt.PathSolver()(
-            scene, max_depth=DEPTH, refraction=False, samples_per_src=rays, max_num_paths_per_src=table
-        )
-        valid, delay = paths.valid.numpy().reshape(len(part), -1), paths.tau.numpy().reshape(len(part), -1)
-        vertices = paths.vertices.numpy().reshape(DEPTH, len(part), -1, 3)
-        twice = np.stack([listed_twice(vertices[:, k], valid[k]) for k in range(len(part))])
-        repeats += int(twice.sum())
-        valid &= ~twice
-        power = sum(array.numpy().reshape(len(part), -1).astype(float) ** 2 for array in paths.a)
-        direct = (paths.interactions.numpy().reshape(DEPTH, len(part), -1) == 0).all(axis=0)
-        delays |= {first + k: delay[k][valid[k]] for k in range(len(part))}
-        gain.append(np.maximum(10 * np.log10(np.maximum((power * valid).sum(axis=1), 1e-15)), -150.0))
-        state.append(np.where((valid & direct).any(axis=1), 1, np.where(gain[-1] > -150, 2, 0)))
-    return {
-        "warm_s": time.perf_counter() - start,
-        "delays": delays,
-        "state": np.concatenate(state),
-        "gain": np.concatenate(gain),
-        "repeats": repeats,
-        "memory_gb": peak_memory_gb(),
-    }
+def time_prediction(name: str) -> None:
+    """Print the time of a coverage map over that of the trace in it, both warm."""
+    ratio = isolated(_prediction_ratio, str(scenes_folder() / name), demo_homes()[name.split("/")[0]]["transmitter"])
+    print(f"\n{name}: predict_map with {ratio['receivers']} receivers costs {ratio['ratio']:.2f} times its trace, warm")
 
 
-def listed_twice(vertices_m: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Find the paths (P,) of one receiver that repeat an earlier one: the same reflection points within 1 cm.
+def _prediction_ratio(folder: str, tx: list[float]) -> dict:
+    partial, model, traces, maps = sp.load_map(folder), sp.Predictor.load(), [], []
+    coverage = sp.predict_map(partial, tx, predictor=model)
+    y, x = np.nonzero(coverage["valid"].to_numpy())
+    rx = np.column_stack([coverage["x"][x], coverage["y"][y], np.full(len(x), 1.5)])
+    for _ in range(3):
+        start = time.perf_counter()
+        sp.trace_links(partial, tx, rx)
+        middle = time.perf_counter()
+        sp.predict_map(partial, tx, predictor=model)
+        traces.append(middle - start)
+        maps.append(time.perf_counter() - middle)
+    return {"receivers": len(rx), "ratio": float(np.median(maps) / np.median(traces))}
 
-    Stock Sionna RT tells paths apart by hashes of rounded planes, and rounding can give one plane two hashes.
-    """
-    points = vertices_m.transpose(1, 0, 2).reshape(len(valid), -1)
-    points = np.where(np.isfinite(points), points, 0.0)
-    same = np.abs(points[:, None] - points[None]).max(axis=2) < 0.01
-    earlier = np.tri(len(valid), k=-1, dtype=bool)
-    return valid & (same & earlier & valid).any(axis=1)
 
-
-def stock_scene(rt: object, folder: str, tx: list[float], rx: NDArray[np.float64]) -> object:
-    """Stock scene with isotropic antennas at the given places."""
-    scene = rt.load_scene(f"{folder}/scene.xml")
-    scene.frequency = 28e9
-    scene.tx_array = scene.rx_array = rt.PlanarArray(
-        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
+def time_first_call(name: str) -> None:
+    """Print how long the first call of a process takes, right after an installation and later."""
+    tx = demo_homes()[name.split("/")[0]]["transmitter"]
+    code = (
+        "import time; start = time.perf_counter(); import sionna_partial as sp;"
+        f"sp.trace_links({str(scenes_folder() / name)!r}, {tx}, [{[tx[0] + 0.5, tx[1], tx[2]]}]);"
+        "print(time.perf_counter() - start)"
     )
-    scene.add(rt.Transmitter("tx", position=[float(value) for value in tx]))
-    for index, position in enumerate(rx):
-        scene.add(rt.Receiver(f"rx{index}", position=[float(value) for value in position]))
-    return scene
-
-
-def group(path_rx: NDArray[np.int32], delay_s: NDArray[np.float64]) -> dict[int, NDArray[np.float64]]:
-    """Delays of each receiver's paths."""
-    start = np.searchsorted(path_rx, np.arange(path_rx.max(initial=-1) + 2))
-    return {k: delay_s[start[k] : start[k + 1]] for k in range(len(start) - 1)}
-
-
-def recall(found: dict[int, NDArray[np.float64]], truth: dict[int, NDArray[np.float64]]) -> float:
-    """Share of the true paths whose delay is found at their receiver, each found path counting once."""
-    hits = total = 0
-    for number, delays in truth.items():
-        left = list(np.sort(found.get(number, np.zeros(0))))
-        total += len(delays)
-        for delay in np.sort(delays):
-            match = next((k for k, value in enumerate(left) if abs(value - delay) < 1e-11), None)
-            if match is not None:
-                del left[match]
-                hits += 1
-    return hits / max(1, total)
-
-
-def agreement(result: dict, truth: dict, sample: NDArray[np.intp]) -> tuple[float, float]:
-    """Share of the sample with equal link state, and with gain within 0.5 dB."""
-    state = np.mean(result["state"][sample] == truth["state"])
-    return float(state), float(np.mean(np.abs(result["gain"][sample] - truth["gain"]) <= 0.5))
-
-
-def peak_memory_gb() -> float:
-    """Largest resident memory of this process so far [GB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    with tempfile.TemporaryDirectory() as empty:
+        environment = os.environ | {"HOME": empty, "NUMBA_CACHE_DIR": f"{empty}/numba"}
+        seconds = [
+            float(subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True).stdout)
+            for _ in range(2)
+        ]
+    print(f"\nfirst call: {seconds[0]:.1f} s with nothing compiled, {seconds[1]:.1f} s in any later process")
 
 
 def warehouse(aisles: int) -> sp.PartialMap:
@@ -204,24 +210,25 @@ def warehouse(aisles: int) -> sp.PartialMap:
 
 
 def trace_warehouse(aisles: int, count: int) -> dict:
-    """Time a warehouse of many racks with `count` receivers."""
-    partial = warehouse(aisles)
-    grid = receivers(partial, 0.1)
-    rx = grid[np.sort(np.random.default_rng(1).choice(len(grid), min(count, len(grid)), replace=False))]
+    """Time a warehouse of many racks with about `count` receivers, reflections only."""
+    partial, tx = warehouse(aisles), np.array([0.5, 0.5, 1.5])
     with tempfile.TemporaryDirectory() as folder:
-        sp.save_map(partial, Path(folder) / "map.yaml")
-        return trace_ours(f"{folder}/map.yaml", [0.5, 0.5, 1.5], rx)
+        sp.save_map(partial, f"{folder}/map.npz")
+        rx = receivers(partial, tx, count)
+        run = trace_ours(f"{folder}/map.npz", tx, rx, sp.TraceSettings(diffraction=False))
+    return {"receivers": len(rx), **{name: run[name] for name in ("walls", "seconds", "memory_gb")}}
 
 
 def draw_growth(path: Path) -> None:
     """Draw and print the growth of the time with receivers and with walls."""
-    by_receivers = [(n, in_process(trace_warehouse, 4, n)) for n in (1000, 3000, 10_000, 25_000)]
-    by_walls = [(run["walls"], run) for run in (in_process(trace_warehouse, n, 3000) for n in (2, 4, 10, 20, 40))]
+    by_receivers = [isolated(trace_warehouse, 4, count) for count in (1000, 3000, 10_000, 25_000)]
+    by_walls = [isolated(trace_warehouse, aisles, 3000) for aisles in (2, 4, 10, 20, 40)]
     figure = Figure(figsize=(9, 4), layout="constrained")
-    for axes, runs, label in zip(figure.subplots(1, 2), (by_receivers, by_walls), ("receivers", "walls"), strict=True):
-        axes.plot([n for n, _ in runs], [run["warm_s"] for _, run in runs], "o-")
-        axes.set(xlabel=f"number of {label}", ylabel="warm trace [s]", xlim=(0, None), ylim=(0, None))
-        print(json.dumps({label: [(n, round(r["warm_s"], 3), round(r["memory_gb"], 2)) for n, r in runs]}))
+    for axes, runs, name in zip(figure.subplots(1, 2), (by_receivers, by_walls), ("receivers", "walls"), strict=True):
+        axes.plot([run[name] for run in runs], [run["seconds"] for run in runs], "o-")
+        axes.set(xlabel=f"number of {name}", ylabel="warm trace [s]", xlim=(0, None), ylim=(0, None))
+        rows = [(run[name], round(run["seconds"], 3), round(run["memory_gb"], 2)) for run in runs]
+        print(f"\n{name}, time [s], memory [GB]: {json.dumps(rows)}")
     figure.savefig(path, dpi=150)
     print(f"growth curves: {path}")
 

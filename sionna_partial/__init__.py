@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sionna_partial.maps.partial_map import PartialMap
     from sionna_partial.plot import plot_coverage
     from sionna_partial.settings import Material, SceneSettings, TraceSettings
+    from sionna_partial.tracing.gradients import GainGradients, gain_gradients
     from sionna_partial.tracing.scene import export_scene
     from sionna_partial.tracing.trace import TracedLinks, trace_links
 
@@ -48,6 +49,7 @@ _PUBLIC = {
     "maps.explore": ("explore",),
     "tracing.scene": ("export_scene",),
     "tracing.trace": ("TracedLinks", "trace_links"),
+    "tracing.gradients": ("GainGradients", "gain_gradients"),
     "learning.features": ("LinkFeatures", "link_features"),
     "learning.predictor": ("LinkPrediction", "Predictor"),
     "coverage": ("predict_map",),
@@ -58,6 +60,7 @@ _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in name
 
 __all__ = [
     "CellState",
+    "GainGradients",
     "LinkFeatures",
     "LinkPrediction",
     "LinkState",
@@ -71,6 +74,7 @@ __all__ = [
     "__version__",
     "explore",
     "export_scene",
+    "gain_gradients",
     "link_features",
     "load_map",
     "make_home",

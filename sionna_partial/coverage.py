@@ -225,9 +225,9 @@ def _receivers(
     partial: PartialMap, tx_m: NDArray[np.float64], rx_height_m: float, spacing_m: float, frequency_hz: float
 ) -> _Receivers:
     """Place the receivers, and mask those that cannot be there."""
-    height_m = partial.wall_height_m
-    require_number("rx_height_m", rx_height_m, 0.0, height_m, open_low=True)
-    require(rx_height_m < height_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {height_m:g} m.")
+    low_m, high_m = partial.height_range_m
+    require_number("rx_height_m", rx_height_m, low_m, high_m, open_low=True)
+    require(rx_height_m < high_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {high_m:g} m.")
     x_m, y_m = _grid_axes(partial, spacing_m)
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     nearest_m = max(MIN_LEG_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4 * math.pi))

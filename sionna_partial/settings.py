@@ -170,6 +170,8 @@ class SceneSettings:
         Longest gap that is closed in a seen wall [m]; at most two cells are bridged, whatever this allows.
     floor_extent : {"observed", "map", "none"}
         What floor and ceiling span: the observed area (nothing comes from unknown cells), the whole map, or nothing.
+    ceiling : bool
+        Whether there is a ceiling above the floor.
 
     Raises
     ------
@@ -181,6 +183,7 @@ class SceneSettings:
     outline_tolerance_cells: float = 0.5
     bridge_gap_m: float = 0.2
     floor_extent: Literal["observed", "map", "none"] = "observed"
+    ceiling: bool = True
 
     def __post_init__(self) -> None:
         require(isinstance(self.material, Material), "material", self.material, "give a Material.")
@@ -188,6 +191,7 @@ class SceneSettings:
         require_number("bridge_gap_m", self.bridge_gap_m, 0.0, 1.0)
         extents = ("observed", "map", "none")
         require(self.floor_extent in extents, "floor_extent", self.floor_extent, f"choose one of {extents}.")
+        require(isinstance(self.ceiling, bool), "ceiling", self.ceiling, "give True or False.")
 
 
 @dataclass(frozen=True)
@@ -200,9 +204,12 @@ class TraceSettings:
         Carrier frequency [Hz].
     max_depth : int
         Largest number of interactions on a path, 0 (line of sight alone) to 10.
-    diffraction : bool
-        One diffraction at a vertical edge, with at most two reflections around it. Found by exact beams, as line of
-        sight and specular reflections are, unless rays are shot anyway.
+    diffraction : bool or None
+        One diffraction at a vertical edge, with at most two reflections around it. On floor plans it is found by exact
+        beams, as line of sight and specular reflections are; on meshes by shooting rays, which is slow. None is True
+        on floor plans and False on meshes.
+    open_ends : bool
+        Whether a wall of a floor plan diffracts also where it ends because observation did.
     refraction, diffuse_reflection : bool
         Further interactions. With either of them, every path is found by shooting rays (Sionna RT's own candidate
         generator), which is slower than exact beams.
@@ -219,7 +226,8 @@ class TraceSettings:
 
     frequency_hz: float = CARRIER_FREQUENCY_HZ
     max_depth: int = 6
-    diffraction: bool = False
+    diffraction: bool | None = None
+    open_ends: bool = False
     refraction: bool = False
     diffuse_reflection: bool = False
     samples_per_tx: int = 1_000_000
@@ -231,6 +239,7 @@ class TraceSettings:
             value = getattr(self, name)
             require(isinstance(value, Integral) and not isinstance(value, bool), name, value, "give a whole number.")
             require_number(name, value, low, high)
-        for name in ("diffraction", "refraction", "diffuse_reflection"):
+        for name in ("diffraction", "open_ends", "refraction", "diffuse_reflection"):
             value = getattr(self, name)
-            require(isinstance(value, bool), name, value, "give True or False.")
+            unset = name == "diffraction" and value is None
+            require(unset or isinstance(value, bool), name, value, "give True or False.")

@@ -74,6 +74,7 @@ def fake_trace(
         rx=rx_m,
         link_state=state.astype(np.uint8),
         gain_db=np.maximum(gain_db, -150.0),
+        path_tx=no_paths.astype(np.int32),
         path_rx=no_paths.astype(np.int32),
         a=no_paths.astype(np.complex128),
         delay_s=no_paths,

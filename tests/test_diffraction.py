@@ -1,138 +1,239 @@
-"""Ways over an edge against brute force in the plan, and their geometry in space."""
+"""Edges drawn as small plans, and ways over them against brute force in the plan and their geometry in space."""
 
 import itertools
 
 import numpy as np
 import pytest
+from extruded import ROOM, SPLINTERS, chains_between, extrude
 from numpy.typing import NDArray
-from test_beams import ROOM, SPLINTERS, _exists
 
-from sionna_partial.tracing.candidates import CEILING, EDGE, FLOOR, Candidates
-from sionna_partial.tracing.diffraction import Wedges, diffraction_candidates
+from sionna_partial.tracing.candidates import EDGE, Candidates
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, diffraction_candidates, find_wedges
+from sionna_partial.tracing.scene import SceneGeometry
 
 TX = np.array([1.07, 1.93, 1.2])
+CORNER = np.array([[(3.0, 2.0), (5.0, 2.0)], [(3.0, 2.0), (3.0, 4.0)]])
+"""An L: the sector inside, of 90 degrees, is up and to the right of (3, 2)."""
 
 
-def _free_ends(walls: NDArray[np.float64]) -> Wedges:
-    """Both ends of every wall as screens."""
-    segment, end = np.repeat(np.arange(len(walls)), 2), np.tile([0, 1], len(walls))
-    along = walls[segment, 1] - walls[segment, 0]
-    normal = np.stack([along[:, 1], -along[:, 0]], axis=1) / np.hypot(*along.T)[:, None]
-    return Wedges(segment, end, normal, -normal)
+def _join(geometry: SceneGeometry, rx: NDArray[np.float64], tx: NDArray[np.float64] = TX, max_depth: int = 3):
+    """Candidates of all blocks, of which there are several."""
+    wedges = find_wedges(geometry, open_ends=False)
+    blocks = diffraction_candidates(geometry, wedges, tx, rx, max_depth, candidates_per_block=50)
+    parts = [part for part, _ in blocks]
+    names = ("rx", "face", "vertices_m", "wedge")
+    return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), wedges)
 
 
-def _join(
-    walls: NDArray[np.float64], wedges: Wedges, rx: NDArray[np.float64], *, horizontal: bool = False, max_depth: int = 3
-) -> Candidates:
-    blocks = [
-        block
-        for block, _ in diffraction_candidates(
-            walls, wedges, TX, rx, height_m=2.5, horizontal=horizontal, max_depth=max_depth, candidates_per_block=50
-        )
-    ]
-    fields = Candidates.__dataclass_fields__
-    return Candidates(*(np.concatenate([getattr(block, name) for block in blocks]) for name in fields))
+def _star(*degrees: float) -> NDArray[np.float64]:
+    """Walls of 1 m from the origin, given by their directions."""
+    angle = np.radians(degrees)
+    return np.stack([np.zeros((len(angle), 2)), np.column_stack([np.cos(angle), np.sin(angle)])], axis=1)
 
 
-def _chains(walls: NDArray[np.float64], start: NDArray[np.float64], stop: NDArray[np.float64]) -> set[tuple[int, ...]]:
-    """Textbook wall chains between two points, of which either may be the end of a wall."""
-    return {
-        chain
-        for length in range(3)
-        for chain in itertools.product(range(len(walls)), repeat=length)
-        if all(a != b for a, b in itertools.pairwise(chain)) and _exists(walls, chain, start, stop)
-    }
+def _sectors(walls: NDArray[np.float64], place: tuple[float, float] = (0.0, 0.0)) -> list[tuple[int, int]]:
+    """Walls that bound the sectors in which the edge at one place diffracts, counterclockwise."""
+    wedges = find_wedges(extrude(walls), open_ends=False)
+    at = np.flatnonzero(np.linalg.norm(wedges.edge_m - place, axis=1) < 1e-9)
+    return [tuple((wedges.face[each] // 2).tolist()) for each in at]
 
 
-def test_finds_exactly_the_ways_over_free_ends_that_brute_force_finds() -> None:
-    walls = np.concatenate([SPLINTERS[[0, 1, 3]] + 0.013, [[(0.0, 0.2), (6.0, 0.0)]]])
-    rng = np.random.default_rng(5)
-    rx = np.column_stack([rng.uniform(0.3, 5.7, 12), rng.uniform(0.4, 3.8, 12), np.full(12, 1.5)])
-    wedges = _free_ends(walls)
-    found = _join(walls, wedges, rx)
-    ways = set()
-    for receiver, surface, wedge in zip(found.rx, found.surface, found.wedge, strict=True):
-        at = int(np.flatnonzero(surface == EDGE)[0])
-        after = surface[at + 1 :]
-        ways.add((int(receiver), tuple(surface[:at]), wedge % len(wedges.end), tuple(after[after >= 0])))
-    truth = set()
-    for index, (segment, end) in enumerate(zip(wedges.segment, wedges.end, strict=True)):
-        edge = walls[segment, end]
-        for receiver, point in enumerate(rx[:, :2]):
-            pairs = itertools.product(_chains(walls, TX[:2], edge), _chains(walls, edge, point))
-            truth |= {(receiver, before, index, after) for before, after in pairs if len(before) + len(after) <= 2}
-    assert len(truth) > 200
-    assert ways == truth
+class TestFindWedges:
+    def test_both_sides_of_a_free_end_are_faces(self) -> None:
+        wedges = find_wedges(extrude([[(1.0, 1.0), (2.0, 1.0)]], height_m=2.7), open_ends=False)
+        assert wedges.edge_m.tolist() == [[1.0, 1.0], [2.0, 1.0]]
+        assert wedges.height_m == 2.7
+        # The second triangle of a wall has the vertical edge at its first end, the first that at its second end.
+        assert wedges.face.tolist() == [[1, 1], [0, 0]] * 2
+        up = [0.0, 1.0]
+        np.testing.assert_allclose(wedges.normal[:, 0], [up, np.negative(up), np.negative(up), up], atol=1e-12)
+        np.testing.assert_allclose(wedges.normal[:, 1], -wedges.normal[:, 0], atol=1e-12)
 
+    def test_a_corner_diffracts_outside(self) -> None:
+        wedges = find_wedges(extrude(CORNER), open_ends=False)
+        at = int(np.flatnonzero((wedges.edge_m == [3.0, 2.0]).all(axis=1))[0])
+        # Counterclockwise from the upright wall, over left and below, to the level wall.
+        assert (wedges.face[at] // 2).tolist() == [1, 0]
+        np.testing.assert_allclose(wedges.normal[at], [[-1.0, 0.0], [0.0, -1.0]], atol=1e-12)
+        swapped = at + len(wedges.edge_m)
+        assert wedges.face[swapped].tolist() == wedges.face[at, ::-1].tolist()
+        np.testing.assert_array_equal(wedges.normal[swapped], wedges.normal[at, ::-1])
 
-def test_paths_keep_their_slope_at_the_edge_and_mirror_elsewhere() -> None:
-    rx = np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4]])
-    screens = _free_ends(ROOM)
-    kept = screens.segment >= 4
-    wedges = Wedges(*(getattr(screens, name)[kept] for name in ("segment", "end", "normal_0", "normal_n")))
-    found = _join(ROOM, wedges, rx, horizontal=True)
-    assert {FLOOR, CEILING} <= set(found.surface.ravel().tolist())
-    for index, surface, vertices in zip(found.rx, found.surface, found.vertices_m, strict=True):
-        points = np.concatenate([TX[None], vertices[surface != -1], rx[index][None]])
-        direction = np.diff(points, axis=0)
-        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        for number, before, after in zip(surface, direction[:-1], direction[1:], strict=False):
-            if number == EDGE:
-                assert after[2] == pytest.approx(before[2], abs=1e-9)
-                continue
-            along = ROOM[number, 1] - ROOM[number, 0] if number >= 0 else np.zeros(2)
-            normal = np.array([along[1], -along[0], 0.0]) / np.hypot(*along) if number >= 0 else np.array([0, 0, 1.0])
-            np.testing.assert_allclose(after, before - 2 * np.dot(before, normal) * normal, atol=1e-9)
-
-
-@pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 6])
-def test_depth_limits_the_reflections(max_depth: int) -> None:
-    found = list(
-        diffraction_candidates(
-            ROOM, _free_ends(ROOM), TX, np.array([[4.5, 0.7, 2.1]]), height_m=2.5, horizontal=True, max_depth=max_depth
-        )
+    @pytest.mark.parametrize(
+        ("degrees", "sectors"),
+        [
+            ((0,), [(0, 0)]),
+            ((0, 90), [(1, 0)]),
+            ((90, 0), [(0, 1)]),
+            ((0, 180), []),
+            ((0, 179.99), []),
+            ((0, 170), [(1, 0)]),
+            ((0, -170), [(0, 1)]),
+            ((0, 90, 180), []),
+            ((0, 90, 270), []),
+            ((0, 90, 180, 270), []),
+            ((90, 210, 330), []),
+            ((0, 45, 90), [(2, 0)]),
+            ((60, 90, 120), [(2, 0)]),
+            ((175, 185, 180), [(1, 0)]),
+            ((0, 90, 175), [(2, 0)]),
+        ],
     )
-    depth = max((int((block.surface != -1).sum(axis=1).max()) for block, _ in found), default=0)
-    assert depth == min(max_depth, 3)
+    def test_a_sector_wider_than_a_half_plane_diffracts(
+        self, degrees: tuple[float, ...], sectors: list[tuple[int, int]]
+    ) -> None:
+        assert _sectors(_star(*degrees)) == sectors
+
+    @pytest.mark.parametrize("turn_deg", [0.0, 37.0, 90.0, 180.0, 251.0])
+    def test_turning_the_plan_turns_the_wedges(self, turn_deg: float) -> None:
+        assert _sectors(_star(*(np.array([0.0, 45.0, 90.0]) + turn_deg))) == [(2, 0)]
+
+    def test_walls_given_end_to_end_are_the_same_walls(self) -> None:
+        swapped = _star(0, 90)[:, ::-1]
+        there, back = (find_wedges(extrude(walls), open_ends=False) for walls in (_star(0, 90), swapped))
+        at, to = (int(np.flatnonzero((each.edge_m == 0.0).all(axis=1))[0]) for each in (there, back))
+        np.testing.assert_allclose(back.normal[to], there.normal[at])
+        assert (back.face[to] // 2).tolist() == (there.face[at] // 2).tolist()
+        assert (back.face[to] % 2).tolist() == [0, 0]
+        assert (there.face[at] % 2).tolist() == [1, 1]
+
+    def test_no_edge_has_two_wedges(self) -> None:
+        edge_m = find_wedges(extrude(np.concatenate([ROOM, SPLINTERS])), open_ends=True).edge_m
+        assert len(np.unique(edge_m, axis=0)) == len(edge_m)
+
+    def test_open_ends_diffract_if_asked(self) -> None:
+        geometry = extrude([[(1.0, 1.0), (2.0, 1.0)]], open_ends_m=[(2.0, 1.0)])
+        assert find_wedges(geometry, open_ends=False).edge_m.tolist() == [[1.0, 1.0]]
+        assert find_wedges(geometry, open_ends=True).edge_m.tolist() == [[1.0, 1.0], [2.0, 1.0]]
+
+    def test_without_walls_there_are_none(self) -> None:
+        wedges = find_wedges(extrude(np.zeros((0, 2, 2))), open_ends=True)
+        assert [len(each) for each in (wedges.edge_m, wedges.face, wedges.normal)] == [0, 0, 0]
 
 
-def test_a_corner_does_not_diffract_inside() -> None:
-    walls = np.array([[(3.0, 2.0), (5.0, 2.0)], [(3.0, 2.0), (3.0, 4.0)]])
-    outwards = np.array([[0.0, -1.0]]), np.array([[-1.0, 0.0]])
-    corner = Wedges(np.array([0]), np.array([0]), *outwards)
-    inside, outside = np.array([[4.0, 3.0, 1.0]]), np.array([[4.0, 1.0, 1.0]])
-    assert (
-        len(list(diffraction_candidates(walls, corner, TX, inside, height_m=2.5, horizontal=False, max_depth=1))) == 0
+class TestDiffractionCandidates:
+    def test_finds_exactly_the_ways_over_free_ends_that_brute_force_finds(self) -> None:
+        walls = np.concatenate([SPLINTERS[[0, 1, 3]] + 0.013, [[(0.0, 0.2), (6.0, 0.0)]]])
+        geometry = extrude(walls, floor_m=())
+        rng = np.random.default_rng(5)
+        rx = np.column_stack([rng.uniform(0.3, 5.7, 12), rng.uniform(0.4, 3.8, 12), np.full(12, 1.5)])
+        found = _join(geometry, rx)
+        edges = found.wedges.edge_m
+        ways = set()
+        for receiver, face, wedge in zip(found.rx, found.face, found.wedge, strict=True):
+            at = int(np.flatnonzero(face == EDGE)[0])
+            before, after = face[:at] // 2, face[at + 1 :]
+            ways.add((int(receiver), tuple(before), int(wedge % len(edges)), tuple(after[after >= 0] // 2)))
+        truth = set()
+        for index, edge in enumerate(edges):
+            for receiver, point in enumerate(rx[:, :2]):
+                onward = chains_between(walls, edge, point, 2)
+                pairs = itertools.product(chains_between(walls, TX[:2], edge, 2), onward)
+                truth |= {(receiver, before, index, after) for before, after in pairs if len(before) + len(after) <= 2}
+        assert len(edges) == 8
+        assert len(truth) > 200
+        assert ways == truth
+        assert len(found.rx) == len(truth)
+
+    def test_paths_keep_their_slope_at_the_edge_and_mirror_elsewhere(self) -> None:
+        rx = np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4]])
+        geometry = extrude(ROOM)
+        found = _join(geometry, rx)
+        assert {geometry.floor_face, geometry.ceiling_face} <= set(found.face.ravel().tolist())
+        for index, face, vertices in zip(found.rx, found.face, found.vertices_m, strict=True):
+            points = np.concatenate([TX[None], vertices[face != -1], rx[index][None]])
+            direction = np.diff(points, axis=0)
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            for number, before, after in zip(face, direction[:-1], direction[1:], strict=False):
+                if number == EDGE:
+                    assert after[2] == pytest.approx(before[2], abs=1e-9)
+                    continue
+                normal = np.array([0, 0, 1.0])
+                if number < geometry.floor_face:
+                    along = np.diff(ROOM[number // 2], axis=0)[0]
+                    normal = np.array([along[1], -along[0], 0.0]) / np.hypot(*along)
+                np.testing.assert_allclose(after, before - 2 * np.dot(before, normal) * normal, atol=1e-9)
+
+    def test_a_floor_alone_is_met_once(self) -> None:
+        geometry = extrude(ROOM, ceiling=False)
+        found = _join(geometry, np.array([[4.5, 0.7, 2.1]]))
+        flats = found.face >= geometry.floor_face
+        assert set(flats.sum(axis=1).tolist()) == {0, 1}
+        assert set(found.face[flats].tolist()) == {geometry.floor_face}
+
+    def test_without_floor_and_ceiling_only_walls_reflect(self) -> None:
+        geometry = extrude(ROOM, floor_m=())
+        assert _join(geometry, np.array([[4.5, 0.7, 2.1]])).face.max() < 2 * len(ROOM)
+
+    @pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 6])
+    def test_depth_limits_the_reflections(self, max_depth: int) -> None:
+        geometry, rx = extrude(ROOM), np.array([[4.5, 0.7, 2.1]])
+        found = list(diffraction_candidates(geometry, find_wedges(geometry, open_ends=False), TX, rx, max_depth))
+        depth = max((int((block.face != -1).sum(axis=1).max()) for block, _ in found), default=0)
+        assert depth == min(max_depth, MAX_REFLECTIONS + 1)
+
+    @pytest.mark.parametrize(
+        ("tx", "wall"),
+        [((4.0, 1.0, 1.2), 0), ((1.07, 3.0, 1.2), 1), ((1.07, 1.93, 1.2), 1)],
+        ids=["below lights the level wall", "left lights the upright wall", "both are lit"],
     )
-    block, share = next(diffraction_candidates(walls, corner, TX, outside, height_m=2.5, horizontal=False, max_depth=1))
-    assert share == 1.0
-    np.testing.assert_allclose(block.vertices_m[0, 0, :2], [3.0, 2.0])
-    # Face 0 is lit: the transmitter is below the horizontal wall.
-    assert block.wedge.tolist() == [0]
+    def test_the_face_that_the_transmitter_lights_comes_first(self, tx: tuple[float, ...], wall: int) -> None:
+        geometry, place = extrude(CORNER), np.array(tx)
+        found = _join(geometry, np.array([[2.5, 0.5, 1.0]]), place, 1)
+        row = int(np.flatnonzero((found.vertices_m[:, 0, :2] == [3.0, 2.0]).all(axis=1))[0])
+        normal = found.wedges.normal[found.wedge[row]]
+        assert normal[0] @ (place[:2] - [3.0, 2.0]) > 0
+        assert found.wedges.face[found.wedge[row], 0] // 2 == wall
 
+    def test_a_corner_does_not_diffract_inside(self) -> None:
+        geometry = extrude(CORNER)
+        inside = np.array([[4.0, 3.0, 1.0], [3.5, 2.2, 1.0]])
+        for tx, rx in ((TX, inside), (inside[0], TX[None]), (inside[0], inside[1:])):
+            found = _join(geometry, rx, tx, 1)
+            assert not (found.vertices_m[:, 0, :2] == [3.0, 2.0]).all(axis=1).any()
 
-def test_the_face_that_the_transmitter_lights_comes_first() -> None:
-    walls = np.array([[(3.0, 2.0), (5.0, 2.0)], [(3.0, 2.0), (3.0, 4.0)]])
-    swapped = Wedges(np.array([0]), np.array([0]), np.array([[0.0, -1.0]]), np.array([[-1.0, 0.0]]))
-    above = np.array([1.07, 3.0, 1.2])
-    blocks = diffraction_candidates(
-        walls, swapped, above, np.array([[4.0, 1.0, 1.0]]), height_m=2.5, horizontal=False, max_depth=1
-    )
-    assert next(blocks)[0].wedge.tolist() == [1]
+    def test_nothing_diffracts_between_the_rooms_at_a_junction(self) -> None:
+        """Sionna RT diffracts there at whichever wedge a ray finds first, and so leaks through the wall."""
+        walls = np.array([[(2.0, 2.0), (3.0, 2.0)], [(3.0, 2.0), (4.0, 2.0)], [(3.0, 2.0), (3.0, 3.0)]])
+        left, right = np.array([2.5, 2.5, 1.0]), np.array([[3.5, 2.5, 1.0]])
+        found = _join(extrude(walls), right, left, 3)
+        assert not (found.vertices_m[..., :2] == [3.0, 2.0]).all(axis=2).any()
 
+    def test_at_a_bent_junction_nothing_joins_two_sectors(self) -> None:
+        """Walls at 0, 45 and 90 degrees: only the sector of 270 degrees diffracts, and within itself."""
+        geometry, radius = extrude(_star(0, 45, 90)), 0.5
+        places = {
+            degrees: np.array([radius * np.cos(np.radians(degrees)), radius * np.sin(np.radians(degrees)), 1.0])
+            for degrees in (20, 70, 100, 200, 350)
+        }
+        for (a, tx), (b, rx) in itertools.permutations(places.items(), 2):
+            wedges = find_wedges(geometry, open_ends=False)
+            blocks = list(diffraction_candidates(geometry, wedges, tx, rx[None], 1))
+            at = [(block.vertices_m[:, 0, :2] == 0.0).all(axis=1).sum() for block, _ in blocks]
+            assert sum(at) == (a >= 100 and b >= 100), (a, b)
 
-def test_without_wedges_there_are_no_candidates() -> None:
-    none = Wedges(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2)))
-    assert not list(diffraction_candidates(ROOM, none, TX, TX[None] + 1.0, height_m=2.5, horizontal=True, max_depth=3))
+    def test_an_open_end_diffracts_if_asked(self) -> None:
+        geometry = extrude([[(3.0, 1.0), (3.0, 3.0)]], open_ends_m=[(3.0, 1.0)], floor_m=())
+        rx = np.array([[5.0, 2.0, 1.0]])
+        for open_ends in (False, True):
+            wedges = find_wedges(geometry, open_ends=open_ends)
+            (block, share), *rest = diffraction_candidates(geometry, wedges, TX, rx, 1)
+            assert share == 1.0
+            assert not rest
+            assert sorted(block.vertices_m[:, 0, 1]) == ([1.0, 3.0] if open_ends else [3.0])
 
+    def test_without_wedges_there_are_no_candidates(self) -> None:
+        geometry = extrude(ROOM[:4])
+        wedges = find_wedges(geometry, open_ends=True)
+        assert len(wedges.edge_m) == 4
+        inside = TX[None] + [2.0, 0.5, 0.1]
+        assert not list(diffraction_candidates(geometry, wedges, TX, inside, 3))
+        empty = extrude(np.zeros((0, 2, 2)))
+        assert not list(diffraction_candidates(empty, find_wedges(empty, open_ends=True), TX, inside, 3))
 
-def test_a_way_over_a_junction_of_three_walls_counts_once() -> None:
-    walls = np.array([[(2.0, 2.0), (3.0, 2.0)], [(3.0, 2.0), (4.0, 2.0)], [(3.0, 2.0), (3.0, 3.0)]])
-    screens = _free_ends(walls)
-    junction = Wedges(
-        np.array([0, 1, 2]), np.array([1, 0, 0]), screens.normal_0[[0, 2, 4]], screens.normal_n[[0, 2, 4]]
-    )
-    blocks = diffraction_candidates(
-        walls, junction, TX, np.array([[4.0, 1.0, 1.0]]), height_m=2.5, horizontal=False, max_depth=1
-    )
-    assert [len(block.rx) for block, _ in blocks] == [1]
+    def test_without_receivers_there_are_no_candidates(self) -> None:
+        geometry = extrude(ROOM)
+        wedges = find_wedges(geometry, open_ends=False)
+        assert not [
+            block for block, _ in diffraction_candidates(geometry, wedges, TX, np.zeros((0, 3)), 3) if len(block.rx)
+        ]

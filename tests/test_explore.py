@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from meshes import OBSERVED, room, scene_mesh, surface_m2
 from scipy.spatial.distance import pdist
 
 from sionna_partial.constants import CellState
@@ -12,6 +13,7 @@ from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.explore import CAMERA_RANGE_M, FORWARD_M, explore
 from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.mesh_map import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
 
 GIBSON = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson"
@@ -66,6 +68,16 @@ def test_what_is_seen_is_true_and_grows(home_seed, seed):
         assert partial.interior_cells == home.interior_cells
         assert (partial.resolution_m, partial.origin_m) == (home.resolution_m, home.origin_m)
         before = partial.state
+
+
+def test_meshes_are_cut_to_what_is_seen():
+    home = mesh_map(scene_mesh(*room().geometry.values()), MeshReading(observed=OBSERVED))
+    nothing, little, everything = explore(home, (0, 3, 200))
+    assert len(nothing.mesh.triangles) == 0
+    assert 0.0 < surface_m2(little.mesh) < surface_m2(everything.mesh) <= surface_m2(home.mesh) + 1e-6
+    for partial in (nothing, little, everything):
+        assert partial == cut_to_known(partial)
+        assert partial.height_range_m == (0.0, 3.0)
 
 
 def test_nothing_is_seen_before_the_first_step():

@@ -44,6 +44,7 @@ def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
         rx=np.asarray(rx, dtype=float),
         link_state=np.full(count, state, dtype=np.uint8),
         gain_db=np.full(count, gain_db),
+        path_tx=np.zeros(0, dtype=np.int32),
         path_rx=np.zeros(0, dtype=np.int32),
         a=np.zeros(0, dtype=complex),
         delay_s=np.zeros(0),

@@ -21,10 +21,12 @@ PACKAGE = ROOT / "sionna_partial"
 
 MODULES = (
     *("constants", "errors", "resources", "settings", "files", "llvm", "llvm_probe"),
-    *("maps.partial_map", "maps.map_turn", "maps.ros_map", "maps.map_files", "maps.homes", "maps.explore"),
+    *("maps.mesh_cut", "maps.mesh", "maps.partial_map", "maps.map_turn", "maps.ros_map"),
+    *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.homes", "maps.explore"),
     *("walls.lines", "walls.cells", "walls.chains", "walls.bridges", "walls.graph", "walls.outlines"),
     *("tracing.scene", "tracing.plan", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
-    *("tracing.solver", "tracing.trace"),
+    *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver", "tracing.probe"),
+    *("tracing.generator", "tracing.trace", "tracing.gradients"),
     *("learning.features", "learning.networks", "learning.fitting", "learning.predictor_files", "learning.predictor"),
     *("coverage", "plot", "export", "demo", "info", "cli"),
 )

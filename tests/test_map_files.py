@@ -2,6 +2,7 @@
 
 import io
 import re
+import sysconfig
 import zipfile
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from meshes import OBSERVED, room, surface_m2
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
@@ -108,17 +110,21 @@ def test_scene_folder_reads_nothing_outside(tmp_path: Path, outside: str) -> Non
         load_map(folder)
 
 
-@pytest.mark.parametrize("name", ["map.yaml", "scene.xml"])
-def test_folder_without_scene(tmp_path: Path, name: str) -> None:
-    (export(tmp_path) / name).unlink()
-    with pytest.raises(MapError, match=rf"is no exported scene: there is no {name} in '.*'; give a ROS map YAML"):
+def test_folder_without_scene(tmp_path: Path) -> None:
+    (export(tmp_path) / "scene.xml").unlink()
+    with pytest.raises(MapError, match=r"is no scene: it has 0 .xml files; give the path of one, or a ROS map YAML"):
+        load_map(tmp_path)
+    for name in ("a.xml", "b.xml"):
+        (tmp_path / name).write_text("<scene/>")
+    with pytest.raises(MapError, match=r"is no scene: it has 2 .xml files; give the path of one, or a ROS map YAML"):
         load_map(tmp_path)
 
 
-def test_foreign_xml(tmp_path: Path) -> None:
-    (tmp_path / "scene.xml").write_text("<scene/>")
-    with pytest.raises(MapError, match="is no exported scene"):
-        load_map(tmp_path / "scene.xml")
+def test_scene_without_shapes(tmp_path: Path) -> None:
+    (export(tmp_path) / "map.yaml").unlink()
+    for path in (tmp_path, tmp_path / "scene.xml"):
+        with pytest.raises(MapError, match=r"scene.xml' holds no shape: give a Mitsuba scene with meshes"):
+            load_map(path)
 
 
 @pytest.mark.parametrize("name", ["gone.yaml", "gone.npz", "gone", "gone.xml", "a" * 300, "a\0b", ""])
@@ -136,15 +142,89 @@ def test_bare_image(tmp_path: Path, name: str) -> None:
 
 
 def test_unknown_kind(tmp_path: Path) -> None:
-    (tmp_path / "map.ply").write_bytes(b"ply")
-    with pytest.raises(MapError, match=r"map\.ply' is of no known kind: give a ROS map YAML"):
-        load_map(tmp_path / "map.ply")
+    (tmp_path / "map.dae").write_bytes(b"dae")
+    with pytest.raises(MapError, match=r"map\.dae' is of no known kind: give a ROS map YAML"):
+        load_map(tmp_path / "map.dae")
 
 
 @pytest.mark.parametrize("path", [None, 3, SMALL, ["map.yaml"]])
 def test_not_a_path(path: object) -> None:
     with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
         load_map(path)  # type: ignore[arg-type]
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def room_file(tmp_path: Path) -> Path:
+    path = tmp_path / "room.glb"
+    room().export(path)
+    return path
+
+
+def test_mesh_file(room_file: Path) -> None:
+    partial = load_map(room_file)
+    assert partial.mesh is not None
+    assert (len(partial.mesh.triangles), partial.resolution_m, partial.origin_m) == (24, 0.05, (-0.05, -0.05))
+    assert (partial.height_range_m, partial.wall_height_m) == ((0.0, 3.0), 3.0)
+    assert partial.is_complete
+    assert load_map(room_file, wall_height_m=9.0).height_range_m == (0.0, 9.0)
+    part = load_map(room_file, observed=OBSERVED[:3], resolution_m=0.1, height_band_m=(0.2, 2.9), up="z")
+    assert part.mesh is not None
+    assert surface_m2(part.mesh) < surface_m2(partial.mesh)
+    assert load_map(room_file, observed=part, resolution_m=0.1, height_band_m=(0.2, 2.9)) == part
+    assert load_map(room_file, up="y").height_range_m == (0.0, 4.0)
+
+
+def test_scene_of_sionna() -> None:
+    folder = Path(sysconfig.get_paths()["purelib"]) / "sionna" / "rt" / "scenes" / "simple_street_canyon"
+    partial = load_map(folder, resolution_m=1.0)
+    assert partial == load_map(folder / "simple_street_canyon.xml", resolution_m=1.0)
+    assert partial.mesh is not None
+    assert len(partial.mesh.materials) == 5
+    assert 0 < (partial.state == WALL).sum() < (partial.state == FREE).sum()
+
+
+def test_mesh_in_npz(tmp_path: Path, room_file: Path) -> None:
+    for partial in (load_map(room_file), load_map(room_file, observed=OBSERVED[:3], wall_height_m=8.0)):
+        save_map(partial, tmp_path / "home.npz")
+        assert load_map(tmp_path / "home.npz") == partial
+    assert load_map(tmp_path / "home.npz", wall_height_m=4.0).height_range_m == (0.0, 4.0)
+
+
+def test_mesh_is_not_written_to_yaml(tmp_path: Path, room_file: Path) -> None:
+    with pytest.raises(OutputError, match=r"home.yaml' cannot hold the map's mesh: choose .npz, or use export_scene"):
+        save_map(load_map(room_file), tmp_path / "home.yaml")
+    assert list(tmp_path.iterdir()) == [room_file]
+
+
+def test_npz_with_too_large_a_mesh(tmp_path: Path, room_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_map(load_map(room_file, resolution_m=1.0), tmp_path / "home.npz")
+    monkeypatch.setattr(map_files, "_MESH_BYTES", 500)
+    with pytest.raises(MapError, match=r"home.npz' holds more than 5,000,000 triangles: cut or simplify the mesh"):
+        load_map(tmp_path / "home.npz")
+
+
+@pytest.mark.parametrize("name", ["mesh_materials", "mesh_height_range_m", "mesh_vertices_m"])
+def test_npz_with_a_damaged_mesh(tmp_path: Path, room_file: Path, name: str) -> None:
+    save_map(load_map(room_file, resolution_m=1.0), tmp_path / "home.npz")
+    with np.load(tmp_path / "home.npz") as content:
+        arrays = {key: content[key] for key in content if key != name}
+    (tmp_path / "home.npz").write_bytes(npz_bytes(**arrays))
+    with pytest.raises(MapError, match=r"home.npz' is damaged or was not written by save_map"):
+        load_map(tmp_path / "home.npz")
+
+
+def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
+    save_map(SMALL, tmp_path / "home.npz")
+    folder = export(tmp_path / "scene")
+    with pytest.raises(MapError, match=r"resolution_m is for meshes alone, but path = '.*home.npz' is none: leave it"):
+        load_map(tmp_path / "home.npz", resolution_m=0.1)
+    with pytest.raises(
+        MapError, match=r"up is for meshes alone, but path = '.*' is an exported map \(remove its map.yam"
+    ):
+        load_map(folder, up="z")
 
 
 # --- damaged npz ------------------------------------------------------------------------------------------------------

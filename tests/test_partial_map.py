@@ -1,12 +1,14 @@
 """PartialMap: what a robot knows of a floor plan."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from meshes import box, scene_mesh
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
@@ -294,3 +296,28 @@ def test_positions_pass_where_the_map_allows_them(state: np.ndarray, points: np.
         else:
             with pytest.raises(PositionError, match="rx = "):
                 partial.require_positions("rx", point)
+
+
+# --- meshes -----------------------------------------------------------------------------------------------------------
+
+
+def test_mesh_says_how_high_radios_may_be() -> None:
+    mesh = scene_mesh(box((10, -4, 100), (12, -3, 104)))
+    partial = replace(PLAN, mesh=mesh)
+    assert (PLAN.height_range_m, partial.height_range_m) == ((0.0, 2.5), (100.0, 104.0))
+    assert partial.require_positions("tx", (10.75, -3.25, 103.9)).tolist() == [10.75, -3.25, 103.9]
+    for z in (1.5, 100.0, 104.0):
+        with pytest.raises(PositionError, match=r"is not between floor and ceiling \(100 to 104 m\)"):
+            partial.require_positions("tx", (10.75, -3.25, z))
+
+
+def test_mesh_is_compared() -> None:
+    mesh, other = scene_mesh(box((0, 0, 0), (1, 1, 1))), scene_mesh(box((0, 0, 0), (1, 1, 2)))
+    assert replace(PLAN, mesh=mesh) == replace(PLAN, mesh=replace(mesh))
+    assert replace(PLAN, mesh=mesh) != PLAN
+    assert replace(PLAN, mesh=mesh) != replace(PLAN, mesh=other)
+
+
+def test_mesh_of_another_kind() -> None:
+    with pytest.raises(MapError, match=r"mesh is of type str: give a SceneMesh, or None for a plan\."):
+        replace(PLAN, mesh="room.ply")  # type: ignore[arg-type]

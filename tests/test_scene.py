@@ -1,25 +1,29 @@
 """Scenes: literal geometry, files on disk, and what stock Sionna RT makes of them."""
 
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 import yaml
+from extruded import drawn
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from meshes import OBSERVED, room
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.mesh import merged_mesh
+from sionna_partial.maps.mesh_map import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
-from sionna_partial.tracing.scene import FAR_M, build_scene, export_scene, write_scene
+from sionna_partial.tracing.scene import FAR_M, build_scene, export_scene, write_mesh_scene, write_scene
 
-CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
 ROOM = """
     ????????????
     ?##########?
@@ -30,13 +34,6 @@ ROOM = """
     ?#####.####?
     ????????????
 """
-
-
-def drawn(text: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = (0.0, 0.0)) -> PartialMap:
-    """Map of an ASCII drawing, its last line at the bottom."""
-    rows = text.split()
-    state = np.array([[CELLS[c] for c in row] for row in reversed(rows)], dtype=np.uint8)
-    return PartialMap(state, resolution_m, origin_m)
 
 
 def covered(rectangles_m: NDArray[np.float64], partial: PartialMap) -> NDArray[np.int_]:
@@ -77,6 +74,41 @@ def test_floor_covers_free_cells_and_the_walls_they_touch() -> None:
     floor = covered(build_scene(partial).floor_m, partial)
     expected = drawn("?????? ?###?? ?###?? ?###?? ??#?#? ??????").state == CellState.WALL
     np.testing.assert_array_equal(floor, expected)
+
+
+def test_without_a_ceiling_there_is_no_such_shape(tmp_path: Path) -> None:
+    partial, open_air = drawn(ROOM), SceneSettings(ceiling=False)
+    folder = export_scene(partial, tmp_path / "scene", open_air)
+    assert {path.stem for path in (folder / "meshes").iterdir()} == {"walls", "floor"} == set(load(folder).objects)
+    covered_over, open_above = build_scene(partial), build_scene(partial, open_air)
+    assert covered_over.ceiling
+    assert covered_over.ceiling_face == covered_over.floor_face + len(covered_over.floor_mesh[1])
+    assert not open_above.ceiling
+    assert (open_above.floor_face, open_above.ceiling_face) == (2 * len(open_above.segments), -1)
+    bare = build_scene(partial, SceneSettings(floor_extent="none"))
+    assert (bare.floor_face, bare.ceiling_face) == (-1, -1)
+
+
+@pytest.mark.parametrize(
+    ("text", "ends"),
+    [
+        # A wall between two rooms that stops at a door: jambs are ends of the wall.
+        ("........ ###..### ........", {(2.5, 1.5): False, (5.5, 1.5): False, (0.5, 1.5): True, (7.5, 1.5): True}),
+        # The same wall, seen in part: what lies beyond its end may be more of it.
+        ("........ ###????? ........", {(2.5, 1.5): True, (0.5, 1.5): True}),
+        ("..?..... ###..... ..?.....", {(2.5, 1.5): False, (0.5, 1.5): True}),
+        # Upright.
+        (".#. .#. .#. ... ...", {(1.5, 2.5): False, (1.5, 4.5): True}),
+        (".#. .#. .#. .?. ...", {(1.5, 2.5): True, (1.5, 4.5): True}),
+        # Where two walls meet there is no end.
+        ("..... .###. .#... .#... .....", {(1.5, 3.5): False, (3.5, 3.5): False, (1.5, 1.5): False}),
+    ],
+    ids=["door", "half seen", "unseen beside", "upright", "upright half seen", "corner"],
+)
+def test_open_ends(text: str, ends: dict[tuple[float, float], bool]) -> None:
+    geometry = build_scene(drawn(text, 1.0))
+    found = dict(zip(map(tuple, geometry.vertices_m.tolist()), geometry.open_end.tolist(), strict=True))
+    assert found == ends
 
 
 def test_floor_of_the_whole_map_and_no_floor() -> None:
@@ -237,6 +269,82 @@ def test_far_maps_are_moved_to_the_origin(origin_m: tuple[float, float], tmp_pat
     shift = np.subtract(origin_m, offset)
     np.testing.assert_allclose(mesh(folder, "walls").vertices - [*shift, 0.0], here.vertices, atol=1e-4)
     assert load_map(folder).origin_m == pytest.approx(origin_m)
+
+
+class TestMeshScene:
+    """A map with a mesh: its parts, one for each material."""
+
+    WOOD = Material(itu="wood", thickness_m=0.05)
+
+    def partial(self, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PartialMap:
+        walls, inner = room().geometry.values()
+        vertices = np.concatenate([walls.vertices, inner.vertices]) + shift_m
+        triangles = np.concatenate([walls.faces, inner.faces + len(walls.vertices)])
+        material = np.repeat([2, 0], 12)
+        whole = merged_mesh(vertices, triangles, material, (None, Material(), self.WOOD))
+        corners = np.add(OBSERVED, shift_m[:2])
+        return mesh_map(whole, MeshReading(observed=corners, resolution_m=0.1))
+
+    def test_stock_sionna_loads_and_solves_the_scene(self, tmp_path: Path) -> None:
+        scene = load(export_scene(self.partial(), tmp_path / "scene"))
+        assert set(scene.objects) == {"part0", "part2"}
+        assert {m.name: float(m.thickness[0]) for m in scene.radio_materials.values()} == pytest.approx(
+            {"material0": 0.1, "material2": 0.05}
+        )
+        assert count_paths(scene, (1.6, 1.9, 1.5), (2.2, 2.9, 1.2)) > 8
+
+    @pytest.mark.parametrize(
+        "shift_m", [(0, 0, 0), (500_000.3, 4_500_000.7, 0.25), (0.1, 0.2, 2240.7), (-9000.3, -998.2, -1001.6)]
+    )
+    def test_reading_back_gives_the_same_map(self, tmp_path: Path, shift_m: tuple[float, float, float]) -> None:
+        partial = self.partial(shift_m)
+        folder = export_scene(partial, tmp_path / "scene")
+        assert load_map(folder) == load_map(folder / "map.yaml") == load_map(folder / "scene.xml") == partial
+        assert load_map(folder, wall_height_m=5.0).height_range_m[1] == pytest.approx(shift_m[2] + 5.0)
+        assert np.abs(mesh(folder, "part0").vertices).max() <= FAR_M
+
+    def test_wide_meshes_come_back_to_the_last_digit(self, tmp_path: Path) -> None:
+        whole = self.partial().mesh
+        assert whole is not None
+        wide = replace(whole, vertices_m=whole.vertices_m * (1234.56789, 0.1, 1.0) - (0.1, 0.2, 0.3))
+        partial = mesh_map(wide, MeshReading(resolution_m=1.0))
+        assert load_map(export_scene(partial, tmp_path / "scene")) == partial
+
+    def test_scene_without_its_map_is_a_mitsuba_scene(self, tmp_path: Path) -> None:
+        folder = export_scene(self.partial(), tmp_path / "scene")
+        (folder / "map.yaml").unlink()
+        read = load_map(folder, resolution_m=0.1, observed=OBSERVED)
+        assert read.mesh is not None
+        assert read.mesh.materials == (Material(), self.WOOD)
+        np.testing.assert_array_equal(read.state, self.partial().state)
+
+    def test_plan_scene_without_its_map_is_a_mitsuba_scene(self, tmp_path: Path) -> None:
+        folder = export_scene(drawn(ROOM), tmp_path / "scene")
+        (folder / "map.yaml").unlink()
+        read = load_map(folder, resolution_m=0.5)
+        assert read.mesh is not None
+        np.testing.assert_allclose(read.mesh.bounds_m, [[0.5, 0.5, 0.0], [5.5, 3.5, 3.0]])
+
+    def test_nothing_observed(self, tmp_path: Path) -> None:
+        nothing = cut_to_known(replace(self.partial(), state=np.full((3, 3), CellState.UNKNOWN)))
+        folder = export_scene(nothing, tmp_path / "scene")
+        assert load_map(folder) == nothing
+        assert set(load(folder).objects) == set()
+
+    def test_triangles_stand_in_mesh_order(self, tmp_path: Path) -> None:
+        whole = self.partial().mesh
+        assert whole is not None
+        write_mesh_scene(whole, tmp_path, offset_m=(1.0, 2.0), default_material=Material())
+        for index in (0, 2):
+            part = mesh(tmp_path, f"part{index}")
+            expected = whole.corners_m[whole.material == index] - (1.0, 2.0, 0.0)
+            np.testing.assert_array_equal(part.vertices[part.faces], expected)
+            assert len(part.vertices) == 8
+
+    def test_frequency_outside_a_material_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(SettingsError, match=r"frequency_hz = 500000000000.0 .*wood"):
+            export_scene(self.partial(), tmp_path / "scene", frequency_hz=5e11)
+        assert list(tmp_path.iterdir()) == []
 
 
 def test_only_maps_and_scene_settings_are_taken() -> None:

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -41,9 +42,10 @@ def test_constants_of_the_paper() -> None:
 def test_defaults_are_the_papers() -> None:
     assert Material() == Material(relative_permittivity=2.94, conductivity_s_m=0.1226, thickness_m=0.1, itu=None)
     assert TraceSettings() == TraceSettings(
-        frequency_hz=28e9, max_depth=6, diffraction=False, refraction=False, diffuse_reflection=False
+        frequency_hz=28e9, max_depth=6, diffraction=None, open_ends=False, refraction=False, diffuse_reflection=False
     )
     assert SceneSettings().material == Material()
+    assert SceneSettings().ceiling is True
 
 
 @pytest.mark.parametrize("settings", [Material(), SceneSettings(), TraceSettings()])
@@ -93,13 +95,25 @@ def test_whole_numbers(name: str) -> None:
         TraceSettings(**{name: 3.0})  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["diffraction", "refraction", "diffuse_reflection"])
-def test_switches(name: str) -> None:
-    assert getattr(TraceSettings(), name) is False
-    assert getattr(TraceSettings(**{name: True}), name) is True  # type: ignore[arg-type]
-    for value in (1, 0, "yes", None):
-        with pytest.raises(SettingsError, match=f"{name} = {value!r} is not allowed: give True or False"):
-            TraceSettings(**{name: value})  # type: ignore[arg-type]
+SWITCHES = {
+    (TraceSettings, "diffraction"): None,
+    (TraceSettings, "open_ends"): False,
+    (TraceSettings, "refraction"): False,
+    (TraceSettings, "diffuse_reflection"): False,
+    (SceneSettings, "ceiling"): True,
+}
+
+
+@pytest.mark.parametrize(("kind", "name"), SWITCHES)
+def test_switches(kind: type, name: str) -> None:
+    default = SWITCHES[kind, name]
+    assert getattr(kind(), name) is default
+    for allowed in (True, False, default):
+        assert getattr(kind(**{name: allowed}), name) is allowed
+    for value in (1, 0, "yes", np.bool_(True), *([] if default is None else [None])):
+        expected = f"{name} = {value!r} is not allowed: give True or False."
+        with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
+            kind(**{name: value})
 
 
 def test_scene_choices() -> None:

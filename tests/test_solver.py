@@ -1,32 +1,147 @@
-"""The solver's verdict on a candidate must not depend on the candidates beside it."""
+"""The solver's verdict depends on a candidate alone, and nothing is compiled twice."""
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
+import pytest
+from extruded import ROOM, extrude
+from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.tracing.beams import trace_beams
 from sionna_partial.tracing.candidates import Candidates, specular_candidates
-from sionna_partial.tracing.scene import build_scene, write_scene
-from sionna_partial.tracing.solver import SceneSolver
+from sionna_partial.tracing.diffraction import diffraction_candidates, find_wedges
+from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.scene import SHAPES, SceneGeometry, build_scene, write_scene
+from sionna_partial.tracing.solver import SceneSolver, _to_device
+
+TX = np.array([1.07, 1.93, 1.2])
+RX = np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4], [5.2, 3.4, 1.9], [4.1, 0.3, 1.1]])
 
 
-def test_order_of_candidates_changes_no_verdict(tmp_path: Path) -> None:
-    """Embree loses hits of rays that are called coherent and are not."""
-    home = sp.make_home(9)
-    geometry = build_scene(home)
-    free = (np.argwhere(home.state == CellState.FREE)[::40, ::-1] + 0.5) * home.resolution_m
-    places = np.column_stack([free, np.full(len(free), 1.5)])
-    tx, rx = places[len(places) // 2], np.delete(places, len(places) // 2, axis=0)
-    walls = geometry.vertices_m[geometry.segments]
-    beams = trace_beams(walls, tx[:2], rx[:, :2], 6)
-    candidates, _ = next(specular_candidates(beams, walls, tx, rx, height_m=3.0, horizontal=True, max_depth=6))
-    xml = write_scene(geometry, tmp_path, offset_m=geometry.origin_m)
-    solver = SceneSolver(xml, sp.TraceSettings(), tx, rx)
-    order = np.random.default_rng(0).permutation(len(candidates.rx))
-    shuffled = Candidates(
-        candidates.rx[order], candidates.surface[order], candidates.vertices_m[order], candidates.wedge
-    )
-    counts = [np.bincount(solver.verify(each).path_rx, minlength=len(rx)) for each in (candidates, shuffled)]
-    np.testing.assert_array_equal(*counts)
+def _solver(geometry: SceneGeometry, folder: Path) -> SceneSolver:
+    xml = write_scene(geometry, folder, offset_m=geometry.origin_m)
+    return SceneSolver(xml, SHAPES, sp.TraceSettings())
+
+
+def _specular(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
+    beams = trace_beams(geometry.walls_m, tx[:2], rx[:, :2], depth)
+    return next(specular_candidates(beams, geometry, tx, rx, depth))[0]
+
+
+def _diffracted(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
+    return next(diffraction_candidates(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth))[0]
+
+
+def _rows(candidates: Candidates, rows: NDArray[np.intp]) -> Candidates:
+    names = ("rx", "face", "vertices_m") + ("wedge",) * (candidates.wedge is not None)
+    return dataclasses.replace(candidates, **{name: getattr(candidates, name)[rows] for name in names})
+
+
+def _sorted(paths: SolvedPaths) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Delays and gains, each in order within a receiver: rounding may swap paths of equal delay."""
+    delay_s, gain = paths.delay_s, np.abs(paths.a)
+    return delay_s[np.lexsort([delay_s, paths.path_rx])], gain[np.lexsort([gain, paths.path_rx])]
+
+
+class TestVerify:
+    def test_order_of_candidates_changes_no_verdict(self, tmp_path: Path) -> None:
+        """Embree loses hits of rays that are called coherent and are not."""
+        home = sp.make_home(9)
+        geometry = build_scene(home)
+        free = (np.argwhere(home.state == CellState.FREE)[::40, ::-1] + 0.5) * home.resolution_m
+        places = np.column_stack([free, np.full(len(free), 1.5)])
+        tx, rx = places[len(places) // 2], np.delete(places, len(places) // 2, axis=0)
+        candidates = _specular(geometry, tx, rx, 6)
+        solver = _solver(geometry, tmp_path)
+        order = np.random.default_rng(0).permutation(len(candidates.rx))
+        shuffled = _rows(candidates, order)
+        counts = [
+            np.bincount(solver.verify(each, tx, rx).path_rx, minlength=len(rx)) for each in (candidates, shuffled)
+        ]
+        np.testing.assert_array_equal(*counts)
+
+    @pytest.mark.parametrize("make", [_specular, _diffracted], ids=["specular", "diffracted"])
+    def test_numbers_of_walls_change_nothing(self, make, tmp_path: Path) -> None:
+        """A path depends on where walls are, not on the order in which they are written."""
+        answers = []
+        for number, walls in enumerate((ROOM, ROOM[::-1], ROOM[[2, 5, 0, 4, 1, 3]][:, ::-1])):
+            geometry, folder = extrude(walls), tmp_path / str(number)
+            folder.mkdir()
+            answers.append(_sorted(_solver(geometry, folder).verify(make(geometry, TX, RX, 2), TX, RX)))
+        assert len(answers[0][0]) > 20
+        for delay_s, gain in answers[1:]:
+            np.testing.assert_allclose(delay_s, answers[0][0], rtol=1e-6)
+            np.testing.assert_allclose(gain, answers[0][1], rtol=1e-3)
+
+    @pytest.mark.parametrize("missing", [(), ("ceiling",), ("floor", "ceiling"), ("walls",), SHAPES])
+    def test_shapes_that_the_scene_lacks_count_no_faces(self, missing: tuple[str, ...], tmp_path: Path) -> None:
+        walls = np.zeros((0, 2, 2)) if "walls" in missing else ROOM[:4]
+        floor_m = () if "floor" in missing else ((0, 0, 6, 4),)
+        geometry = extrude(walls, floor_m=floor_m, ceiling="ceiling" not in missing)
+        rx = np.array([[4.9, 3.1, 1.7]])
+        candidates = _specular(geometry, TX, rx, 1)
+        paths = _solver(geometry, tmp_path).verify(candidates, TX, rx)
+        expected = 1 + 4 * ("walls" not in missing) + ("floor" not in missing) + (not missing or missing == ("walls",))
+        assert len(paths.a) == len(candidates.rx) == expected
+
+    def test_a_candidate_through_a_wall_is_refused(self, tmp_path: Path) -> None:
+        geometry = extrude(ROOM)
+        rx = np.array([[5.0, 0.4, 1.5], [2.0, 2.0, 1.5]])
+        through = Candidates(np.array([0, 1], np.int32), np.full((2, 1), -1, np.int32), np.zeros((2, 1, 3)))
+        assert _solver(geometry, tmp_path).verify(through, TX, rx).path_rx.tolist() == [1]
+
+    def test_no_candidates_give_no_paths(self, tmp_path: Path) -> None:
+        geometry = extrude(ROOM)
+        none = _rows(_specular(geometry, TX, RX, 2), np.zeros(0, np.intp))
+        paths = _solver(geometry, tmp_path).verify(none, TX, RX)
+        assert paths.a.shape == paths.path_rx.shape == (0,)
+        assert paths.vertices_m.shape == (0, 2, 3)
+
+
+class TestAlignment:
+    def test_arrays_start_where_those_of_drjit_do(self) -> None:
+        starts = []
+
+        def kind(array: NDArray[np.float32]) -> None:
+            starts.append(array.ctypes.data % 64)
+
+        room = np.arange(40, dtype=np.float32)
+        for skip in range(5):
+            _to_device(kind, room[skip : skip + 8])
+        assert starts == [0] * 5
+
+    def test_values_and_shape_are_kept(self) -> None:
+        for values in (np.arange(12, dtype=np.uint32).reshape(3, 4)[:, ::2], np.zeros((0, 3)), np.array([7.5])):
+            kept = _to_device(np.array, values)
+            np.testing.assert_array_equal(kept, values)
+            assert kept.dtype == values.dtype
+
+    @pytest.mark.parametrize("make", [_specular, _diffracted], ids=["specular", "diffracted"])
+    def test_nothing_is_compiled_twice(self, make, tmp_path: Path) -> None:
+        """Other receivers, other numbers of candidates and arrays elsewhere in memory: the kernels are there."""
+        geometry = extrude(ROOM)
+        solver = _solver(geometry, tmp_path)
+        import drjit as dr  # after LLVM
+
+        candidates = make(geometry, TX, RX, 2)
+        solver.verify(candidates, TX, RX)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            for skip in range(1, 8):
+                fewer = _rows(_elsewhere(candidates, skip), np.arange(skip, len(candidates.rx)))
+                solver.verify(fewer, TX + 0.01 * skip, RX)
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        assert len(kernels) >= 7
+        assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []
+
+
+def _elsewhere(candidates: Candidates, skip: int) -> Candidates:
+    """Copy candidates to addresses that are off by `skip` of their numbers."""
+    moved = {}
+    for name in ("rx", "face", "vertices_m"):
+        values = getattr(candidates, name)
+        moved[name] = np.concatenate([np.zeros(skip, values.dtype), values.ravel()])[skip:].reshape(values.shape)
+    return dataclasses.replace(candidates, **moved)

@@ -117,12 +117,12 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     partial : PartialMap
         The map on which the links were traced.
     links : TracedLinks
-        N links.
+        From one or T transmitters to N receivers.
 
     Returns
     -------
     LinkFeatures
-        Of N links.
+        Of N or T N links, transmitter by transmitter.
 
     Raises
     ------
@@ -130,11 +130,12 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
         If `partial` is no PartialMap.
     """
     require_map("partial", partial)
+    transmitters = links.tx.reshape(-1, 3)
     return LinkFeatures(
-        link_state=links.link_state,
-        unobserved_distance_m=unobserved_distance_m(partial, links.tx, links.rx),
-        distance_m=_distance_m(links.tx, links.rx),
-        gain_db=links.gain_db,
+        link_state=links.link_state.ravel(),
+        unobserved_distance_m=np.concatenate([unobserved_distance_m(partial, tx, links.rx) for tx in transmitters]),
+        distance_m=_distance_m(transmitters[:, None], links.rx).ravel(),
+        gain_db=links.gain_db.ravel(),
     )
 
 

@@ -18,6 +18,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.mesh_map import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.settings import require
 
@@ -78,7 +79,7 @@ def explore(home: PartialMap, steps: Sequence[int] = (50, 100, 150, 200), seed: 
     -------
     list of PartialMap
         One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Each
-        shows everything that the ones before it show.
+        shows everything that the ones before it show. A mesh is cut to what is known.
 
     Raises
     ------
@@ -103,7 +104,7 @@ def explore(home: PartialMap, steps: Sequence[int] = (50, 100, 150, 200), seed: 
         seen = np.full_like(padded, _UNKNOWN)
         if count:
             seen[row0:row1, column0:column1] = robot.seen
-        maps.append(replace(home, state=seen[1:-1, 1:-1], interior_cells=len(free)))
+        maps.append(cut_to_known(replace(home, state=seen[1:-1, 1:-1], interior_cells=len(free))))
     return maps
 
 

@@ -3,21 +3,33 @@
 import os
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
+import yaml
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import SCENE_FILES, atomic_write, output_path
+from sionna_partial.maps.mesh import MAX_TRIANGLES, mesh_arrays, mesh_of_arrays
+from sionna_partial.maps.mesh_files import MESH_SUFFIXES, read_mesh
+from sionna_partial.maps.mesh_map import MeshReading, mesh_map, raised
+from sionna_partial.maps.mesh_scene import read_exported_mesh, read_mitsuba_scene
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, require_map
 from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
 
-ACCEPTED = "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), or an exported scene (folder or scene.xml)"
+ACCEPTED = (
+    "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), an exported scene (folder or scene.xml), "
+    f"a Mitsuba scene (folder or .xml), or a mesh ({', '.join(MESH_SUFFIXES)})"
+)
 """What load_map reads."""
+
+_MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
+"""Size of the largest array of a mesh [bytes]."""
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
 """Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
@@ -26,20 +38,43 @@ HABITAT_COVERED = (6, 9)
 """Drawings that may cover what is not navigable: target and target bounding box (habitat-lab, maps.py)."""
 
 
-def load_map(path: str | os.PathLike[str], *, strict: bool = False, wall_height_m: float | None = None) -> PartialMap:
-    """Read a map from a file or an exported scene folder.
+def load_map(
+    path: str | os.PathLike[str],
+    *,
+    strict: bool = False,
+    wall_height_m: float | None = None,
+    height_band_m: tuple[float, float] | None = None,
+    observed: ArrayLike | PartialMap | None = None,
+    resolution_m: float | None = None,
+    up: Literal["z", "y"] | None = None,
+) -> PartialMap:
+    """Read a map from a file or a scene folder.
+
+    A mesh is laid on cells: observed cells in which it has a surface in the height band are walls, other observed
+    cells are free. The map carries the mesh itself, cut at the border of its known cells seen from above.
 
     Parameters
     ----------
     path : path-like
-        A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image), an `.npz` of `save_map`, or an
-        exported scene: its folder or its `scene.xml`.
+        A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image); an `.npz` of `save_map`; an
+        exported scene: its folder or its `scene.xml`; a mesh in metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene
+        of meshes, with the radio materials of Sionna RT: its `.xml`, or a folder with one.
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
         wall.
     wall_height_m : float or None
-        Wall height [m] in place of the file's.
+        Wall height [m] in place of the file's. For a mesh, the height above its lowest point up to which radios may
+        be (by default its highest point), as on roofs.
+    height_band_m : (float, float) or None
+        World z between which a surface of a mesh is a wall [m]. By default `DEFAULT_BAND_M` above its lowest point.
+    observed : (M, 2) array-like, PartialMap or None
+        What has been observed of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it
+        is. By default all cells above or below which the mesh has a surface.
+    resolution_m : float or None
+        Edge of the cells of a mesh's map [m], 0.05 by default. They lie on multiples of it.
+    up : {"z", "y"} or None
+        Axis of a mesh file that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB files.
 
     Returns
     -------
@@ -50,17 +85,27 @@ def load_map(path: str | os.PathLike[str], *, strict: bool = False, wall_height_
     Raises
     ------
     MapError
-        If there is no such file, or it is damaged, of another kind or out of range.
+        If there is no such file, or it is damaged, of another kind or out of range; or if an argument for meshes is
+        given and it is none.
     """
     if not isinstance(path, (str, os.PathLike)):
         raise MapError(f"path = {path!r} is not a path: give {ACCEPTED}.")
-    source, suffix = Path(path), Path(path).suffix.lower()
-    if os.path.isdir(source) or (suffix == ".xml" and os.path.exists(source)):
-        return _read_scene_map(source, wall_height_m)
-    if not os.path.isfile(source):
+    source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
+    if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
+    if os.path.isdir(source) or source.suffix.lower() == ".xml":
+        return _read_scene_map(source, wall_height_m, reading)
+    if source.suffix.lower() in MESH_SUFFIXES:
+        return mesh_map(read_mesh(source, up), reading, wall_height_m)
+    reading.require_unused(source, "none")
+    return _read_grid_file(source, strict=strict, wall_height_m=wall_height_m)
+
+
+def _read_grid_file(source: Path, *, strict: bool, wall_height_m: float | None) -> PartialMap:
+    suffix = source.suffix.lower()
     if suffix in (".yaml", ".yml"):
-        return read_ros_map(source, strict=strict, wall_height_m=wall_height_m)
+        partial = read_ros_map(source, strict=strict, wall_height_m=wall_height_m)
+        return _with_exported_mesh(partial, source, wall_height_m)
     if suffix == ".npz":
         return _read_npz(source, wall_height_m)
     if suffix in (".pgm", ".png", ".bmp"):
@@ -79,7 +124,7 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     partial : PartialMap
         The map.
     path : path-like
-        `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem) or `.npz`.
+        `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem; not for a map with a mesh) or `.npz`.
     extra : mapping or None
         Further keys for the YAML.
 
@@ -88,12 +133,14 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     MapError
         If `partial` is no PartialMap.
     OutputError
-        For another suffix, or if writing fails; nothing half written is left behind.
+        For another suffix, for a map with a mesh as YAML, or if writing fails; nothing half written is left behind.
     """
     require_map("partial", partial)
     target = output_path(path)
     suffix = target.suffix.lower()
     if suffix in (".yaml", ".yml"):
+        if partial.mesh is not None:
+            raise OutputError(f"path = '{target}' cannot hold the map's mesh: choose .npz, or use export_scene.")
         write_ros_map(partial, target, extra)
     elif suffix == ".npz":
         content: dict[str, Any] = {
@@ -104,6 +151,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
         }
         if partial.interior_cells is not None:
             content["interior_cells"] = partial.interior_cells
+        if partial.mesh is not None:
+            content |= mesh_arrays(partial.mesh)
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content)
     else:
@@ -308,30 +357,49 @@ def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDAr
         raise MapError(f"{name} has shape {array.shape} and {other} {like.shape}: give arrays of one shape.")
 
 
-def _read_scene_map(source: Path, wall_height_m: float | None) -> PartialMap:
+def _read_scene_map(source: Path, wall_height_m: float | None, reading: MeshReading) -> PartialMap:
+    """Read an exported scene, or else the Mitsuba scene that a path leads to."""
     folder = source if source.is_dir() else source.parent
-    for name in SCENE_FILES:
-        if not (folder / name).is_file():
+    scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
+    if folder / "scene.xml" not in scenes or not all((folder / name).is_file() for name in SCENE_FILES):
+        if len(scenes) != 1:
             raise MapError(
-                f"path = '{source}' is no exported scene: there is no {name} in '{folder}'; give {ACCEPTED}."
+                f"path = '{source}' is no scene: it has {len(scenes)} .xml files; give the path of one, or {ACCEPTED}."
             )
-    return read_ros_map(folder / "map.yaml", wall_height_m=wall_height_m, confined=True)
+        return mesh_map(read_mitsuba_scene(scenes[0]), reading, wall_height_m)
+    reading.require_unused(source, "an exported map (remove its map.yaml to read the meshes of its scene alone)")
+    partial = read_ros_map(folder / "map.yaml", wall_height_m=wall_height_m, confined=True)
+    return _with_exported_mesh(partial, folder / "map.yaml", wall_height_m)
+
+
+def _with_exported_mesh(partial: PartialMap, path: Path, wall_height_m: float | None) -> PartialMap:
+    """Add the meshes of the scene beside a map YAML, if it says that they are the building."""
+    sheet = yaml.safe_load(path.read_bytes())
+    if "mesh" not in sheet:
+        return partial
+    partial = replace(partial, mesh=read_exported_mesh(path.parent, sheet))
+    return partial if wall_height_m is None else raised(partial)
 
 
 def _read_npz(source: Path, wall_height_m: float | None) -> PartialMap:
     try:
         with zipfile.ZipFile(source) as archive:
-            size = archive.getinfo("state.npy").file_size
-        if size > MAX_CELLS + 1000:
+            sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
+        if sizes.pop("state.npy") > MAX_CELLS + 1000:
             raise MapError(f"path = '{source}' holds more than {MAX_CELLS:,} cells: cut the map or coarsen it.")
+        if max(sizes.values(), default=0) > _MESH_BYTES:
+            raise MapError(f"path = '{source}' holds more than {MAX_TRIANGLES:,} triangles: cut or simplify the mesh.")
         with np.load(source, allow_pickle=False) as content:
             state, resolution_m = content["state"], content["resolution_m"].item()
             origin_m, height = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
+            mesh = mesh_of_arrays(content)
     except MapError:
         raise
     except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files
         raise MapError(
             f"path = '{source}' is damaged or was not written by save_map ({error}): save it again."
         ) from error
-    return PartialMap(state, resolution_m, origin_m, height if wall_height_m is None else wall_height_m, interior)
+    if wall_height_m is None:
+        return PartialMap(state, resolution_m, origin_m, height, interior, mesh)
+    return raised(PartialMap(state, resolution_m, origin_m, wall_height_m, interior, mesh))

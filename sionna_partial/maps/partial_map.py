@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, PositionError
+from sionna_partial.maps.mesh import SceneMesh
 
 MAX_CELLS = 100_000_000
 """Largest number of cells of a map: more is a unit error or a map that should be cut."""
@@ -35,9 +36,11 @@ class PartialMap:
     origin_m : (float, float)
         World x and y of the lower-left corner of the lower-left cell [m].
     wall_height_m : float
-        Height of walls and ceiling [m].
+        Height of walls and ceiling of a plan [m]. A mesh has its own (`height_range_m`).
     interior_cells : int or None
         Number of free cells of the complete home, where a simulation knows it.
+    mesh : SceneMesh or None
+        What is known of the building, in place of walls extruded from the cells. Its z is the world's.
 
     Raises
     ------
@@ -50,6 +53,7 @@ class PartialMap:
     origin_m: tuple[float, float] = (0.0, 0.0)
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M
     interior_cells: int | None = None
+    mesh: SceneMesh | None = None
 
     def __post_init__(self) -> None:
         state = _checked_state(self.state)
@@ -66,6 +70,8 @@ class PartialMap:
             raise MapError(
                 f"interior_cells = {cells!r} is not allowed: give the number of free cells of the home, or None."
             )
+        if not (self.mesh is None or isinstance(self.mesh, SceneMesh)):
+            raise MapError(f"mesh is of type {type(self.mesh).__name__}: give a SceneMesh, or None for a plan.")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PartialMap):
@@ -76,6 +82,7 @@ class PartialMap:
             and self.origin_m == other.origin_m
             and self.wall_height_m == other.wall_height_m
             and self.interior_cells == other.interior_cells
+            and self.mesh == other.mesh
         )
 
     @property
@@ -89,6 +96,13 @@ class PartialMap:
         """World (x_min, y_min, x_max, y_max) of the grid [m]."""
         (x, y), (ny, nx) = self.origin_m, self.shape
         return x, y, x + nx * self.resolution_m, y + ny * self.resolution_m
+
+    @property
+    def height_range_m(self) -> tuple[float, float]:
+        """World z of floor and ceiling [m]; of a mesh, its ends. Radios are between them."""
+        if self.mesh is None or self.mesh.height_range_m is None:
+            return 0.0, self.wall_height_m
+        return self.mesh.height_range_m
 
     @property
     def is_complete(self) -> bool:
@@ -179,7 +193,7 @@ class PartialMap:
         if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
             raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
         x0, y0, x1, y1 = self.bounds_m
-        height = self.wall_height_m
+        low, high = self.height_range_m
         flat = points.reshape(-1, 3)
         finite = ~np.any(~np.isfinite(flat), axis=1)
         placed = np.where(finite[:, None], flat, 0.0)
@@ -193,8 +207,8 @@ class PartialMap:
                 "move it inside, or extend the map with unknown cells.",
             ),
             (
-                (z <= 0.0) | (z >= height),
-                f"is not between floor and ceiling (0 to {height:g} m)",
+                (z <= low) | (z >= high),
+                f"is not between floor and ceiling ({low:g} to {high:g} m)",
                 "change its height z or the map's wall_height_m.",
             ),
             (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),

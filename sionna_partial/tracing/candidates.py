@@ -5,22 +5,46 @@ where it meets floor and ceiling depends on the length of that way alone.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.tracing.beams import Beams
+from sionna_partial.tracing.scene import SceneGeometry
 
-FLOOR = -2
-"""Surface index of the floor in a candidate."""
+EDGE = -2
+"""Stands for the face of an interaction in a candidate where that is a diffraction."""
 
-CEILING = -3
-"""Surface index of the ceiling in a candidate."""
+FLOOR, CEILING, BEND = -2, -3, -4
+"""Stand for a wall segment in a chain where a path meets the floor, the ceiling or a vertical edge."""
 
-EDGE = -4
-"""Surface index of a vertical edge that diffracts in a candidate."""
+
+@dataclass(frozen=True)
+class Wedges:
+    """Vertical edges, each with the two faces that bound the room around it.
+
+    Around an edge, walls bound sectors. Only a sector wider than a half-plane holds directions that the walls hide from
+    each other, so an edge diffracts in one sector at most, and where three or more walls meet mostly in none. A free end
+    of a wall has both of its sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
+
+    Parameters
+    ----------
+    edge_m : (W, 2) float64 array
+        The edges in the plan [m].
+    height_m : float
+        Height that they rise to from 0 [m].
+    face : (2 W, 2) int32 array
+        0-face and n-face of the scene: counterclockwise from the 0-face of wedge i < W lies the sector, then the n-face.
+    normal : (2 W, 2, 2) float64 array
+        Their unit normals, which point into the sector.
+    """
+
+    edge_m: NDArray[np.float64]
+    height_m: float
+    face: NDArray[np.int32]
+    normal: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -31,30 +55,36 @@ class Candidates:
     ----------
     rx : (C,) int32 array
         Receiver of each candidate.
-    surface : (C, D) int32 array
-        Wall segment (>= 0), FLOOR, CEILING or EDGE of every interaction in order from the transmitter; -1 where there
-        is none.
+    face : (C, D) int32 array
+        Face of the scene at every interaction in order from the transmitter, counted through its shapes; any of the
+        faces in one plane stands for all. EDGE where the path diffracts, -1 where there is no interaction.
     vertices_m : (C, D, 3) float64 array
         Points of interaction [m].
-    wedge : (C,) int32 array
-        Wedge at which each candidate diffracts (see `Wedges`); empty if none does.
+    wedge : (C,) int32 array, optional
+        Wedge at which each candidate diffracts.
+    wedges : Wedges, optional
+        Given if all candidates diffract.
     """
 
     rx: NDArray[np.int32]
-    surface: NDArray[np.int32]
+    face: NDArray[np.int32]
     vertices_m: NDArray[np.float64]
-    wedge: NDArray[np.int32]
+    wedge: NDArray[np.int32] | None = None
+    wedges: Wedges | None = None
+
+    def rows(self, index: NDArray[np.intp]) -> "Candidates":
+        """Pick some of the candidates."""
+        wedge = None if self.wedge is None else self.wedge[index]
+        return replace(self, rx=self.rx[index], face=self.face[index], vertices_m=self.vertices_m[index], wedge=wedge)
 
 
 def specular_candidates(
     beams: Beams,
-    walls_m: NDArray[np.float64],
+    geometry: SceneGeometry,
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
-    *,
-    height_m: float,
-    horizontal: bool,
     max_depth: int,
+    *,
     pairs_per_block: int = 20_000,
 ) -> Iterator[tuple[Candidates, float]]:
     """Add the reflections off floor and ceiling, block by block.
@@ -62,15 +92,10 @@ def specular_candidates(
     Parameters
     ----------
     beams : Beams
-        Result of `trace_beams` for the same plan.
-    walls_m : (S, 2, 2) array
-        End points of the wall segments [m].
+        Result of `trace_beams` for the walls of `geometry`.
+    geometry : SceneGeometry
     tx_m, rx_m : (3,) and (N, 3) arrays
-        Transmitter and receivers [m], between floor (z = 0) and ceiling.
-    height_m : float
-        Height of the ceiling [m].
-    horizontal : bool
-        Whether there are floor and ceiling at all.
+        Transmitter and receivers in the local frame [m], between floor (z = 0) and ceiling.
     max_depth : int
         Largest number of interactions of a path.
     pairs_per_block : int
@@ -90,20 +115,27 @@ def specular_candidates(
             beams.source,
             beams.pair_node[start:stop],
             beams.pair_rx[start:stop],
-            walls_m,
+            geometry.walls_m,
             tx_m,
             rx_m,
-            height_m,
-            horizontal,
+            geometry.height_m,
+            geometry.floor_face >= 0,
+            geometry.ceiling_face >= 0,
             max_depth,
         )
-        candidates = Candidates(rx, surface, vertices_m, wedge=np.zeros(0, np.int32))
-        yield candidates, stop / len(beams.pair_node)
+        yield Candidates(rx, faces_of(surface, geometry), vertices_m), stop / len(beams.pair_node)
+
+
+def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.int32]:
+    """Turn wall segments, FLOOR, CEILING and BEND (C, D) into faces of the scene; -1 stays."""
+    walls = 2 * np.arange(len(geometry.segments), dtype=np.int32)
+    others = np.array([EDGE, geometry.ceiling_face, geometry.floor_face, -1], dtype=np.int32)
+    return np.concatenate([walls, others])[surface]
 
 
 @njit(cache=True)
 def _expand_heights(  # type: ignore[no-untyped-def]
-    parent, segment, source, pair_node, pair_rx, walls, tx, rx, height, horizontal, max_depth
+    parent, segment, source, pair_node, pair_rx, walls, tx, rx, height, floor, ceiling, max_depth
 ):
     """Every order of wall, floor and ceiling reflections of each pair (see `specular_candidates`)."""
     depth_size = max(1, max_depth)
@@ -111,8 +143,7 @@ def _expand_heights(  # type: ignore[no-untyped-def]
     place = np.empty((depth_size, 3))
     total = 0
     for i in range(len(pair_node)):
-        left = max_depth - chain_length(parent, pair_node[i])
-        total += 1 + 2 * left if horizontal else 1
+        total += 1 + 2 * (max_depth - chain_length(parent, pair_node[i]))
     out_rx = np.empty(total, np.int32)
     surface = np.full((total, depth_size), -1, np.int32)
     vertices = np.zeros((total, depth_size, 3))
@@ -122,22 +153,24 @@ def _expand_heights(  # type: ignore[no-untyped-def]
         k, _, good = unfold(parent, segment, source, pair_node[i], walls, target, chain, place)
         if not good:
             continue
-        for bounces in range(max_depth - k + 1 if horizontal else 1):
-            for first in range(2 if bounces else 1):
+        for bounces in range(max_depth - k + 1):
+            for first in (FLOOR, CEILING):
+                if not can_bounce(bounces, first, floor, ceiling):
+                    continue
                 out_rx[count] = pair_rx[i]
-                merge_heights(
-                    chain[:k],
-                    place[:k],
-                    tx,
-                    target,
-                    height,
-                    bounces,
-                    FLOOR if first == 0 else CEILING,
-                    surface[count],
-                    vertices[count],
-                )
+                merge_heights(chain[:k], place[:k], tx, target, height, bounces, first, surface[count], vertices[count])
                 count += 1
     return out_rx[:count].copy(), surface[:count].copy(), vertices[:count].copy()
+
+
+@njit(cache=True)
+def can_bounce(bounces, first, floor, ceiling):  # type: ignore[no-untyped-def]
+    """Whether a path can meet floor and ceiling alternately `bounces` times; without any, `first` counts as FLOOR."""
+    if bounces == 0:
+        return first == FLOOR
+    if bounces == 1:
+        return floor if first == FLOOR else ceiling
+    return floor and ceiling
 
 
 @njit(cache=True)

@@ -13,8 +13,19 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.tracing.beams import Beams, trace_beams_in
-from sionna_partial.tracing.candidates import CEILING, EDGE, FLOOR, Candidates, merge_heights, unfold
+from sionna_partial.tracing.candidates import (
+    BEND,
+    CEILING,
+    FLOOR,
+    Candidates,
+    Wedges,
+    can_bounce,
+    faces_of,
+    merge_heights,
+    unfold,
+)
 from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow, prepare_plan
+from sionna_partial.tracing.scene import SceneGeometry
 
 MAX_REFLECTIONS = 2
 """Largest number of reflections around the diffraction."""
@@ -25,31 +36,12 @@ _EXTERIOR_M = 1e-5
 _NEAR_M = 1e-3
 """Shortest leg in the plan next to an edge [m]: walls that meet there do not mirror it."""
 
+_FLAT_RAD = 1e-3
+"""Walls that meet at less than this angle from a straight line form no edge [rad]."""
+
 _EDGES_AT_ONCE = 32
 """Number of edges whose beams are held in memory together. It does not depend on the receivers, nor does the order of
 the candidates."""
-
-
-@dataclass(frozen=True)
-class Wedges:
-    """Vertical edges in the plan, each with the two faces that meet there.
-
-    A free end of a wall has both sides of the wall as its faces. Where three or more walls meet, Sionna RT knows
-    several wedges in one place, and a path takes the first that it passes outside of. Normals point out of the wedge,
-    whose inner angle is at most 180 degrees. In candidates, wedge W + i is wedge i with its faces swapped.
-
-    Parameters
-    ----------
-    segment, end : (W,) int64 arrays
-        A wall that ends at the edge, and which of its two ends that is.
-    normal_0, normal_n : (W, 2) float64 arrays
-        Unit normals of the two faces.
-    """
-
-    segment: NDArray[np.int64]
-    end: NDArray[np.int64]
-    normal_0: NDArray[np.float64]
-    normal_n: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -67,30 +59,55 @@ class _Arrivals:
     place: NDArray[np.float64]
 
 
+def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
+    """Find the vertical edges of the walls that diffract.
+
+    Parameters
+    ----------
+    geometry : SceneGeometry
+    open_ends : bool
+        Whether walls that end because observation did diffract there.
+    """
+    vertex = geometry.segments.ravel()
+    away = geometry.vertices_m[geometry.segments[:, ::-1].ravel()] - geometry.vertices_m[vertex]
+    angle = np.arctan2(away[:, 1], away[:, 0])
+    order = np.lexsort([angle, vertex])
+    vertex, angle = vertex[order], angle[order]
+    start, count = np.unique(vertex, return_index=True, return_counts=True)[1:]
+    after = np.arange(len(vertex)) + 1
+    after[start + count - 1] = start
+    width = (angle[after] - angle) % (2 * np.pi)
+    width[after == np.arange(len(vertex))] = 2 * np.pi
+    wide = np.flatnonzero((width > np.pi + _FLAT_RAD) & (open_ends | ~geometry.open_end[vertex]))
+    face = (order ^ 1).astype(np.int32)  # of the two triangles of a wall, the second stands at its first end
+    pair = np.stack([face[wide], face[after[wide]]], axis=1)
+    first, last = angle[wide], angle[after[wide]]
+    normal = np.array([[-np.sin(first), np.cos(first)], [np.sin(last), -np.cos(last)]]).transpose(2, 0, 1)
+    return Wedges(
+        edge_m=geometry.vertices_m[vertex[wide]],
+        height_m=geometry.height_m,
+        face=np.concatenate([pair, pair[:, ::-1]]),
+        normal=np.concatenate([normal, normal[:, ::-1]]),
+    )
+
+
 def diffraction_candidates(
-    walls_m: NDArray[np.float64],
+    geometry: SceneGeometry,
     wedges: Wedges,
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
-    *,
-    height_m: float,
-    horizontal: bool,
     max_depth: int,
+    *,
     candidates_per_block: int = 100_000,
 ) -> Iterator[tuple[Candidates, float]]:
     """Find every way over one vertical edge with at most two reflections, block by block.
 
     Parameters
     ----------
-    walls_m : (S, 2, 2) array
-        End points of the wall segments [m].
+    geometry : SceneGeometry
     wedges : Wedges
     tx_m, rx_m : (3,) and (N, 3) arrays
-        Transmitter and receivers [m], between floor (z = 0) and ceiling.
-    height_m : float
-        Height of the ceiling [m].
-    horizontal : bool
-        Whether there are floor and ceiling at all.
+        Transmitter and receivers in the local frame [m], between floor (z = 0) and ceiling.
     max_depth : int
         Largest number of interactions of a path, the diffraction included.
     candidates_per_block : int
@@ -103,27 +120,25 @@ def diffraction_candidates(
         Share of all edges done with this block.
     """
     reflections = min(MAX_REFLECTIONS, max_depth - 1)
-    if reflections < 0 or len(wedges.segment) == 0:
+    if reflections < 0 or len(wedges.edge_m) == 0:
         return
-    edges_m, edge = np.unique(walls_m[wedges.segment, wedges.end], axis=0, return_inverse=True)
-    by_edge = np.argsort(edge, kind="stable")
-    wedge_start = np.searchsorted(edge[by_edge], np.arange(len(edges_m) + 1))
-    faces = np.hstack([wedges.normal_0, wedges.normal_n])[by_edge]
+    walls_m = geometry.walls_m
+    flats = (geometry.floor_face >= 0, geometry.ceiling_face >= 0)
+    normals = wedges.normal[: len(wedges.edge_m)].reshape(-1, 4)
     plan, receivers = prepare_plan(walls_m), bin_points(rx_m[:, :2])
-    arrivals = _arrivals(plan, walls_m, edges_m, tx_m, reflections)
+    arrivals = _arrivals(plan, walls_m, wedges.edge_m, tx_m, reflections)
     reached = np.flatnonzero(np.diff(arrivals.start))
     for first in range(0, len(reached), _EDGES_AT_ONCE):
         group = reached[first : first + _EDGES_AT_ONCE]
-        beams = _departures(plan, receivers, edges_m[group], arrivals, group, reflections)
+        beams = _departures(plan, receivers, wedges.edge_m[group], arrivals, group, reflections)
         common = (beams.parent, beams.segment, beams.source, beams.pair_node, beams.pair_rx, walls_m, rx_m)
-        ways = (group, edges_m, arrivals.start, arrivals.count, arrivals.length_m, arrivals.wall, arrivals.place)
-        rows = _combine(*common, *ways, wedge_start, faces, tx_m, reflections, horizontal)
+        ways = (group, wedges.edge_m, arrivals.start, arrivals.count, arrivals.length_m, arrivals.wall, arrivals.place)
+        rows = _combine(*common, *ways, normals, tx_m, reflections, *flats)
         for low in range(0, len(rows), candidates_per_block):
             part = rows[low : low + candidates_per_block]
-            rx, surface, vertices_m, wedge = _write(part, *common, *ways, tx_m, height_m, reflections)
-            original = by_edge[wedge % len(faces)] + len(faces) * (wedge // len(faces))
+            rx, surface, vertices_m = _write(part, *common, *ways, tx_m, geometry.height_m, reflections)
             share = (first + len(group) * min(1.0, (low + candidates_per_block) / len(rows))) / len(reached)
-            yield Candidates(rx, surface, vertices_m, original.astype(np.int32)), share
+            yield Candidates(rx, faces_of(surface, geometry), vertices_m, part[:, 2].copy(), wedges), share
 
 
 def _arrivals(
@@ -184,17 +199,17 @@ def _root(parent, node):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _outside(face, x, y):  # type: ignore[no-untyped-def]
-    """Whether a direction from the edge points away from the two faces of a wedge."""
-    first = face[0] * x + face[1] * y > _EXTERIOR_M
-    return first, first or face[2] * x + face[3] * y > _EXTERIOR_M
+def _outside(normals, x, y):  # type: ignore[no-untyped-def]
+    """Whether a point, seen from the edge, is in front of the 0-face of a wedge, and in front of either face."""
+    first = normals[0] * x + normals[1] * y > _EXTERIOR_M
+    return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
 
 
 @njit(cache=True)
 def _combine(  # type: ignore[no-untyped-def]
     parent, segment, source, pair_node, pair_rx, walls, rx,
     group, edges, start, count, length, wall, place,
-    wedge_start, faces, tx, reflections, horizontal,
+    normals, tx, reflections, floor, ceiling,
 ):  # fmt: skip
     """Join arrivals and departures: rows of (pair, arrival, wedge, bounces off floor and ceiling, first of them)."""
     rows, used = np.empty((1024, 5), np.int32), 0
@@ -212,16 +227,15 @@ def _combine(  # type: ignore[no-untyped-def]
             if left < 0:
                 continue
             ix, iy = (place[j, count[j] - 1, 0], place[j, count[j] - 1, 1]) if count[j] > 0 else (tx[0], tx[1])
-            for w in range(wedge_start[edge], wedge_start[edge + 1]):
-                first, seen = _outside(faces[w], ix - edges[edge, 0], iy - edges[edge, 1])
-                if not seen or not _outside(faces[w], ox, oy)[1]:
-                    continue
-                rows = grow(rows, used + 1 + 2 * left)
-                for bounces in range(left + 1 if horizontal else 1):
-                    for ceiling in range(2 if bounces else 1):
-                        rows[used] = (i, j, w if first else w + len(faces), bounces, ceiling)
+            lit, outside = _outside(normals[edge], ix - edges[edge, 0], iy - edges[edge, 1])
+            if not outside or not _outside(normals[edge], ox, oy)[1]:
+                continue
+            rows = grow(rows, used + 1 + 2 * left)
+            for bounces in range(left + 1):
+                for flat in (FLOOR, CEILING):
+                    if can_bounce(bounces, flat, floor, ceiling):
+                        rows[used] = (i, j, edge if lit else edge + len(edges), bounces, flat)
                         used += 1
-                break
     return rows[:used].copy()
 
 
@@ -232,7 +246,7 @@ def _write(  # type: ignore[no-untyped-def]
     tx, height, reflections,
 ):  # fmt: skip
     """Candidates of the rows that `_combine` gives."""
-    out_rx, wedge = np.empty(len(rows), np.int32), np.empty(len(rows), np.int32)
+    out_rx = np.empty(len(rows), np.int32)
     surface = np.full((len(rows), reflections + 1), -1, np.int32)
     vertices = np.zeros((len(rows), reflections + 1, 3))
     chain, way = np.empty(reflections + 1, np.int64), np.empty((reflections + 1, 3))
@@ -247,10 +261,9 @@ def _write(  # type: ignore[no-untyped-def]
         total = length[j] + onward
         chain[:before], way[:before] = wall[j, :before], place[j, :before]
         way[:before, 2] *= length[j] / total
-        chain[before], way[before] = EDGE, (edges[edge, 0], edges[edge, 1], length[j] / total)
+        chain[before], way[before] = BEND, (edges[edge, 0], edges[edge, 1], length[j] / total)
         size = before + 1 + after
         way[before + 1 : size, 2] = (length[j] + onward * way[before + 1 : size, 2]) / total
-        out_rx[k], wedge[k] = pair_rx[i], rows[k, 2]
-        first = FLOOR if rows[k, 4] == 0 else CEILING
-        merge_heights(chain[:size], way[:size], tx, target, height, rows[k, 3], first, surface[k], vertices[k])
-    return out_rx, surface, vertices, wedge
+        out_rx[k] = pair_rx[i]
+        merge_heights(chain[:size], way[:size], tx, target, height, rows[k, 3], rows[k, 4], surface[k], vertices[k])
+    return out_rx, surface, vertices

@@ -2,7 +2,9 @@
 
 import os
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +16,16 @@ from scipy import ndimage
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
-from sionna_partial.maps.map_files import save_map
+from sionna_partial.maps.mesh import SceneMesh
+from sionna_partial.maps.mesh_scene import exported_record
 from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, settings_or_default
 from sionna_partial.walls.cells import row_runs
-from sionna_partial.walls.outlines import wall_outlines
+from sionna_partial.walls.outlines import Outlines, wall_outlines
+
+SHAPES = ("walls", "floor", "ceiling")
+"""Shapes of an exported floor plan in the order in which faces are counted; those that are empty are left out."""
 
 FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
@@ -39,12 +46,16 @@ class SceneGeometry:
         Ends of the wall outlines [m].
     segments : (S, 2) int64 array
         Walls, as indices into `vertices_m`.
+    open_end : (V,) bool array
+        Where a wall ends because observation did: what lies beyond is not free.
     floor_m : (R, 4) float64 array
         Rectangles x0, y0, x1, y1 of floor and ceiling [m]; they do not overlap.
     cell_m : float
         Edge of the square lattice that the rectangles lie on [m].
     height_m : float
         Height of walls and ceiling [m].
+    ceiling : bool
+        Whether there is a ceiling above the floor.
     material : Material
         Material of everything.
     origin_m : (float, float)
@@ -53,11 +64,33 @@ class SceneGeometry:
 
     vertices_m: NDArray[np.float64]
     segments: NDArray[np.int64]
+    open_end: NDArray[np.bool_]
     floor_m: NDArray[np.float64]
     cell_m: float
     height_m: float
+    ceiling: bool
     material: Material
     origin_m: tuple[float, float]
+
+    @property
+    def walls_m(self) -> NDArray[np.float64]:
+        """End points (S, 2, 2) of the walls [m]."""
+        return self.vertices_m[self.segments]
+
+    @property
+    def floor_face(self) -> int:
+        """First face of the floor, -1 if there is none: faces count through walls, floor and ceiling."""
+        return 2 * len(self.segments) if len(self.floor_m) else -1
+
+    @property
+    def ceiling_face(self) -> int:
+        """First face of the ceiling, -1 if there is none."""
+        return self.floor_face + len(self.floor_mesh[1]) if len(self.floor_m) and self.ceiling else -1
+
+    @cached_property
+    def floor_mesh(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Corners (K, 2) [m] and counterclockwise triangles (T, 3) of the floor."""
+        return _triangles(self.floor_m, self.cell_m)
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
@@ -81,9 +114,11 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
+        open_end=_open_ends(partial, outlines),
         floor_m=_rectangles(_floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
         cell_m=partial.resolution_m,
         height_m=partial.wall_height_m,
+        ceiling=settings.ceiling,
         material=settings.material,
         origin_m=partial.origin_m,
     )
@@ -102,6 +137,9 @@ def export_scene(
     empty), and the map itself as `map.yaml` and `map.pgm`, from which `load_map` reads it back. Scene coordinates are
     the map's world coordinates less `scene_offset` in `map.yaml`: [0, 0], or the lower-left corner of a map that
     reaches farther than `FAR_M` from the origin.
+
+    A map with a mesh has its `meshes/part0.ply` and so on, one for each material, in place of walls, floor and
+    ceiling, and a `scene_offset` of three whole numbers; axes on which it lies on both sides of the origin stay.
 
     Parameters
     ----------
@@ -125,14 +163,42 @@ def export_scene(
     OutputError
         If writing fails; nothing half written is left behind.
     """
+    if isinstance(partial, PartialMap) and partial.mesh is not None:
+        return _export_mesh_scene(partial, partial.mesh, folder, settings, frequency_hz)
     geometry = build_scene(partial, settings)
     geometry.material.require_frequency(frequency_hz)
     far = max(abs(value) for value in partial.bounds_m) > FAR_M
     offset_m = partial.origin_m if far else (0.0, 0.0)
     with atomic_folder(folder) as place:
         write_scene(geometry, place, offset_m=offset_m, frequency_hz=frequency_hz)
-        save_map(partial, place / "map.yaml", extra={"scene_offset": list(offset_m)})
+        write_ros_map(partial, place / "map.yaml", {"scene_offset": list(offset_m)})
     return Path(folder)
+
+
+def _export_mesh_scene(
+    partial: PartialMap,
+    mesh: SceneMesh,
+    folder: str | os.PathLike[str],
+    settings: SceneSettings | None,
+    frequency_hz: float,
+) -> Path:
+    material = settings_or_default("settings", settings, SceneSettings).material
+    for used in {mesh.materials[index] or material for index in np.unique(mesh.material)}:
+        used.require_frequency(frequency_hz)
+    x0, y0, x1, y1 = partial.bounds_m
+    offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]
+    extra = {"scene_offset": offset_m, "mesh": exported_record(mesh)}
+    with atomic_folder(folder) as place:
+        write_mesh_scene(mesh, place, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz)
+        write_ros_map(partial, place / "map.yaml", extra)
+    return Path(folder)
+
+
+def _whole_offset_m(low_m: float, high_m: float) -> float:
+    """Whole number of metres that takes a far axis to the origin, and takes no digit from any number beyond it."""
+    if max(abs(low_m), abs(high_m)) <= FAR_M:
+        return 0.0
+    return float(np.floor(max(low_m, 0.0)) + np.ceil(min(high_m, 0.0)))
 
 
 def write_scene(
@@ -163,15 +229,75 @@ def write_scene(
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
     (folder / "meshes").mkdir(exist_ok=True)
     scene = ET.Element("scene", version="2.1.0")
-    _add_material(scene, geometry.material, frequency_hz)
+    _add_material(scene, "material", geometry.material, frequency_hz)
     for name, (vertices, faces) in _meshes(geometry).items():
         if len(faces):
             mesh = trimesh.Trimesh(vertices + shift, faces, process=False)
             mesh.export(folder / "meshes" / f"{name}.ply")
-            shape = ET.SubElement(scene, "shape", type="ply", id=name)
-            ET.SubElement(shape, "string", name="filename", value=f"meshes/{name}.ply")
-            ET.SubElement(shape, "boolean", name="face_normals", value="true")
-            ET.SubElement(shape, "ref", name="bsdf", id="material")
+            _add_shape(scene, name, "material")
+    return _write_xml(scene, folder)
+
+
+def write_mesh_scene(
+    mesh: SceneMesh,
+    folder: Path,
+    *,
+    offset_m: Sequence[float],
+    default_material: Material,
+    frequency_hz: float = CARRIER_FREQUENCY_HZ,
+) -> Path:
+    """Write `scene.xml` and the meshes of a SceneMesh into an existing folder.
+
+    The shape `part0` has the triangles of the first of the mesh's materials, in their order, `part1` those of the
+    second, and so on; parts without triangles are left out. Triangles of a part share their vertices.
+
+    Parameters
+    ----------
+    mesh : SceneMesh
+    folder : pathlib.Path
+    offset_m : (x, y) or (x, y, z)
+        World position that becomes the scene's origin [m].
+    default_material : Material
+        Takes the place of None among the mesh's materials.
+    frequency_hz : float
+        Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
+
+    Returns
+    -------
+    pathlib.Path
+        `scene.xml`.
+    """
+    shift = np.zeros(3)
+    shift[: len(offset_m)] = offset_m
+    (folder / "meshes").mkdir(exist_ok=True)
+    scene = ET.Element("scene", version="2.1.0")
+    for index in np.unique(mesh.material):
+        name, material = f"part{index}", mesh.materials[index] or default_material
+        used, triangles = np.unique(mesh.triangles[mesh.material == index], return_inverse=True)
+        _write_ply(folder / "meshes" / f"{name}.ply", mesh.vertices_m[used] - shift, triangles.reshape(-1, 3))
+        _add_material(scene, f"material{index}", material, frequency_hz)
+        _add_shape(scene, name, f"material{index}")
+    return _write_xml(scene, folder)
+
+
+def _write_ply(path: Path, vertices_m: NDArray[np.float64], triangles: NDArray[np.integer]) -> None:
+    """Write a mesh with all digits of its vertices (trimesh would round them to float32)."""
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, triangles
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices_m)}"]
+    lines += [f"property double {axis}" for axis in "xyz"]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(lines).encode() + vertices_m.astype("<f8").tobytes() + faces.tobytes())
+
+
+def _add_shape(scene: ET.Element, name: str, material: str) -> None:
+    shape = ET.SubElement(scene, "shape", type="ply", id=name)
+    ET.SubElement(shape, "string", name="filename", value=f"meshes/{name}.ply")
+    ET.SubElement(shape, "boolean", name="face_normals", value="true")
+    ET.SubElement(shape, "ref", name="bsdf", id=material)
+
+
+def _write_xml(scene: ET.Element, folder: Path) -> Path:
     ET.indent(scene)
     path = folder / "scene.xml"
     ET.ElementTree(scene).write(path, encoding="utf-8")
@@ -183,15 +309,15 @@ def _loads_by_name(itu: str) -> bool:
     return itu != "vacuum" and any(low <= SIONNA_LOAD_GHZ <= high for low, high in ITU_BANDS_GHZ[itu])
 
 
-def _add_material(scene: ET.Element, material: Material, frequency_hz: float) -> None:
+def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz: float) -> None:
     if material.itu is not None and _loads_by_name(material.itu):
-        bsdf = ET.SubElement(scene, "bsdf", type="itu-radio-material", id="material")
+        bsdf = ET.SubElement(scene, "bsdf", type="itu-radio-material", id=name)
         ET.SubElement(bsdf, "string", name="type", value=material.itu)
     else:
         permittivity, conductivity = material.relative_permittivity, material.conductivity_s_m
         if material.itu is not None:
             permittivity, conductivity = _itu_constants(material.itu, frequency_hz)
-        bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id="material")
+        bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id=name)
         ET.SubElement(bsdf, "float", name="relative_permittivity", value=repr(float(permittivity)))
         ET.SubElement(bsdf, "float", name="conductivity", value=repr(float(conductivity)))
     ET.SubElement(bsdf, "float", name="thickness", value=repr(float(material.thickness_m)))
@@ -214,13 +340,21 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDA
     up = np.array([0.0, 0.0, geometry.height_m])
     (a, b), count = geometry.segments.T, len(low)
     walls = np.stack([a, b, b + count, a, b + count, a + count], axis=1).reshape(-1, 3)
-    corners, triangles = _triangles(geometry.floor_m, geometry.cell_m)
+    corners, triangles = geometry.floor_mesh
     floor = np.column_stack([corners, np.zeros(len(corners))])
-    return {
-        "walls": (np.concatenate([low, low + up]), walls),
-        "floor": (floor, triangles),
-        "ceiling": (floor + up, triangles[:, ::-1]),
-    }
+    meshes = {"walls": (np.concatenate([low, low + up]), walls), "floor": (floor, triangles)}
+    return meshes | ({"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {})
+
+
+def _open_ends(partial: PartialMap, outlines: Outlines) -> NDArray[np.bool_]:
+    """Find the vertices (V,) where one wall ends and the cell beyond its end is not free."""
+    ends, tails = outlines.segments.ravel(), outlines.segments[:, ::-1].ravel()
+    along = outlines.vertices_m[ends] - outlines.vertices_m[tails]
+    along *= partial.resolution_m / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    beyond = partial.state_at(outlines.vertices_m[ends] + along + partial.origin_m)
+    is_open = np.zeros(len(outlines.vertices_m), dtype=bool)
+    is_open[ends] = beyond != CellState.FREE
+    return is_open & (np.bincount(ends, minlength=len(is_open)) == 1)
 
 
 def _triangles(rectangles_m: NDArray[np.float64], cell_m: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

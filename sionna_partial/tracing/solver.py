@@ -1,66 +1,29 @@
 """The one place that leans on Sionna RT's internals: candidates in, verified paths out.
 
 Sionna RT's `PathSolver` is a chain of a candidate generator, `ImageMethod` and `FieldCalculator`. Here the same chain
-runs on candidates from exact beams, or from Sionna RT's own deterministic generator where rays must be shot. Either
-way `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go in as plain arrays:
-`Scene.targets()`, which compiles a kernel for each receiver, is left out.
+runs on our candidates: `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go
+in as plain arrays: `Scene.targets()`, which compiles a kernel for each receiver, is left out. `contract` names every
+internal part that is used.
+
+Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a chain of each kind.
 """
 
-import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.errors import BackendError
-from sionna_partial.llvm import load_llvm
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import CEILING, EDGE, FLOOR, Candidates
-from sionna_partial.tracing.diffraction import Wedges
+from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges
+from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.sionna_rt import load_sionna, open_scene
 
-MITSUBA_VARIANT = "llvm_ad_mono_polarized"
-"""Mitsuba variant of Sionna RT on a CPU."""
-
-
-@dataclass(frozen=True)
-class SolvedPaths:
-    """Verified paths in scene coordinates (fields as in `TracedLinks`; D may be less)."""
-
-    path_rx: NDArray[np.int32]
-    a: NDArray[np.complex128]
-    delay_s: NDArray[np.float64]
-    departure_rad: NDArray[np.float64]
-    arrival_rad: NDArray[np.float64]
-    interactions: NDArray[np.uint8]
-    vertices_m: NDArray[Any]
-
-
-def load_sionna() -> ModuleType:
-    """Import Sionna RT on the CPU, with a working LLVM.
-
-    Raises
-    ------
-    BackendError
-        If LLVM or Sionna RT cannot be used; the message says what to do.
-    """
-    load_llvm()
-    import mitsuba as mi
-
-    if mi.variant() is None:
-        mi.set_variant(MITSUBA_VARIANT)
-    if mi.variant() != MITSUBA_VARIANT:
-        raise BackendError(
-            f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
-            "before the first trace, or import sionna_partial in a process of its own."
-        )
-    import sionna.rt
-
-    return sionna.rt
+_ALIGNMENT_BYTES = 64
+"""Alignment of Dr.Jit's own arrays [bytes]."""
 
 
 class _IncoherentScene:
@@ -80,250 +43,296 @@ class _IncoherentScene:
         return self._scene.ray_intersect(ray, **{**options, "coherent": False})
 
 
-class SceneSolver:
-    """Solves paths from one transmitter in one exported scene.
+def _to_device(kind: Any, values: NDArray[Any]) -> Any:
+    """Hand an array over to Dr.Jit, aligned as its own arrays are: for other mixtures it compiles kernels anew."""
+    count = values.size * values.itemsize
+    room = np.empty(count + _ALIGNMENT_BYTES, np.uint8)
+    skip = -room.ctypes.data % _ALIGNMENT_BYTES
+    aligned = room[skip : skip + count].view(values.dtype).reshape(values.shape)
+    aligned[...] = values
+    return kind(aligned)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """What is added to a transmitter's position and to a scene: variables of Dr.Jit with one entry each.
+
+    With gradients enabled, the derivatives of what `SceneSolver.path_power` gives lead back to them.
 
     Parameters
     ----------
-    scene_xml : Path
-        Exported scene whose shapes are called walls, floor and ceiling.
-    settings : TraceSettings
-    tx_m : (3,) array
-        Transmitter, in scene coordinates [m].
-    rx_m : (N, 3) array
-        Receivers, in scene coordinates [m].
+    x_m, y_m, z_m : mitsuba.Float
+        Added to the transmitter's position [m].
+    relative_permittivity : mitsuba.Float
+        Added to the real relative permittivity of every material.
+    conductivity_s_m : mitsuba.Float
+        Added to the conductivity of every material [S/m].
+    thickness_m : mitsuba.Float
+        Added to the thickness of every material [m].
+    frequency_hz : mitsuba.Float
+        Added to the carrier frequency [Hz], on which ITU materials depend too.
     """
 
-    def __init__(
-        self, scene_xml: Path, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-    ) -> None:
-        rt = load_sionna()
-        import mitsuba as mi
+    x_m: Any
+    y_m: Any
+    z_m: Any
+    relative_permittivity: Any
+    conductivity_s_m: Any
+    thickness_m: Any
+    frequency_hz: Any
 
-        self._settings = settings
-        self._scene = rt.load_scene(str(scene_xml), merge_shapes=False)
-        self._scene.frequency = settings.frequency_hz
-        antenna = rt.PlanarArray(
-            num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
-        )
-        self._scene.tx_array = self._scene.rx_array = antenna
-        self._tx_m = tx_m
-        self._tx = mi.Point3f(*(mi.Float([float(value)]) for value in tx_m))
-        self._rx_m = rx_m
-        self._image_method = rt.path_solvers.image_method.ImageMethod()
-        self._field_calculator = rt.path_solvers.field_calculator.FieldCalculator()
 
-    def verify(self, candidates: Candidates) -> SolvedPaths:
-        """Verify candidates and compute their coefficients; either all of them diffract or none does."""
-        buffer = self._candidate_buffer(candidates)
-        return self._solve(buffer, self._rx_m, diffraction=len(candidates.wedge) > 0)
+class _Chain:
+    """Sionna RT's image method and field calculator, with loops of one kind."""
 
-    @property
-    def wedges(self) -> Wedges:
-        """Vertical edges of the walls as Sionna RT sees them: corners, and free ends, which it takes for screens."""
-        table, primitive = self._wedge_table
-        faces = (normal.numpy()[:2, : len(primitive)].T.astype(np.float64) for normal in (table.n0, table.nn))
-        return Wedges(primitive // 2, 1 - primitive % 2, *faces)
+    def __init__(self, loop_mode: str) -> None:
+        solvers = load_sionna().path_solvers
+        self._image_method = solvers.image_method.ImageMethod()
+        self._field_calculator = solvers.field_calculator.FieldCalculator()
+        self._image_method.loop_mode = self._field_calculator.loop_mode = loop_mode
 
-    @cached_property
-    def _wedge_table(self) -> tuple[Any, NDArray[np.int64]]:
-        """Sionna RT's wedges along the vertical edges, as they are and then with faces swapped, and their triangles.
-
-        Segment s of the walls is made of the triangles 2 s and 2 s + 1 (see `write_scene`). Edge 1 of the one and edge
-        2 of the other are vertical.
-        """
-        import drjit as dr
-        import mitsuba as mi
-        from sionna.rt.utils.wedges import WedgeGeometry, wedge_geometry
-
-        if "walls" not in self._scene.objects:
-            return WedgeGeometry.build_with_size(0), np.zeros(0, np.int64)
-        walls = self._scene.objects["walls"]
-        primitive = np.arange(walls.mi_mesh.face_count(), dtype=np.uint32)
-        local_edge = 1 + primitive % 2
-        shape = dr.reinterpret_array(mi.MeshPtr, dr.full(mi.UInt, walls.object_id, len(primitive)))
-        every = wedge_geometry(shape, mi.UInt(primitive), mi.UInt(local_edge))
-        ends = np.sort([every.prim0.numpy(), every.primn.numpy()], axis=0)
-        _, first = np.unique(ends, axis=1, return_index=True)
-        flat = (every.n0.numpy() * every.nn.numpy()).sum(axis=0) > 1.0 - 1e-6
-        kept = first[~flat[first]]
-        swapped = mi.Bool(np.repeat([False, True], len(kept)))
-        table = dr.gather(WedgeGeometry, every, mi.UInt(np.tile(kept, 2).astype(np.uint32)))
-        table.swap_faces(swapped)
-        dr.eval(table)
-        return table, primitive[kept].astype(np.int64)
-
-    def shoot(self) -> Iterator[SolvedPaths]:
-        """Find paths of every enabled kind by shooting rays, one receiver at a time.
-
-        Sionna RT's generator counts chains in a hash table that receivers of one call share, and a collision drops a
-        path. With one receiver a call, the answer cannot depend on the other receivers.
-        """
-        import drjit as dr
-        import mitsuba as mi
-        from sionna.rt.path_solvers.sb_deterministic import SBDeterministicCandidateGenerator
-
-        settings = self._settings
-        generator = SBDeterministicCandidateGenerator()
-        rays = settings.samples_per_tx
-        for index, position in enumerate(self._rx_m):
-            target = mi.Point3f(*(mi.Float([float(value)]) for value in position))
-            dr.make_opaque(self._tx, target)
-            buffer = generator(
-                mi_scene=self._scene.mi_scene,
-                src_positions=self._tx,
-                tgt_positions=target,
-                samples_per_src=rays,
-                max_num_paths_per_src=1 + rays * settings.max_depth if settings.diffuse_reflection else 100_000,
-                max_depth=settings.max_depth,
-                los=True,
-                specular_reflection=True,
-                diffuse_reflection=settings.diffuse_reflection,
-                refraction=settings.refraction,
-                diffraction=settings.diffraction,
-                edge_diffraction=settings.diffraction,
-                seed=settings.seed,
-            )
-            buffer.schedule()
-            dr.eval()
-            buffer.shrink()
-            buffer.detach_geometry()
-            paths = self._solve(buffer, position[None], diffraction=settings.diffraction)
-            yield SolvedPaths(paths.path_rx + np.int32(index), *(getattr(paths, name) for name in _FIELDS[1:]))
-
-    def _candidate_buffer(self, candidates: Candidates) -> Any:
-        """Fill one of Sionna RT's path buffers with unverified candidates."""
-        import drjit as dr
-        import mitsuba as mi
-        from sionna.rt.constants import INVALID_PRIMITIVE, InteractionType
-        from sionna.rt.path_solvers.paths_buffer import PathsBuffer
-        from sionna.rt.utils.wedges import WedgeGeometry
-
-        count, depth = candidates.surface.shape
-        surface = candidates.surface
-        primitive = np.where(surface >= 0, 2 * surface, 0).astype(np.uint32)
-        primitive[surface == -1] = INVALID_PRIMITIVE
-        kind = np.where(surface == -1, InteractionType.NONE, InteractionType.SPECULAR).astype(np.uint32)
-        buffer = PathsBuffer(count, depth, len(candidates.wedge) > 0)
-        if len(candidates.wedge):
-            wedges = dr.gather(WedgeGeometry, self._wedge_table[0], mi.UInt(candidates.wedge.astype(np.uint32)))
-            primitive[surface == EDGE] = wedges.prim0.numpy()
-            kind[surface == EDGE] = InteractionType.DIFFRACTION
-            buffer._diffracting_wedges = wedges
-        float_tensor: Any = mi.TensorXf
-        integer_tensor: Any = mi.TensorXu
-        x, y, z = np.moveaxis(candidates.vertices_m.astype(np.float32), 2, 0)
-        buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (float_tensor(v.copy()) for v in (x, y, z))
-        buffer._shapes, buffer._primitives = integer_tensor(self._shapes(surface)), integer_tensor(primitive)
-        buffer._interaction_types = integer_tensor(kind)
-        buffer._tgt_indices = mi.UInt(candidates.rx.astype(np.uint32))
-        buffer._paths_counter = mi.UInt(count)
-        buffer.shrink()
-        return buffer
-
-    def _shapes(self, surface: NDArray[np.int32]) -> NDArray[np.uint32]:
-        """Identify the shape of each surface for Sionna RT."""
-        from sionna.rt.constants import INVALID_SHAPE
-
-        shape = np.full(surface.shape, INVALID_SHAPE, np.uint32)
-        walls = (surface >= 0) | (surface == EDGE)
-        for name, where in (("walls", walls), ("floor", surface == FLOOR), ("ceiling", surface == CEILING)):
-            if where.any():
-                shape[where] = self._scene.objects[name].object_id
-        return shape
-
-    def _solve(self, buffer: Any, rx_m: NDArray[np.float64], *, diffraction: bool) -> SolvedPaths:
-        """Run the image method and the field calculator on a buffer of candidates."""
+    def __call__(
+        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
+    ) -> Any:
+        """Verify the candidates in a buffer, and give it back with their coefficients."""
         import drjit as dr
         import mitsuba as mi
 
-        targets = mi.Point3f(*(mi.Float(column.astype(np.float32)) for column in rx_m.T))
-        still = dr.zeros(mi.Point3f, 1), dr.zeros(mi.Point3f, len(rx_m))
-        dr.make_opaque(self._tx, targets, *still)
-        patterns = self._scene.tx_array.antenna_pattern.patterns
+        still = dr.zeros(mi.Point3f, 1), dr.zeros(mi.Point3f, dr.width(targets))
+        dr.make_opaque(*still)
+        patterns = scene.tx_array.antenna_pattern.patterns
         buffer = self._image_method(
-            scene=_IncoherentScene(self._scene.mi_scene),
+            scene=_IncoherentScene(scene.mi_scene),
             paths=buffer,
-            src_positions=self._tx,
+            src_positions=source,
             tgt_positions=targets,
             diffraction=diffraction,
             diffraction_lit_region=True,
         )
-        buffer = self._field_calculator(
-            wavelength=self._scene.wavelength,
+        return self._field_calculator(
+            wavelength=scene.wavelength,
             paths=buffer,
-            samples_per_src=self._settings.samples_per_tx,
+            samples_per_src=samples_per_tx,
             diffraction=diffraction,
-            src_positions=self._tx,
+            src_positions=source,
             tgt_positions=targets,
             src_orientations=still[0],
             tgt_orientations=still[1],
             src_antenna_patterns=patterns,
             tgt_antenna_patterns=patterns,
         )
-        return _read_buffer(buffer, self._tx_m, rx_m)
 
 
-_FIELDS = tuple(SolvedPaths.__dataclass_fields__)
+class SceneSolver:
+    """Verifies candidates in one exported scene.
 
-
-def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
-    """Join lists of paths, ordered by receiver and then by delay.
-
-    Takes the parts out of the list one by one, so that memory need not hold all paths twice.
+    Parameters
+    ----------
+    scene_xml : Path
+        Exported scene.
+    shapes : tuple of str
+        Names of its shapes in the order in which faces are counted; those that the scene lacks count none.
+    settings : TraceSettings
     """
-    total, depth = sum(len(part.a) for part in parts), max(1, max_depth)
-    joined = SolvedPaths(
-        path_rx=np.zeros(total, np.int32),
-        a=np.zeros(total, np.complex128),
-        delay_s=np.zeros(total),
-        departure_rad=np.zeros((total, 2)),
-        arrival_rad=np.zeros((total, 2)),
-        interactions=np.zeros((total, depth), np.uint8),
-        vertices_m=np.full((total, depth, 3), math.nan),
-    )
-    place = np.empty(total, np.int64)
-    if parts:
-        order = np.lexsort([np.concatenate([getattr(part, key) for part in parts]) for key in ("delay_s", "path_rx")])
-        place[order] = np.arange(total)
-    start = 0
-    while parts:
-        part = parts.pop(0)
-        at = place[start : start + len(part.a)]
-        for name in _FIELDS[:5]:
-            getattr(joined, name)[at] = getattr(part, name)
-        joined.interactions[at, : part.interactions.shape[1]] = part.interactions
-        joined.vertices_m[at, : part.interactions.shape[1]] = part.vertices_m
-        start += len(part.a)
-    return joined
+
+    def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
+        load_sionna()
+        from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
+
+        self._settings = settings
+        self._scene = open_scene(scene_xml, settings.frequency_hz)
+        objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
+        self.shapes = [shape.mi_mesh for shape in objects]
+        faces = [mesh.face_count() for mesh in self.shapes]
+        shape = np.repeat(np.array([shape.object_id for shape in objects], np.uint32), faces)
+        self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last stands for no face, -1
+        primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
+        self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
+        self._symbolic, self._evaluated = _Chain("symbolic"), _Chain("evaluated")
+
+    @property
+    def mi_scene(self) -> Any:
+        """The Mitsuba scene."""
+        return self._scene.mi_scene
+
+    def verify(
+        self,
+        candidates: Candidates,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+    ) -> SolvedPaths:
+        """Verify candidates and compute their coefficients.
+
+        Parameters
+        ----------
+        candidates : Candidates
+        tx_m, rx_m : (3,) and (N, 3) arrays
+            Transmitter and receivers, in scene coordinates [m].
+        """
+        return self.verify_rows(candidates, tx_m, rx_m)[0]
+
+    def verify_rows(
+        self,
+        candidates: Candidates,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+    ) -> tuple[SolvedPaths, NDArray[np.intp]]:
+        """Verify candidates as `verify` does, and say which of them the paths are.
+
+        Parameters
+        ----------
+        candidates : Candidates
+        tx_m, rx_m : (3,) and (N, 3) arrays
+            Transmitter and receivers, in scene coordinates [m].
+
+        Returns
+        -------
+        SolvedPaths
+        (P,) intp array
+            The candidate that each path was.
+        """
+        if len(candidates.rx) == 0:
+            return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
+        buffer = self._solve(self._symbolic, candidates, _points(tx_m[None]), _points(rx_m))
+        return _read_buffer(buffer, tx_m, rx_m)
+
+    def path_power(
+        self,
+        candidates: Candidates,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+        offsets: Offsets,
+    ) -> Any:
+        """Power of candidates as a differentiable function of the transmitter's position and of the scene.
+
+        Candidates are verified again, so that those that the offsets make invalid have none.
+
+        Parameters
+        ----------
+        candidates : Candidates
+            At least one.
+        tx_m, rx_m : (3,) and (N, 3) arrays
+            Transmitter and receivers, in scene coordinates [m].
+        offsets : Offsets
+
+        Returns
+        -------
+        mitsuba.Float
+            Squared magnitude (C,) of each candidate's coefficient.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        source = _points(tx_m[None]) + mi.Point3f(offsets.x_m, offsets.y_m, offsets.z_m)
+        # Dr.Jit cannot pass forward through a symbolic call of a material twice
+        with self._changed(offsets), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, False):
+            buffer = self._solve(self._evaluated, candidates, source, _points(rx_m))
+            a = buffer.a[0][0]
+            return dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
+
+    @contextmanager
+    def _changed(self, offsets: Offsets) -> Iterator[None]:
+        """Add offsets to the frequency and to all materials for a while."""
+        materials = self._scene.radio_materials.values()
+        kept = [(each, each.relative_permittivity, each.conductivity, each.thickness) for each in materials]
+        frequency = self._scene.frequency
+        try:
+            self._scene.frequency = frequency + offsets.frequency_hz  # ITU materials follow
+            for material, *_ in kept:
+                material.relative_permittivity = material.relative_permittivity + offsets.relative_permittivity
+                material.conductivity = material.conductivity + offsets.conductivity_s_m
+                material.thickness = material.thickness + offsets.thickness_m
+            yield
+        finally:
+            self._scene.frequency = frequency
+            for material, permittivity, conductivity, thickness in kept:
+                material.relative_permittivity = permittivity
+                material.conductivity, material.thickness = conductivity, thickness
+
+    def _solve(self, chain: _Chain, candidates: Candidates, source: Any, targets: Any) -> Any:
+        """Verify candidates with one of the chains, in a buffer that keeps their order."""
+        diffraction = candidates.wedges is not None
+        samples = self._settings.samples_per_tx
+        return chain(self._scene, self._buffer(candidates), source, targets, samples, diffraction)
+
+    def _buffer(self, candidates: Candidates) -> Any:
+        """Fill one of Sionna RT's path buffers with unverified candidates."""
+        import mitsuba as mi
+        from sionna.rt.constants import InteractionType
+        from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+        face = candidates.face
+        kind = np.where(face == EDGE, InteractionType.DIFFRACTION, InteractionType.SPECULAR).astype(np.uint32)
+        kind[face == -1] = InteractionType.NONE
+        if candidates.wedges is not None and candidates.wedge is not None:
+            # Sionna RT takes the normal of the 0-face from the face that a path diffracts at
+            face = np.where(face == EDGE, candidates.wedges.face[candidates.wedge, :1], face)
+        shape, primitive = self._shape_of_face[face], self._primitive_of_face[face]
+        buffer = PathsBuffer(*face.shape, candidates.wedges is not None)
+        buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (
+            _to_device(mi.TensorXf, place.astype(np.float32)) for place in np.moveaxis(candidates.vertices_m, 2, 0)
+        )
+        buffer._shapes, buffer._primitives = _to_device(mi.TensorXu, shape), _to_device(mi.TensorXu, primitive)
+        buffer._interaction_types = _to_device(mi.TensorXu, kind)
+        buffer._tgt_indices = _to_device(mi.UInt, candidates.rx.astype(np.uint32))
+        buffer._paths_counter = mi.UInt(len(face))
+        if candidates.wedges is not None and candidates.wedge is not None:
+            buffer._diffracting_wedges = self._wedge_geometry(candidates.wedges, candidates.wedge)
+        buffer.shrink()
+        return buffer
+
+    def _wedge_geometry(self, wedges: Wedges, index: NDArray[np.int32]) -> Any:
+        """Wedges of candidates as Sionna RT describes them: normal of the 0-face x edge points along that face."""
+        import drjit as dr
+        import mitsuba as mi
+        from sionna.rt.utils.wedges import WedgeGeometry
+
+        upward = index < len(wedges.edge_m)
+        x, y = wedges.edge_m[index % len(wedges.edge_m)].T
+        face, normal, flat = wedges.face[index], wedges.normal[index], np.zeros(len(index))
+
+        def vectors(kind: Any, *columns: NDArray[np.float64]) -> Any:
+            return kind(*(_to_device(mi.Float, column.astype(np.float32)) for column in columns))
+
+        return WedgeGeometry(
+            shape=dr.reinterpret_array(mi.MeshPtr, _to_device(mi.UInt, self._shape_of_face[face[:, 0]])),
+            prim0=_to_device(mi.UInt, self._primitive_of_face[face[:, 0]]),
+            primn=_to_device(mi.UInt, self._primitive_of_face[face[:, 1]]),
+            local_edge=dr.zeros(mi.UInt, len(index)),
+            o=vectors(mi.Point3f, x, y, np.where(upward, 0.0, wedges.height_m)),
+            e_hat=vectors(mi.Vector3f, flat, flat, np.where(upward, 1.0, -1.0)),
+            length=dr.full(mi.Float, wedges.height_m, len(index)),
+            n0=vectors(mi.Normal3f, *normal[:, 0].T, flat),
+            nn=vectors(mi.Normal3f, *normal[:, 1].T, flat),
+        )
 
 
-def _read_buffer(buffer: Any, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> SolvedPaths:
-    """Copy the valid paths of a buffer out of Dr.Jit."""
-    if buffer.buffer_size == 0:
-        return join_paths([], buffer.max_depth)
+def _points(places_m: NDArray[np.float64]) -> Any:
+    """Hand places (N, 3) over to Dr.Jit."""
+    import drjit as dr
+    import mitsuba as mi
+
+    points = mi.Point3f(*(_to_device(mi.Float, column.astype(np.float32)) for column in places_m.T))
+    dr.make_opaque(points)
+    return points
+
+
+def _read_buffer(
+    buffer: Any, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+) -> tuple[SolvedPaths, NDArray[np.intp]]:
+    """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
     valid = np.flatnonzero(buffer.valid.numpy())
-    path_rx = buffer.target_indices.numpy()[valid].astype(np.int32)
     a = buffer.a[0][0]
-    interactions = buffer.interaction_types.numpy()[valid].astype(np.uint8)
-    vertices = np.stack([v.numpy()[valid] for v in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2)
-    vertices = np.where(interactions[:, :, None] > 0, vertices, np.float32(math.nan))
-    count = (interactions > 0).sum(axis=1)
-    direct = (count == 0)[:, None]
-    first, last = vertices[:, 0], vertices[np.arange(len(valid)), np.maximum(count, 1) - 1]
-    return SolvedPaths(
-        path_rx=path_rx,
+    paths = SolvedPaths.of_vertices(
+        path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
         a=a.real.numpy()[valid].astype(np.float64) + 1j * a.imag.numpy()[valid],
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
-        departure_rad=_zenith_azimuth(np.where(direct, rx_m[path_rx], first) - tx_m),
-        arrival_rad=_zenith_azimuth(np.where(direct, tx_m, last) - rx_m[path_rx]),
-        interactions=interactions,
-        vertices_m=vertices,
+        interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
+        vertices_m=np.stack(
+            [each.numpy()[valid] for each in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
+        ),
+        tx_m=tx_m,
+        rx_m=rx_m,
     )
-
-
-def _zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Zenith and azimuth angles [rad] (P, 2) of direction vectors (P, 3)."""
-    x, y, z = direction.T
-    return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)
+    return paths, valid

@@ -2,9 +2,9 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import partial as partial_function
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,33 +15,38 @@ from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import Candidates, specular_candidates
-from sionna_partial.tracing.diffraction import diffraction_candidates
-from sionna_partial.tracing.scene import SceneGeometry, build_scene, write_scene
-from sionna_partial.tracing.solver import SceneSolver, SolvedPaths, join_paths
+from sionna_partial.tracing.generator import Generator, write_scene_of
+from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.probe import fast_engine_works
+from sionna_partial.tracing.solver import SceneSolver
+from sionna_partial.tracing.stock import stock_paths
 
 Progress = Callable[[float, str], None]
 """Called with the share of the work done, in [0, 1], and what is being done."""
 
 
+Solve = Callable[[NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[SolvedPaths, float, str]]]
+"""Solves the paths from one transmitter (3,) to receivers (N, 3), in scene coordinates, block by block: the paths of a
+block, the share of the work done, and what is being done."""
+
+
 @dataclass(frozen=True)
 class TracedLinks:
-    """Every traced path from one transmitter to N receivers.
+    """Every traced path from one or T transmitters to N receivers.
 
-    Paths are listed one after the other, ordered by receiver and then by delay; P is their number.
+    Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
 
     Parameters
     ----------
-    tx : (3,) float64 array
-        Transmitter position [m].
+    tx : (3,) or (T, 3) float64 array
+        Transmitter positions [m].
     rx : (N, 3) float64 array
         Receiver positions [m].
-    link_state : (N,) uint8 array of LinkState
-    gain_db : (N,) float64 array
+    link_state : (N,) or (T, N) uint8 array of LinkState
+    gain_db : (N,) or (T, N) float64 array
         Omnidirectional path gain [dB], at least -150 (paper, eq. 5).
-    path_rx : (P,) int32 array
-        Index of the receiver that each path ends at.
+    path_tx, path_rx : (P,) int32 arrays
+        Indices of the transmitter and the receiver that each path joins.
     a : (P,) complex128 array
         Complex path gain (isotropic antennas, vertical polarisation).
     delay_s : (P,) float64 array
@@ -60,6 +65,7 @@ class TracedLinks:
     rx: NDArray[np.float64]
     link_state: NDArray[np.uint8]
     gain_db: NDArray[np.float64]
+    path_tx: NDArray[np.int32]
     path_rx: NDArray[np.int32]
     a: NDArray[np.complex128]
     delay_s: NDArray[np.float64]
@@ -80,20 +86,20 @@ def trace_links(
     scene_settings: SceneSettings | None = None,
     progress: Progress | None = None,
 ) -> TracedLinks:
-    """Trace every path from one transmitter to N receivers with Sionna RT.
+    """Trace every path from one or more transmitters to N receivers with Sionna RT.
 
-    Line of sight and specular reflections are complete: candidates come from exact beams and are verified by Sionna
-    RT's image method. So are, if switched on, paths with one diffraction at a vertical edge of the walls (corners, door
-    jambs, open wall ends) and at most two reflections around it. With refraction or diffuse reflection switched on,
-    Sionna RT shoots rays instead, one receiver at a time, for paths of every kind, which is slow and finds most paths,
-    not all. The answer for a receiver does not depend on the other receivers.
+    On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge of the walls
+    (corners, door jambs) and at most two reflections around it are complete: candidates come from exact beams and are
+    verified by Sionna RT's image method. With refraction or diffuse reflection switched on, Sionna RT shoots rays
+    instead, for paths of every kind, which is slow and finds most paths, not all. The answer for a receiver does not
+    depend on the other receivers.
 
     Parameters
     ----------
     scene : PartialMap or path
         What is known of the building; unknown space is free (paper, Section III-B).
-    tx : (3,) array-like
-        Transmitter position [m].
+    tx : (3,) or (T, 3) array-like
+        Transmitter positions [m].
     rx : (N, 3) array-like
         Receiver positions [m]; N may be 0.
     settings : TraceSettings, optional
@@ -116,105 +122,105 @@ def trace_links(
     OutputError
         If no temporary file can be written.
     """
-    settings = settings_or_default("settings", settings, TraceSettings)
-    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
-    scene_settings.material.require_frequency(settings.frequency_hz)
+    settings, scene_settings = checked_settings(settings, scene_settings)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    tx_m, rx_m = _positions(partial, tx, rx)
+    tx_m, rx_m = checked_positions(partial, tx, rx)
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
-    geometry = build_scene(partial, scene_settings)
-    shift = np.array([*geometry.origin_m, 0.0])
+    shift = np.array([*partial.origin_m, 0.0])
     with temporary_folder() as folder:
-        xml = write_scene(geometry, folder, offset_m=geometry.origin_m, frequency_hz=settings.frequency_hz)
-        parts = list(_solve_blocks(geometry, xml, settings, tx_m - shift, rx_m - shift, report))
+        parts = []
+        if len(rx_m):
+            solve = _solver(partial, folder, settings, scene_settings)
+            for index, place in enumerate(tx_m):
+                for paths, share, message in solve(place - shift, rx_m - shift):
+                    parts.append(replace(paths, path_tx=np.full(len(paths.a), index, np.int32)))
+                    report(0.1 + 0.9 * (index + share) / len(tx_m), message)
     paths = join_paths(parts, settings.max_depth)
     paths.vertices_m[:] += shift
-    link_state, gain_db = _link_summary(paths, len(rx_m))
+    shape = (*np.shape(tx)[:-1], len(rx_m))
+    link_state, gain_db = _summary(paths, len(tx_m), len(rx_m))
     return TracedLinks(
-        tx=tx_m,
+        tx=tx_m.reshape(*np.shape(tx)),
         rx=rx_m,
-        link_state=link_state,
-        gain_db=gain_db,
-        path_rx=paths.path_rx,
-        a=paths.a,
-        delay_s=paths.delay_s,
-        departure_rad=paths.departure_rad,
-        arrival_rad=paths.arrival_rad,
-        interactions=paths.interactions,
-        vertices_m=paths.vertices_m,
+        link_state=link_state.reshape(shape),
+        gain_db=gain_db.reshape(shape),
+        **{field.name: getattr(paths, field.name) for field in fields(SolvedPaths)},
         settings=settings,
         scene_settings=scene_settings,
     )
 
 
-def _positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Check the positions and give the transmitter as (3,), the receivers as (N, 3)."""
+def checked_settings(
+    settings: TraceSettings | None, scene_settings: SceneSettings | None
+) -> tuple[TraceSettings, SceneSettings]:
+    """Put defaults in place of None; raise a SettingsError unless the material covers the frequency."""
+    settings = settings_or_default("settings", settings, TraceSettings)
+    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
+    scene_settings.material.require_frequency(settings.frequency_hz)
+    return settings, scene_settings
+
+
+def checked_positions(
+    partial: PartialMap, tx: ArrayLike, rx: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
     tx_m = partial.require_positions("tx", tx)
-    if tx_m.ndim != 1:
-        raise PositionError(f"tx has shape {tx_m.shape}: give one transmitter (3,), and call once for each.")
     with suppress(ValueError):  # nested lists of unequal lengths have no size
         rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
     rx_m = partial.require_positions("rx", rx)
     if rx_m.ndim != 2:
         raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
-    return tx_m, rx_m
+    return tx_m.reshape(-1, 3), rx_m
 
 
-def _solve_blocks(
-    geometry: SceneGeometry,
-    xml: Path,
-    settings: TraceSettings,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    report: Progress,
-) -> Iterator[SolvedPaths]:
-    """Solve the paths in scene coordinates, block by block."""
-    if len(rx_m) == 0:
-        return
-    report(0.02, "starting Sionna RT")
-    solver = SceneSolver(xml, settings, tx_m, rx_m)
-    if settings.refraction or settings.diffuse_reflection:
-        for done, paths in enumerate(solver.shoot()):
-            yield paths
-            report(0.1 + 0.9 * (done + 1) / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
-        return
-    for candidates, share_done, message in _candidates(geometry, settings, solver, tx_m, rx_m):
-        yield solver.verify(candidates)
-        report(0.1 + 0.9 * share_done, message)
+def _solver(partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings) -> Solve:
+    """Write the scene, and choose how its paths are found."""
+    scene = write_scene_of(partial, folder, settings, scene_settings)
+    shoot = settings.refraction or settings.diffuse_reflection or (settings.diffraction and not scene.is_plan)
+    if shoot or not fast_engine_works():
+        diffraction = scene.is_plan if settings.diffraction is None else settings.diffraction
+        return partial_function(_shoot, scene.xml, replace(settings, diffraction=diffraction))
+    return partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
 
 
-def _candidates(
-    geometry: SceneGeometry,
-    settings: TraceSettings,
-    solver: SceneSolver,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-) -> Iterator[tuple[Candidates, float, str]]:
-    """Exact candidates in blocks, with the share of the work done and its name."""
-    walls_m = geometry.vertices_m[geometry.segments]
-    extent: dict[str, Any] = {
-        "height_m": geometry.height_m,
-        "horizontal": len(geometry.floor_m) > 0,
-        "max_depth": settings.max_depth,
-    }
-    beams = trace_beams(walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
-    part = 0.2 if settings.diffraction else 1.0
-    for candidates, share in specular_candidates(beams, walls_m, tx_m, rx_m, **extent):
-        yield candidates, part * share, "verifying reflections"
-    if not settings.diffraction:
-        return
-    for candidates, share in diffraction_candidates(walls_m, solver.wedges, tx_m, rx_m, **extent):
-        yield candidates, part + (1.0 - part) * share, "verifying diffractions"
+def _verify(
+    candidates_between: Generator, solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+) -> Iterator[tuple[SolvedPaths, float, str]]:
+    """Verify the candidates of the scene."""
+    for candidates, share, message in candidates_between(solver, tx_m, rx_m):
+        yield solver.verify(candidates, tx_m, rx_m), share, message
 
 
-def _link_summary(paths: SolvedPaths, count: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Link state (count,) and omnidirectional path gain (count,) [dB] of all receivers (paper, eq. 5)."""
-    power = np.abs(paths.a) ** 2
-    total = np.bincount(paths.path_rx, weights=power, minlength=count)
+def _shoot(
+    scene_xml: Path, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+) -> Iterator[tuple[SolvedPaths, float, str]]:
+    """Let Sionna RT's public path solver shoot rays."""
+    for paths, share in stock_paths(scene_xml, settings, tx_m, rx_m):
+        yield paths, share, f"shooting rays to {len(rx_m)} receivers"
+
+
+def _summary(paths: SolvedPaths, transmitters: int, receivers: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Link state and path gain [dB] of all links, transmitter by transmitter."""
+    link, links = paths.path_tx.astype(np.int64) * receivers + paths.path_rx, transmitters * receivers
+    power = np.bincount(link, weights=np.abs(paths.a) ** 2, minlength=links)
+    return link_summary(power, np.isin(np.arange(links), link[paths.is_direct]))
+
+
+def link_summary(
+    power: NDArray[np.float64], is_direct: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Link state and omnidirectional path gain [dB] of links (paper, eq. 5).
+
+    Parameters
+    ----------
+    power : (N,) float64 array
+        Sum of |a|^2 over the paths of each link.
+    is_direct : (N,) bool array
+        Whether one of them has no interaction.
+    """
     with np.errstate(divide="ignore"):
-        gain_db = np.maximum(10.0 * np.log10(total), GAIN_FLOOR_DB)
+        gain_db = np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
     link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
-    direct = (paths.interactions == 0).all(axis=1)
-    link_state[paths.path_rx[direct]] = LinkState.LOS
+    link_state[is_direct] = LinkState.LOS
     return link_state, gain_db

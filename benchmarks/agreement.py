@@ -1,0 +1,122 @@
+"""How far two lists of paths agree, and which of them are real."""
+
+import itertools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+import sionna_partial as sp
+from sionna_partial.tracing.diffraction import find_wedges
+from sionna_partial.tracing.scene import SceneGeometry, build_scene
+
+Paths = dict[str, NDArray[Any]]
+"""Paths of one receiver: `a` and `delay_s` (P,), `interactions` (P, D), `vertices_m` (P, D, 3), NaN where none is."""
+
+SAME_DELAY_S = 1e-11
+"""Paths to one receiver whose delays differ by less are the same [s]: 3 mm."""
+
+TOUCH_M = 2e-3
+"""Distance from the ends of a leg within which it may touch a wall [m]."""
+
+
+def paths_of(links: sp.TracedLinks) -> list[Paths]:
+    """Paths of each receiver of a trace."""
+    start = np.searchsorted(links.path_rx, np.arange(len(links.rx) + 1))
+    names = ("a", "delay_s", "interactions", "vertices_m")
+    return [{name: getattr(links, name)[first:stop] for name in names} for first, stop in itertools.pairwise(start)]
+
+
+def agreement(
+    partial: sp.PartialMap, tx: NDArray[np.float64], rx: NDArray[np.float64], found: list[Paths], truth: list[Paths]
+) -> dict[str, int]:
+    """Count what agrees.
+
+    Stock Sionna RT misses paths, because no ray met their chain of walls or because its rays travel in packets, and
+    lets some through a wall at a corner. So every path that only one side has is checked by itself, in double
+    precision: its legs must cross no wall. On a mesh no path is checked, and each one of truth counts as real.
+
+    Returns
+    -------
+    dict
+        Counts. `links`; `truth`: paths of the truth that are real; `found`: of them, those that are found; `extra`:
+        paths that truth lacks; `real`: of them, those that cross no wall; `leaks`: paths of truth that cross a wall;
+        `same_state`, `same_gain`: links with equal state, and with gains within 0.5 dB, where every real path counts
+        for the truth.
+    """
+    geometry = build_scene(partial) if partial.mesh is None else None
+    shift = np.array([*partial.origin_m, 0.0])
+    count = dict.fromkeys(("links", "truth", "found", "extra", "real", "leaks", "same_state", "same_gain"), 0)
+    for place, ours, theirs in zip(rx, found, truth, strict=True):
+        pairs = pair_delays(ours["delay_s"], theirs["delay_s"])
+        extra, alone = (np.setdiff1d(np.arange(len(p["a"])), k) for p, k in zip((ours, theirs), pairs.T, strict=True))
+        real, sound = np.zeros(len(extra), bool), np.ones(len(theirs["a"]), bool)
+        if geometry is not None:
+            ends = tx - shift, place - shift
+            real[:] = [is_real(geometry, *ends, each - shift) for each in ours["vertices_m"][extra]]
+            sound[alone] = [is_real(geometry, *ends, each - shift) for each in theirs["vertices_m"][alone]]
+        best = {name: np.concatenate([theirs[name][sound], ours[name][extra[real]]]) for name in ("a", "interactions")}
+        (state, gain_db), (true_state, true_gain_db) = link(ours), link(best)
+        count["links"] += 1
+        count["truth"] += int(sound.sum())
+        count["found"] += len(pairs)
+        count["extra"] += len(extra)
+        count["real"] += int(real.sum())
+        count["leaks"] += int((~sound).sum())
+        count["same_state"] += int(state == true_state)
+        count["same_gain"] += int(abs(gain_db - true_gain_db) <= 0.5)
+    return count
+
+
+def link(paths: Paths) -> tuple[sp.LinkState, float]:
+    """Link state and gain [dB] of one receiver."""
+    gain_db = max(10 * np.log10(max(np.sum(np.abs(paths["a"]) ** 2), 1e-20)), -150.0)
+    if (paths["interactions"] == 0).all(axis=1).any():
+        return sp.LinkState.LOS, gain_db
+    return (sp.LinkState.NLOS if gain_db > -150.0 else sp.LinkState.OUTAGE), gain_db
+
+
+def upright(partial: sp.PartialMap, paths: Paths) -> Paths:
+    """Leave out diffracted paths at horizontal edges, open wall ends and junctions of walls, which are not traced."""
+    geometry = build_scene(partial)
+    bent = (paths["interactions"] == 8).any(axis=1)
+    rows = np.arange(len(bent)), (paths["interactions"] == 8).argmax(axis=1)
+    place = paths["vertices_m"][rows] - [*partial.origin_m, 0.0]
+    wedges = find_wedges(geometry, open_ends=False)
+    kept = ~bent
+    if len(wedges.edge_m) and bent.any():
+        near = cKDTree(wedges.edge_m).query(place[bent, :2])[0] < 0.01
+        kept[bent] = near & (np.abs(place[bent, 2] - geometry.height_m / 2) < geometry.height_m / 2 - 1e-3)
+    return {name: values[kept] for name, values in paths.items()}
+
+
+def pair_delays(first_s: NDArray[np.float64], second_s: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Match delays one to one: indices (M, 2)."""
+    first, second = np.argsort(first_s), np.argsort(second_s)
+    pairs, i, k = [], 0, 0
+    while i < len(first) and k < len(second):
+        difference = first_s[first[i]] - second_s[second[k]]
+        if abs(difference) < SAME_DELAY_S:
+            pairs.append((first[i], second[k]))
+        i, k = i + int(difference < SAME_DELAY_S), k + int(difference > -SAME_DELAY_S)
+    return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+
+def is_real(
+    geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], vertices_m: NDArray[np.float64]
+) -> bool:
+    """Check one path in double precision: its legs cross no wall but where they end."""
+    points = np.concatenate([tx[None], vertices_m[np.isfinite(vertices_m[:, 0])], rx[None]])
+    a, b = geometry.walls_m[:, 0], geometry.walls_m[:, 1]
+    wall = b - a
+    for start, stop in zip(points[:-1, :2], points[1:, :2], strict=True):
+        way = stop - start
+        area = way[0] * wall[:, 1] - way[1] * wall[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            along = ((a - start)[:, 0] * wall[:, 1] - (a - start)[:, 1] * wall[:, 0]) / area
+            across = ((a - start)[:, 0] * way[1] - (a - start)[:, 1] * way[0]) / area
+        margin = TOUCH_M / max(float(np.hypot(*way)), TOUCH_M)
+        if ((along > margin) & (along < 1 - margin) & (across > 0) & (across < 1)).any():
+            return False
+    return True

@@ -1,0 +1,100 @@
+"""Stock Sionna RT for the benchmarks: its path solver on tiles of receivers, and what it finds."""
+
+import multiprocessing
+import os
+import resource
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.tracing.sionna_rt import load_sionna
+from sionna_partial.tracing.stock import listed_before
+
+TRUTH_RAYS = 1_000_000
+TRUTH_TABLE = 30_000_000
+TILE = 100
+
+
+def isolated(function: Callable[..., dict], *arguments: object, **options: object) -> dict:
+    """Run a measurement in a fresh process, so that memory and warm-up are its own."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(function, arguments, options)
+
+
+def trace_stock(
+    folder: str,
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    *,
+    tile: int = TILE,
+    rays: int = TRUTH_RAYS,
+    table: int = TRUTH_TABLE,
+    max_depth: int = 6,
+    diffraction: bool = False,
+    cores: int | None = None,
+) -> dict:
+    """Run stock `PathSolver` on tiles of receivers: seconds, peak memory, and each receiver's paths, each once."""
+    limit_cores(cores)
+    rt = load_sionna()
+    start = time.perf_counter()
+    paths: list[dict[str, NDArray[Any]]] = []
+    repeats = 0
+    for first in range(0, len(rx), tile):
+        part = rx[first : first + tile]
+        found = rt.PathSolver()(
+            stock_scene(rt, folder, tx, part),
+            max_depth=max_depth,
+            refraction=False,
+            diffraction=diffraction,
+            edge_diffraction=diffraction,
+            samples_per_src=rays,
+            max_num_paths_per_src=table,
+        )
+        for index in range(len(part)):
+            each, twice = receiver_paths(found, index, len(part), max(1, max_depth))
+            paths.append(each)
+            repeats += twice
+    return {"seconds": time.perf_counter() - start, "memory_gb": peak_memory_gb(), "paths": paths, "repeats": repeats}
+
+
+def receiver_paths(found: Any, index: int, receivers: int, depth: int) -> tuple[dict[str, NDArray[Any]], int]:
+    """Paths of one receiver, each once, and how many were listed again."""
+    valid = np.flatnonzero(found.valid.numpy().reshape(receivers, -1)[index])
+    real, imaginary = (part.numpy().reshape(receivers, -1)[index, valid].astype(float) for part in found.a)
+    interactions = found.interactions.numpy().reshape(depth, receivers, -1)[:, index, valid].T.astype(np.uint8)
+    vertices_m = np.moveaxis(found.vertices.numpy().reshape(depth, receivers, -1, 3)[:, index, valid], 0, 1)
+    once = ~listed_before(interactions, vertices_m)
+    paths = {
+        "a": real + 1j * imaginary,
+        "delay_s": found.tau.numpy().reshape(receivers, -1)[index, valid].astype(float),
+        "interactions": interactions,
+        "vertices_m": np.where(interactions[:, :, None] > 0, vertices_m.astype(float), np.nan),
+    }
+    return {name: values[once] for name, values in paths.items()}, int((~once).sum())
+
+
+def stock_scene(rt: Any, folder: str, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> Any:
+    """Stock scene with isotropic antennas at the given places."""
+    scene = rt.load_scene(f"{folder}/scene.xml")
+    scene.frequency = 28e9
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
+    )
+    scene.add(rt.Transmitter("tx", position=[float(value) for value in tx]))
+    for index, position in enumerate(rx):
+        scene.add(rt.Receiver(f"rx{index}", position=[float(value) for value in position]))
+    return scene
+
+
+def limit_cores(cores: int | None) -> None:
+    """Keep this process, which has not started Dr.Jit, on so many cores."""
+    if cores is not None:
+        os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:cores])
+
+
+def peak_memory_gb() -> float:
+    """Largest resident memory of this process so far [GB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6

@@ -1,0 +1,297 @@
+"""Triangles cut at the border of an area seen from above, or by a slab: arrays in, arrays out."""
+
+from typing import Any
+
+import numpy as np
+import shapely
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+BORDER_M = 1e-5
+"""Distance within which a surface lies on a border, and stays [m]: float32 files round that much."""
+
+UPRIGHT_M = 1e-4
+"""Triangles that look narrower than this from above are cut as upright walls [m]."""
+
+MERGE_M = 1e-6
+"""Distance within which two points are one [m]."""
+
+SEAM_M = 1e-4
+"""Distance within which a cut point lies on a vertex or an edge beside it [m]: as far as `UPRIGHT_M` moves it."""
+
+Triangles = NDArray[np.float64]
+"""Corners (F, 3, 3) of triangles [m]."""
+
+
+def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], Triangles, NDArray[np.intp]]:
+    """Cut triangles at the border of an area seen from above.
+
+    Parameters
+    ----------
+    corners_m : (F, 3, 3) float64 array
+        Corners of the triangles [m].
+    area : shapely Polygon or MultiPolygon
+        What stays, as world x and y [m]. What lies on its border (within `BORDER_M`) stays.
+
+    Returns
+    -------
+    whole : (F,) bool array
+        Triangles that lie in the area.
+    pieces_m : (P, 3, 3) float64 array
+        What is in the area of triangles that lie across its border, with their winding.
+    source : (P,) int array
+        Triangle that each piece comes from, in rising order.
+    """
+    whole = np.zeros(len(corners_m), dtype=bool)
+    if not len(corners_m) or area.is_empty:
+        return whole, np.zeros((0, 3, 3)), np.zeros(0, dtype=np.intp)
+    shift = np.append(np.floor(area.bounds[:2]), 0.0)  # map projections leave few digits for the cut
+    local = corners_m - shift
+    area = shapely.simplify(shapely.transform(area, lambda points: points - shift[:2]), 0.0)
+    ends, upright = _seen_from_above(local[..., :2])
+    shapes = np.where(upright, shapely.linestrings(ends), shapely.polygons(local[..., :2]))
+    near = shapely.buffer(area, BORDER_M, join_style="mitre")
+    shapely.prepare(near)
+    touched = shapely.intersects(near, shapes)
+    whole[touched] = shapely.covers(near, shapes[touched])
+    flat, steep = (np.nonzero(touched & ~whole & kind)[0] for kind in (~upright, upright))
+    flat_pieces, flat_source = _cut_flat(local[flat], shapes[flat], area)
+    steep_pieces, steep_source = _cut_upright(local[steep], ends[steep], area)
+    pieces = np.concatenate([flat_pieces, steep_pieces])
+    source = np.concatenate([flat[flat_source], steep[steep_source]])
+    order = np.argsort(source, kind="stable")
+    return whole, pieces[order] + shift, source[order]
+
+
+@njit(cache=True)
+def clip_slab(
+    corners_m: Triangles, values: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # pragma: no cover - compiled
+    """Clip triangles to where a linear function of theirs lies between two limits.
+
+    Parameters
+    ----------
+    corners_m : (F, 3, 3) float64 array
+        Corners of the triangles [m].
+    values : (F, 3) float64 array
+        The function at the corners.
+    low, high : (F,) float64 arrays
+        Limits.
+
+    Returns
+    -------
+    polygons_m : (F, 5, 3) float64 array
+        Corners of what is left [m], with the winding of the triangle.
+    sizes : (F,) int64 array
+        Number of corners of each polygon; 0 where nothing is left.
+    """
+    polygons, sizes = np.zeros((len(corners_m), 5, 3)), np.zeros(len(corners_m), dtype=np.int64)
+    for index in range(len(corners_m)):
+        size = 0
+        for here in range(3):
+            there = (here + 1) % 3
+            start, end = values[index, here], values[index, there]
+            if low[index] <= start <= high[index]:
+                polygons[index, size] = corners_m[index, here]
+                size += 1
+            first, second = (low[index], high[index]) if start < end else (high[index], low[index])
+            below, above = (here, there) if start < end else (there, here)  # neighbours get the same point
+            for limit in (first, second):
+                if min(start, end) < limit < max(start, end):
+                    share = (limit - values[index, below]) / (values[index, above] - values[index, below])
+                    way = corners_m[index, above] - corners_m[index, below]
+                    polygons[index, size] = corners_m[index, below] + share * way
+                    size += 1
+        sizes[index] = size
+    return polygons, sizes
+
+
+def merge_points(points_m: NDArray[np.float64], distance_m: float = MERGE_M) -> NDArray[np.intp]:
+    """Find points that are one.
+
+    Parameters
+    ----------
+    points_m : (V, 3) float64 array
+        Points [m].
+    distance_m : float
+        Largest distance between two that are one [m].
+
+    Returns
+    -------
+    (V,) int array
+        Index of the first point that each is one with, its own where there is none before it.
+    """
+    unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
+    pairs = cKDTree(unique).query_pairs(distance_m, output_type="ndarray") if len(unique) else np.zeros((0, 2), np.intp)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(unique), len(unique)))
+    count, labels = connected_components(graph, directed=False) if len(unique) else (0, np.zeros(0, np.intp))
+    lowest = np.full(count, len(points_m), dtype=np.intp)
+    np.minimum.at(lowest, labels, first)
+    return lowest[labels][inverse.ravel()]
+
+
+def close_seams(
+    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64], first_new: int
+) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Split triangles at the new vertices that lie on their open edges, so that neighbours share whole edges.
+
+    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts.
+
+    Parameters
+    ----------
+    vertices_m : (V, 3) float64 array
+    triangles : (F, 3) int64 array
+    first_new : int
+        Vertices from this one on are new.
+
+    Returns
+    -------
+    triangles : (G, 3) int64 array
+    source : (G,) int array
+        Triangle that each one comes from, in rising order.
+    """
+    source = np.arange(len(triangles))
+    while True:
+        triangle, corner, point, share = _points_on_edges(vertices_m, triangles, first_new)
+        if not len(triangle):
+            return triangles, source
+        split, first = np.unique(triangle, return_index=True)
+        edge = np.zeros(len(triangles), dtype=np.intp)
+        edge[split] = corner[first]
+        ours = edge[triangle] == corner  # one edge of a triangle at a time
+        start, end, apex = (triangles[split, (edge[split] + step) % 3] for step in (0, 1, 2))
+        node = np.concatenate([start, point[ours], end])
+        owner = np.concatenate([split, triangle[ours], split])
+        place = np.concatenate([np.zeros(len(split)), share[ours], np.ones(len(split))])
+        order = np.lexsort((place, owner))
+        node, owner = node[order], owner[order]
+        within = np.nonzero(np.diff(owner) == 0)[0]
+        across = apex[np.searchsorted(split, owner[within])]
+        kept = np.delete(np.arange(len(triangles)), split)
+        parts = np.stack([node[within], node[within + 1], across], axis=1)
+        origin = np.concatenate([kept, owner[within]])
+        order = np.argsort(origin, kind="stable")
+        triangles, source = np.concatenate([triangles[kept], parts])[order], source[origin[order]]
+
+
+def _points_on_edges(
+    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64], first_new: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64], NDArray[np.float64]]:
+    """Triangle, corner at which its edge starts, new vertex on that open edge, and where on it (share of length)."""
+    edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
+    _, index, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    open_edges = np.nonzero((counts[index.ravel()] == 1) & (edges[:, 0] != edges[:, 1]))[0]
+    points = np.unique(edges[open_edges])
+    points = points[points >= first_new]
+    ends = vertices_m[edges[open_edges]]
+    tree = shapely.STRtree(shapely.linestrings(ends[..., :2]))
+    which, hit = tree.query(shapely.points(vertices_m[points, :2]), predicate="dwithin", distance=SEAM_M)
+    point, way = points[which], ends[hit, 1] - ends[hit, 0]
+    offset = vertices_m[point] - ends[hit, 0]
+    lengths = np.linalg.norm(way, axis=1)
+    share = (offset * way).sum(axis=1) / lengths**2
+    on_edge = np.linalg.norm(offset - share[:, None] * way, axis=1) <= SEAM_M
+    on_edge &= (share * lengths > SEAM_M) & ((1.0 - share) * lengths > SEAM_M)
+    edge = open_edges[hit[on_edge]]
+    order = np.lexsort((share[on_edge], edge))
+    edge = edge[order]
+    return edge // 3, edge % 3, point[on_edge][order], share[on_edge][order]
+
+
+def _seen_from_above(flat_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Longest edge (F, 2, 2) of triangles (F, 3, 2), and whether they are upright."""
+    edges = np.stack([flat_m, np.roll(flat_m, -1, axis=1)], axis=2)
+    lengths = np.linalg.norm(edges[:, :, 1] - edges[:, :, 0], axis=2)
+    longest = np.argmax(lengths, axis=1)
+    rows = np.arange(len(flat_m))
+    return edges[rows, longest], np.abs(_doubled_area(flat_m)) <= UPRIGHT_M * lengths[rows, longest]
+
+
+def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+
+
+def _doubled_area(flat_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _cross(flat_m[:, 1] - flat_m[:, 0], flat_m[:, 2] - flat_m[:, 0])
+
+
+def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
+    """Cut triangles that have a width seen from above; the height of new corners is that of the triangle's plane."""
+    parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
+    wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
+    pieces, index = shapely.get_parts(shapely.constrained_delaunay_triangles(parts[wide]), return_index=True)
+    source = source[wide][index]
+    flat = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3]
+    first, second, third = corners_m[source].transpose(1, 0, 2)
+    doubled = _doubled_area(corners_m[source][..., :2])
+    offset = flat - first[:, None, :2]
+    along_second = _cross(offset, (third - first)[:, None, :2]) / doubled[:, None]
+    along_third = _cross((second - first)[:, None, :2], offset) / doubled[:, None]
+    height = first[:, 2:] + along_second * (second - first)[:, 2:] + along_third * (third - first)[:, 2:]
+    cut = np.concatenate([flat, height[..., None]], axis=2)
+    cut[doubled < 0] = cut[doubled < 0][:, ::-1]
+    return cut, source
+
+
+def _cut_upright(corners_m: Triangles, ends_m: NDArray[np.float64], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
+    """Cut triangles that are lines seen from above, where these lines leave the area."""
+    source, low, high = _spans_inside(ends_m, area)
+    start, way = ends_m[source, 0], ends_m[source, 1] - ends_m[source, 0]
+    offset = corners_m[source][..., :2] - start[:, None]
+    share = (offset * way[:, None]).sum(axis=2) / (way**2).sum(axis=1)[:, None]
+    polygons, sizes = clip_slab(corners_m[source], share, low, high)
+    fans = [(np.nonzero(sizes > last)[0], last) for last in (2, 3, 4)]
+    pieces = np.concatenate([polygons[rows][:, [0, last - 1, last]] for rows, last in fans])
+    return pieces, np.concatenate([source[rows] for rows, _ in fans])
+
+
+def _spans_inside(
+    ends_m: NDArray[np.float64], area: Any
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    """Line, start and end (shares of its length) of every stretch of lines (L, 2, 2) in an area or on its border."""
+    lengths = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
+    line, share = _border_stops(ends_m, area)
+    line = np.concatenate([np.repeat(np.arange(len(ends_m)), 2), line])
+    share = np.concatenate([np.tile([0.0, 1.0], len(ends_m)), share])
+    order = np.lexsort((share, line))
+    line, share = line[order], share[order]
+    apart = (np.diff(line, prepend=-1) != 0) | (np.diff(share, prepend=0.0) * lengths[line] > MERGE_M)
+    line, share = line[apart], share[apart]
+    spans = np.nonzero(np.diff(line) == 0)[0]
+    line, low, high = line[spans], share[spans], share[spans + 1]
+    middle = ends_m[line, 0] + ((low + high) / 2)[:, None] * (ends_m[line, 1] - ends_m[line, 0])
+    shapely.prepare(area)
+    inside = shapely.dwithin(area, shapely.points(middle), BORDER_M)
+    line, low, high = line[inside], low[inside], high[inside]
+    new = (np.diff(line, prepend=-1) != 0) | (low != np.roll(high, 1))
+    first = np.nonzero(new)[0]
+    last = np.append(first[1:], len(line)) - 1 if len(line) else first
+    return line[first], low[first], high[last]
+
+
+def _border_stops(ends_m: NDArray[np.float64], area: Any) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Line, and share of its length, where lines (L, 2, 2) cross the border of an area or its corners lie on them."""
+    rings, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
+    edges = np.stack([rings[:-1], rings[1:]], axis=1)[ring[:-1] == ring[1:]]
+    tree = shapely.STRtree(shapely.linestrings(edges))
+    line, edge = tree.query(shapely.linestrings(ends_m), predicate="dwithin", distance=BORDER_M)
+    start, way = ends_m[line, 0], ends_m[line, 1] - ends_m[line, 0]
+    border = edges[edge, 1] - edges[edge, 0]
+    offset = edges[edge, 0] - start
+    doubled = _cross(way, border)
+    lengths = np.linalg.norm(way, axis=1)
+    slanted = np.abs(doubled) > 1e-9 * lengths * np.linalg.norm(border, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossing, along = _cross(offset, border) / doubled, _cross(offset, way) / doubled
+    crossed = slanted & (along >= 0) & (along <= 1)
+    lines, shares = [line[crossed]], [crossing[crossed]]
+    for corner in (offset, offset + border):
+        close = np.abs(_cross(way, corner)) <= BORDER_M * lengths
+        lines.append(line[close])
+        shares.append((way * corner).sum(axis=1)[close] / lengths[close] ** 2)
+    line, share = np.concatenate(lines), np.concatenate(shares)
+    between = (share > 0) & (share < 1)
+    return line[between], share[between]

@@ -1,0 +1,103 @@
+"""Verified paths, whichever way they were found, and how lists of them are joined."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class SolvedPaths:
+    """Verified paths in scene coordinates (fields as in `TracedLinks`; D may be less)."""
+
+    path_tx: NDArray[np.int32]
+    path_rx: NDArray[np.int32]
+    a: NDArray[np.complex128]
+    delay_s: NDArray[np.float64]
+    departure_rad: NDArray[np.float64]
+    arrival_rad: NDArray[np.float64]
+    interactions: NDArray[np.uint8]
+    vertices_m: NDArray[Any]
+
+    @property
+    def is_direct(self) -> NDArray[np.bool_]:
+        """Whether each path (P,) is the line of sight."""
+        return (self.interactions == 0).all(axis=1)
+
+    @classmethod
+    def of_vertices(
+        cls,
+        path_rx: NDArray[np.int32],
+        a: NDArray[np.complex128],
+        delay_s: NDArray[np.float64],
+        interactions: NDArray[np.uint8],
+        vertices_m: NDArray[Any],
+        *,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+    ) -> "SolvedPaths":
+        """Make paths of one transmitter, with NaN where there is no interaction and the angles at both ends."""
+        vertices_m = np.where(interactions[:, :, None] > 0, vertices_m, np.float32(math.nan))
+        count = (interactions > 0).sum(axis=1)
+        direct = (count == 0)[:, None]
+        first, last = vertices_m[:, 0], vertices_m[np.arange(len(count)), np.maximum(count, 1) - 1]
+        return cls(
+            path_tx=np.zeros(len(a), np.int32),
+            path_rx=path_rx,
+            a=a,
+            delay_s=delay_s,
+            departure_rad=_zenith_azimuth(np.where(direct, rx_m[path_rx], first) - tx_m),
+            arrival_rad=_zenith_azimuth(np.where(direct, tx_m, last) - rx_m[path_rx]),
+            interactions=interactions,
+            vertices_m=vertices_m,
+        )
+
+
+def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
+    """Join lists of paths, ordered by transmitter, receiver and delay.
+
+    Takes the parts out of the list one by one, so that memory need not hold all paths twice.
+    """
+    total, depth = sum(len(part.a) for part in parts), max(1, max_depth)
+    joined = SolvedPaths(
+        path_tx=np.zeros(total, np.int32),
+        path_rx=np.zeros(total, np.int32),
+        a=np.zeros(total, np.complex128),
+        delay_s=np.zeros(total),
+        departure_rad=np.zeros((total, 2)),
+        arrival_rad=np.zeros((total, 2)),
+        interactions=np.zeros((total, depth), np.uint8),
+        vertices_m=np.full((total, depth, 3), math.nan),
+    )
+    place, start = np.empty(total, np.int64), 0
+    place[_path_order(parts)] = np.arange(total)
+    while parts:
+        part = parts.pop(0)
+        at = place[start : start + len(part.a)]
+        for field in fields(SolvedPaths):
+            target = getattr(joined, field.name)
+            if target.ndim == 1 or field.name.endswith("_rad"):
+                target[at] = getattr(part, field.name)
+        joined.interactions[at, : part.interactions.shape[1]] = part.interactions
+        joined.vertices_m[at, : part.interactions.shape[1]] = part.vertices_m
+        start += len(part.a)
+    return joined
+
+
+def _path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
+    """Order of all paths by transmitter, receiver and delay; Sionna RT's delays have single precision."""
+    if not parts:
+        return np.zeros(0, np.int64)
+    tx, rx, delay_s = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("path_tx", "path_rx", "delay_s")
+    )
+    link = tx.astype(np.uint64) * np.uint64(int(rx.max(initial=0)) + 1) + rx.astype(np.uint64)
+    return np.argsort(link << np.uint64(32) | delay_s.astype(np.float32).view(np.uint32), kind="stable")
+
+
+def _zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Zenith and azimuth angles [rad] (P, 2) of direction vectors (P, 3)."""
+    x, y, z = direction.T
+    return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)

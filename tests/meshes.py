@@ -1,0 +1,42 @@
+"""Meshes that several tests use."""
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sionna_partial.maps.mesh import SceneMesh, merged_mesh
+
+OBSERVED = [(0.0, 0.0), (5.0, 0.0), (5.0, 4.0), (0.0, 4.0)]
+"""Floor of the room."""
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+    solid = trimesh.creation.box(np.subtract(high, low))
+    solid.apply_translation(np.add(low, high) / 2)
+    return solid
+
+
+def room() -> trimesh.Scene:
+    """A room of 5 x 4 x 3 m, and in it a wall of 10 cm that leaves a door."""
+    return trimesh.Scene([box((0, 0, 0), (5, 4, 3)), box((2.95, 0, 0), (3.05, 3, 3))])
+
+
+def scene_mesh(*solids: trimesh.Trimesh) -> SceneMesh:
+    whole = trimesh.util.concatenate(solids)
+    return merged_mesh(np.array(whole.vertices), whole.faces, np.zeros(len(whole.faces), np.intp), (None,))
+
+
+def surface_m2(mesh: SceneMesh) -> float:
+    return float(areas_m2(mesh).sum())
+
+
+def areas_m2(mesh: SceneMesh) -> NDArray[np.float64]:
+    a, b, c = mesh.corners_m.transpose(1, 0, 2)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+
+
+def open_edges(mesh: SceneMesh) -> NDArray[np.float64]:
+    """Ends (E, 2, 3) of the edges that one triangle has alone."""
+    edges = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    edges, count = np.unique(edges, axis=0, return_counts=True)
+    return mesh.vertices_m[edges[count == 1]]

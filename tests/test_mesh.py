@@ -1,0 +1,204 @@
+"""Meshes: checked, compared, and cut at the border of an area."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from meshes import areas_m2, box, open_edges, scene_mesh, surface_m2
+
+from sionna_partial.errors import MapError
+from sionna_partial.maps import mesh as mesh_module
+from sionna_partial.maps.mesh import SceneMesh, mesh_arrays, mesh_of_arrays
+from sionna_partial.maps.mesh_cut import clip_slab, merge_points
+from sionna_partial.settings import Material
+
+CONCRETE = Material(itu="concrete")
+SQUARE = {
+    "vertices_m": [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+    "triangles": [[0, 1, 2], [0, 2, 3]],
+    "material": [1, 0],
+    "materials": (None, CONCRETE),
+}
+ROOM = scene_mesh(box((0, 0, 0), (5, 4, 3)))
+
+
+def bumpy(seed: int) -> SceneMesh:
+    """A closed surface without a vertical or horizontal triangle."""
+    solid = box((0, 0, 0), (5, 4, 3)).subdivide().subdivide().subdivide()
+    solid.vertices += np.random.default_rng(seed).normal(0.0, 0.02, solid.vertices.shape)
+    return scene_mesh(solid)
+
+
+def random_cells(seed: int, count: int = 300):  # type: ignore[no-untyped-def]
+    """Union of random cells of 0.1 m."""
+    cells = np.random.default_rng(seed).integers(-2, (52, 42), (count, 2))
+    return shapely.union_all(shapely.box(*(cells * 0.1).T, *(cells * 0.1 + 0.1).T))
+
+
+class TestSceneMesh:
+    def test_triangles_stand_in_the_order_of_their_materials(self) -> None:
+        mesh = SceneMesh(**SQUARE)
+        np.testing.assert_array_equal(mesh.material, [0, 1])
+        np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2], [0, 3, 1]])
+        np.testing.assert_array_equal(mesh.vertices_m, [[0, 0, 0], [1, 1, 0], [0, 1, 0], [1, 0, 0]])
+        assert mesh.materials == (None, CONCRETE)
+
+    def test_equal_meshes(self) -> None:
+        mesh = SceneMesh(**SQUARE)
+        assert mesh == SceneMesh(**SQUARE)
+        assert mesh == replace(mesh, triangles=mesh.triangles)
+        for change in ({"material": [0, 0]}, {"materials": (None, None)}, {"height_range_m": (0.0, 9.0)}):
+            assert mesh != SceneMesh(**(SQUARE | change))
+        assert mesh != SceneMesh(**(SQUARE | {"vertices_m": [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 1]]}))
+        assert mesh != "mesh"
+
+    def test_arrays_are_read_only_copies(self) -> None:
+        vertices = np.array(SQUARE["vertices_m"], dtype=float)
+        mesh = SceneMesh(**(SQUARE | {"vertices_m": vertices}))
+        vertices[:] = 7.0
+        assert mesh.bounds_m.max() == 1.0
+        for array in (mesh.vertices_m, mesh.triangles, mesh.material):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 0
+
+    def test_degenerate_triangles_and_unused_vertices_are_dropped(self) -> None:
+        vertices = [*SQUARE["vertices_m"], [2, 0, 0], [9, 9, 9]]
+        triangles = [[0, 1, 2], [0, 1, 4], [1, 1, 2], [0, 2, 3]]
+        mesh = SceneMesh(vertices, triangles, [0, 0, 0, 0])
+        assert mesh == SceneMesh(SQUARE["vertices_m"], SQUARE["triangles"], [0, 0])
+
+    def test_height_range_is_that_of_the_mesh(self) -> None:
+        assert ROOM.height_range_m == (0.0, 3.0)
+        assert SceneMesh(**SQUARE).height_range_m == (0.0, 3.0)
+        assert SceneMesh(**(SQUARE | {"height_range_m": (-1, 8)})).height_range_m == (-1.0, 8.0)
+
+    def test_nothing(self) -> None:
+        mesh = SceneMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0, int))
+        assert np.isnan(mesh.bounds_m).all()
+        assert mesh.corners_m.shape == (0, 3, 3)
+        assert mesh.within(shapely.box(0, 0, 1, 1)) == mesh
+
+    def test_arrays_give_the_mesh_back(self) -> None:
+        mesh = SceneMesh(**SQUARE)
+        assert mesh_of_arrays({name: np.asarray(array) for name, array in mesh_arrays(mesh).items()}) == mesh
+        assert mesh_of_arrays({}) is None
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"vertices_m": "many"}, "vertices_m is not an array of numbers: give x, y, z in metres, (V, 3)."),
+            ({"vertices_m": [[0, 0]]}, "vertices_m has shape (1, 2): give x, y, z in metres, (V, 3)."),
+            ({"vertices_m": [[0, 0, np.nan]]}, "vertices_m[0] = (0.0, 0.0, nan) is not allowed: give finite numbers"),
+            ({"vertices_m": [[0, 0, 0], [0, 1e9, 0]]}, "vertices_m[1] = (0.0, 1000000000.0, 0.0) is not allowed"),
+            ({"triangles": [[0, 1]]}, "triangles is int64 of shape (1, 2): give integers (F, 3)."),
+            ({"triangles": [[0.0, 1.0, 2.0]]}, "triangles is float64 of shape (1, 3): give integers (F, 3)."),
+            ({"triangles": [[0, 1, 4]]}, "triangles holds the index 4, but vertices_m has 4 entries: give 0 to 3;"),
+            ({"triangles": [[0, 1, -1]]}, "triangles holds the index -1, but vertices_m has 4 entries"),
+            ({"material": [[0, 0]]}, "material is int64 of shape (1, 2): give integers (F,)."),
+            ({"material": [0, 2]}, "material holds the index 2, but materials has 2 entries: give 0 to 1;"),
+            ({"material": [0]}, "material has 1 entries for 2 triangles: give one for each."),
+            ({"materials": ("brick", None)}, "materials = ('brick', None) is not allowed: give Material(...) or None"),
+            ({"materials": (None,) * 257}, "materials has 257 entries, more than 256: give like ones the same"),
+            ({"height_range_m": (3, 3)}, "height_range_m = (3, 3) is not allowed: give (low, high) in metres"),
+            ({"height_range_m": (3, None)}, "height_range_m = (3, None) is not allowed"),
+        ],
+    )
+    def test_refused(self, change: dict, message: str) -> None:  # type: ignore[type-arg]
+        with pytest.raises(MapError, match=re.escape(message)):
+            SceneMesh(**(SQUARE | change))
+
+    def test_too_many_triangles(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(mesh_module, "MAX_TRIANGLES", 1)
+        with pytest.raises(MapError, match="triangles has 2 rows, more than 1: cut or simplify the mesh"):
+            SceneMesh(**SQUARE)
+
+
+class TestWithin:
+    def test_room_cut_in_two(self) -> None:
+        half = ROOM.within(shapely.box(-1, -1, 2, 9))
+        np.testing.assert_allclose(half.bounds_m, [[0, 0, 0], [2, 4, 3]], atol=1e-12)
+        assert surface_m2(half) == pytest.approx(2 * 2 * 4 + 2 * 2 * 3 + 4 * 3)
+        assert half.height_range_m == ROOM.height_range_m
+
+    def test_inside_nothing_changes(self) -> None:
+        assert ROOM.within(shapely.box(-1, -1, 9, 9)) == ROOM
+        assert ROOM.within(shapely.box(0, 0, 5, 4)) == ROOM
+
+    @pytest.mark.parametrize("area", [shapely.box(6, 6, 9, 9), shapely.Polygon()])
+    def test_outside_nothing_is_left(self, area: object) -> None:
+        assert len(ROOM.within(area).triangles) == 0
+
+    def test_walls_on_the_border_stay_whatever_float32_does(self) -> None:
+        moved = replace(ROOM, vertices_m=ROOM.vertices_m.astype(np.float32) * np.float32(1 + 1e-6))
+        floorless = moved.within(shapely.box(5, 0, 6, 4))
+        assert surface_m2(floorless) == pytest.approx(12.0, rel=1e-4)
+
+    def test_wall_along_a_border_with_a_corner_is_cut_at_the_corner(self) -> None:
+        wall = scene_mesh(box((0, 1, 0), (4, 1.2, 3)))
+        cut = wall.within(shapely.union_all([shapely.box(0, 0, 1, 1), shapely.box(2, 0, 3, 1)]))
+        assert surface_m2(cut) == pytest.approx(6.0 + 0.0)
+        np.testing.assert_allclose(cut.bounds_m, [[0, 1, 0], [3, 1, 3]], atol=1e-12)
+
+    def test_slopes_keep_their_plane_and_winding(self) -> None:
+        slope = SceneMesh([[0, 0, 0], [4, 0, 2], [4, 4, 6], [0, 4, 4]], [[0, 1, 2], [0, 3, 2]], [0, 0])
+        cut = slope.within(shapely.Point(2, 2).buffer(1.0, quad_segs=8))
+        x, y, z = cut.vertices_m.T
+        np.testing.assert_allclose(z, x / 2 + y, atol=1e-12)
+        a, b, c = cut.corners_m.transpose(1, 0, 2)
+        up = np.cross(b - a, c - a)[:, 2] > 0
+        np.testing.assert_array_equal(up, a[:, 0] + b[:, 0] + c[:, 0] > a[:, 1] + b[:, 1] + c[:, 1])
+
+    def test_materials_go_with_their_triangles(self) -> None:
+        cut = SceneMesh(**SQUARE).within(shapely.box(0.25, -1, 2, 2))
+        below = cut.corners_m.mean(axis=1)[:, 0] > cut.corners_m.mean(axis=1)[:, 1]
+        np.testing.assert_array_equal(cut.material, below)
+        assert areas_m2(cut)[cut.material == 0].sum() == pytest.approx(0.75**2 / 2)
+
+    @settings(max_examples=10)
+    @given(st.integers(0, 2**32 - 1))
+    def test_an_area_and_the_rest_share_the_surface(self, seed: int) -> None:
+        mesh, area = bumpy(seed), random_cells(seed)
+        cut, rest = mesh.within(area), mesh.within(shapely.box(-1, -1, 6, 5) - area)
+        assert surface_m2(cut) + surface_m2(rest) == pytest.approx(surface_m2(mesh), rel=1e-5)
+        middle = shapely.points(cut.corners_m.mean(axis=1)[:, :2])
+        assert shapely.distance(area, middle).max() < 1e-4
+
+    @settings(max_examples=10)
+    @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-6]))
+    def test_a_closed_surface_opens_at_the_border_alone(self, seed: int, noise_m: float) -> None:
+        solid = box((0, 0, 0), (5, 4, 3)).subdivide().subdivide().subdivide()
+        solid.vertices += np.random.default_rng(seed).normal(0.0, noise_m, solid.vertices.shape)
+        area = random_cells(seed, 900)
+        rims = open_edges(scene_mesh(solid).within(area))
+        assert shapely.distance(area.boundary, shapely.points(rims.mean(axis=1)[:, :2])).max() < 1e-4
+
+    def test_cutting_twice_is_cutting_once(self) -> None:
+        area = random_cells(3)
+        cut = ROOM.within(area)
+        assert cut.within(area) == cut
+
+    def test_far_from_the_origin(self) -> None:
+        shift = np.array([500_000.0, 4_500_000.0, 0.0])
+        area = random_cells(5)
+        far = replace(ROOM, vertices_m=ROOM.vertices_m + shift).within(
+            shapely.transform(area, lambda corners: corners + shift[:2])
+        )
+        assert surface_m2(far) == pytest.approx(surface_m2(ROOM.within(area)), rel=1e-6)
+
+
+def test_clip_slab() -> None:
+    corners = np.array([[[0.0, 0, 0], [4, 0, 0], [0, 0, 4]]])
+    polygons, sizes = clip_slab(corners, np.ascontiguousarray(corners[..., 2]), np.array([1.0]), np.array([3.0]))
+    np.testing.assert_array_equal(sizes, [4])
+    np.testing.assert_allclose(polygons[0, :4], [[3, 0, 1], [1, 0, 3], [0, 0, 3], [0, 0, 1]])
+
+
+def test_merge_points() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 5e-7], [1, 0, 0], [0, 0, 1e-3]])
+    np.testing.assert_array_equal(merge_points(points), [0, 1, 0, 1, 4])
+    np.testing.assert_array_equal(merge_points(points, 1e-2), [0, 1, 0, 1, 0])
+    assert merge_points(np.zeros((0, 3))).shape == (0,)

@@ -1,0 +1,191 @@
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from mesh_rays import TURN, joined, load_meshes, shapes_of
+from numpy.typing import NDArray
+
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.mesh_candidates import mesh_candidates
+from sionna_partial.tracing.rays import shoot_rays
+
+SIZE = np.array([8.0, 6.0, 3.0])
+TX = np.array([0.3, -0.2, 0.1])
+RX = np.random.default_rng(0).uniform(-0.45 * SIZE, 0.45 * SIZE, (30, 3))
+LIGHT_M_S = 299792458.0
+
+
+def candidates_of(
+    scene: Any,
+    meshes: Sequence[trimesh.Trimesh],
+    tx: Any,
+    rx: Any,
+    *,
+    depth: int = 3,
+    rays: int = 50_000,
+    **options: int,
+) -> Candidates:
+    shot = shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), tx, rays, depth)
+    parts = list(mesh_candidates(*joined(*meshes), shot, tx, rx, max_depth=depth, **options))
+    shares = [share for _, share in parts]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+    fields = (
+        np.concatenate([getattr(part, name) for part, _ in parts]) for name in ("rx", "face", "vertices_m", "wedge")
+    )
+    return Candidates(*fields)
+
+
+def lengths_m(candidates: Candidates, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths of all candidates (C,)."""
+    ends = rx[candidates.rx][:, None]
+    points = np.where(candidates.face[:, :, None] >= 0, candidates.vertices_m, ends)
+    way = np.concatenate([np.broadcast_to(tx, ends.shape), points, ends], axis=1)
+    return np.linalg.norm(np.diff(way, axis=1), axis=2).sum(axis=1)
+
+
+def by_receiver(candidates: Candidates, lengths: NDArray[np.float64], count: int) -> list[NDArray[np.float64]]:
+    return [np.sort(lengths[candidates.rx == k]) for k in range(count)]
+
+
+def image_distances_m(rx: NDArray[np.float64], depth: int) -> NDArray[np.float64]:
+    """Distances to all images of TX in the box, of order `depth` at most, ascending."""
+    orders = [o for o in itertools.product(range(-depth, depth + 1), repeat=3) if np.abs(o).sum() <= depth]
+    images = np.array(orders) * SIZE + np.where(np.array(orders) % 2, -TX, TX)
+    return np.sort(np.linalg.norm(images - rx, axis=1))
+
+
+def turned(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    return points @ TURN[:3, :3].T
+
+
+def room() -> list[trimesh.Trimesh]:
+    """A box with a ball, a pillar and a table in it."""
+    ball = trimesh.creation.icosphere(1, 0.5).apply_translation((-2, 1, 0.4))
+    pillar = trimesh.creation.cylinder(0.3, 3, sections=8).apply_translation((2, -1, 0))
+    table = trimesh.creation.box((1.5, 0.8, 0.05)).apply_translation((1, 1.5, -0.7))
+    return [trimesh.creation.box(SIZE), ball, pillar, table]
+
+
+class TestBox:
+    """In a convex room every image of the transmitter is a path: an exact answer, whatever the faces look like."""
+
+    @pytest.mark.parametrize("kind", ["upright", "turned", "inverted", "subdivided", "in two meshes"])
+    def test_every_image_once(self, tmp_path: Path, kind: str) -> None:
+        box, tx, rx = trimesh.creation.box(SIZE), TX, RX
+        if kind == "subdivided":
+            box = box.subdivide().subdivide()
+        if kind == "inverted":
+            box.invert()
+        if kind == "turned":
+            box, tx, rx = box.apply_transform(TURN), turned(TX), turned(RX)
+        half = len(box.faces) // 2 + 1
+        parts = [trimesh.Trimesh(box.vertices, faces) for faces in (box.faces[:half], box.faces[half:])]
+        meshes = parts if kind == "in two meshes" else [box]
+        found = candidates_of(load_meshes(tmp_path, *meshes), meshes, tx, rx, depth=4)
+        for k, lengths in enumerate(by_receiver(found, lengths_m(found, tx, rx), len(rx))):
+            np.testing.assert_allclose(lengths, image_distances_m(RX[k], 4), atol=1e-5)
+
+    def test_no_reflection_is_line_of_sight(self, tmp_path: Path) -> None:
+        box = [trimesh.creation.box(SIZE)]
+        scene = load_meshes(tmp_path, *box)
+        parts = list(
+            mesh_candidates(
+                *joined(*box), shoot_rays(scene.mi_scene, shapes_of(scene, 1), TX, 100, 0), TX, RX, max_depth=0
+            )
+        )
+        assert len(parts) == 1
+        assert parts[0][0].rx.tolist() == list(range(len(RX)))
+        assert (parts[0][0].face == -1).all()
+        assert parts[0][0].face.shape == (len(RX), 1)
+
+
+class TestRoom:
+    @pytest.fixture(scope="class")
+    def scene(self, tmp_path_factory: pytest.TempPathFactory) -> Any:
+        return load_meshes(tmp_path_factory.mktemp("room"), *room())
+
+    def test_candidates_obey_the_law_of_reflection(self, scene: Any) -> None:
+        found = candidates_of(scene, room(), TX, RX)
+        vertices, triangles = joined(*room())
+        normal = trimesh.Trimesh(vertices, triangles, process=False).face_normals
+        chosen = (found.face >= 0).sum(axis=1) == 3
+        assert chosen.sum() > 500
+        face, points = found.face[chosen], found.vertices_m[chosen]
+        np.testing.assert_allclose(((points - vertices[triangles[face, 0]]) * normal[face]).sum(axis=2), 0.0, atol=1e-9)
+        ends = RX[found.rx[chosen]][:, None]
+        legs = np.diff(np.concatenate([np.broadcast_to(TX, ends.shape), points, ends], axis=1), axis=1)
+        legs /= np.linalg.norm(legs, axis=2, keepdims=True)
+        mirrored = legs[:, :-1] - 2.0 * (legs[:, :-1] * normal[face]).sum(axis=2)[:, :, None] * normal[face]
+        np.testing.assert_allclose(legs[:, 1:], mirrored, atol=1e-6)
+
+    def test_all_paths_of_stock_sionna_are_candidates(self, scene: Any) -> None:
+        import sionna.rt as rt
+
+        scene.add(rt.Transmitter("tx", position=TX.tolist()))
+        rx = RX[:10]
+        for k, position in enumerate(rx):
+            scene.add(rt.Receiver(f"rx{k}", position=position.tolist()))
+        paths = rt.PathSolver()(
+            scene, max_depth=3, refraction=False, samples_per_src=50_000, max_num_paths_per_src=2_000_000
+        )
+        valid, delay = paths.valid.numpy().reshape(len(rx), -1), paths.tau.numpy().reshape(len(rx), -1)
+        found = candidates_of(scene, room(), TX, rx)
+        assert len(found.rx) < 3 * valid.sum()
+        for k, lengths in enumerate(by_receiver(found, lengths_m(found, TX, rx), len(rx))):
+            away = np.abs(lengths[:, None] - LIGHT_M_S * delay[k][valid[k]]).min(axis=0)
+            assert len(away) > 40
+            assert away.max() < 2e-3
+
+    def test_no_chain_twice_and_each_in_one_piece(self, scene: Any) -> None:
+        found = candidates_of(scene, room(), TX, RX)
+        _, triangles = joined(*room())
+        assert len(np.unique(np.column_stack([found.rx, found.face]), axis=0)) == len(found.rx)
+        flat = found.vertices_m[:, 0, 2] == -1.5
+        floor = flat & (found.face[:, 0] >= 0) & (found.face[:, 1] < 0)
+        assert np.ptp(np.flatnonzero(floor)) == floor.sum() - 1
+
+    def test_a_receiver_has_its_candidates_whoever_is_beside(self, scene: Any) -> None:
+        whole, some = candidates_of(scene, room(), TX, RX), candidates_of(scene, room(), TX, RX[20:23])
+        for k in range(3):
+            kept = whole.rx == 20 + k
+            assert kept.sum() > 20
+            assert whole.face[kept].tobytes() == some.face[some.rx == k].tobytes()
+            assert whole.vertices_m[kept].tobytes() == some.vertices_m[some.rx == k].tobytes()
+
+    def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
+        whole, parts = (
+            candidates_of(scene, room(), TX, RX),
+            candidates_of(scene, room(), TX, RX, candidates_per_block=50),
+        )
+        for name in ("rx", "face", "vertices_m"):
+            assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
+
+
+class TestOpenMesh:
+    TRIANGLE = trimesh.Trimesh([[2.0, -2.0, -2.0], [2.0, 2.0, -2.0], [2.0, 0.0, 3.0]], [[0, 1, 2]])
+
+    def test_one_triangle_reflects_where_its_mirror_image_shows(self, tmp_path: Path) -> None:
+        rx = np.random.default_rng(1).uniform(-6.0, 6.0, (3000, 3))
+        found = candidates_of(load_meshes(tmp_path, self.TRIANGLE), [self.TRIANGLE], np.zeros(3), rx, depth=2)
+        share = 2.0 / (4.0 - rx[:, 0])
+        y, z = share * rx[:, 1], share * rx[:, 2]
+        inside = (rx[:, 0] < 2.0) & (z > -2.0) & (np.abs(y) < 2.0 * (3.0 - z) / 5.0)
+        near = np.minimum(np.abs(z + 2.0), np.abs(np.abs(y) - 2.0 * (3.0 - z) / 5.0)) < 2e-3
+        reflected = np.zeros(len(rx), bool)
+        reflected[found.rx[found.face[:, 0] == 0]] = True
+        assert inside.sum() > 100
+        np.testing.assert_array_equal(reflected[~near], inside[~near])
+        assert (found.face[:, 1] == -1).all()
+        assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
+
+    def test_without_rays_there_is_line_of_sight(self) -> None:
+        parts = list(mesh_candidates(*joined(self.TRIANGLE), [], TX, RX, max_depth=2))
+        assert [part.rx.tolist() for part, _ in parts] == [list(range(len(RX)))]
+
+    def test_no_receivers(self) -> None:
+        assert list(mesh_candidates(*joined(self.TRIANGLE), [], TX, np.zeros((0, 3)), max_depth=2)) == []

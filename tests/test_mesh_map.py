@@ -1,0 +1,206 @@
+"""Meshes on cells: walls without gaps, and what has been observed."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from meshes import OBSERVED, box, room, scene_mesh, surface_m2
+from scipy import ndimage
+
+from sionna_partial.constants import CellState
+from sionna_partial.coverage import predict_map
+from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.maps.mesh import SceneMesh
+from sionna_partial.maps.mesh_map import MeshReading, cut_to_known, mesh_map, raised
+from sionna_partial.maps.partial_map import PartialMap
+
+FREE, WALL, UNKNOWN = (int(state) for state in CellState)
+ROOM = scene_mesh(*room().geometry.values())
+SIGN = {FREE: ".", WALL: "#", UNKNOWN: "?"}
+
+
+def drawn(partial: PartialMap) -> str:
+    return " ".join("".join(SIGN[int(cell)] for cell in row) for row in partial.state[::-1])
+
+
+def upright(ends: list[tuple[float, float]], height_m: float = 3.0) -> SceneMesh:
+    """A thin wall along a line."""
+    low = np.array([(x, y, 0.0) for x, y in ends])
+    vertices, count = np.concatenate([low, np.add(low, (0, 0, height_m))]), len(low)
+    steps = [(i, i + 1) for i in range(count - 1)]
+    triangles = [t for a, b in steps for t in ((a, b, b + count), (a, b + count, a + count))]
+    return SceneMesh(vertices, triangles, [0] * len(triangles))
+
+
+class TestState:
+    def test_room(self) -> None:
+        partial = mesh_map(ROOM, MeshReading(observed=OBSERVED, resolution_m=0.5))
+        assert (partial.origin_m, partial.shape) == ((-0.5, -0.5), (11, 13))
+        inside = ["?#....##..#??"] * 6
+        rows = ["?" * 13, "?" * 13, "?##########??", *inside, "?##########??", "?" * 13]
+        assert drawn(partial).split() == rows
+        assert partial.is_complete
+        assert partial.mesh == ROOM
+
+    def test_default_is_what_has_surfaces(self) -> None:
+        partial = mesh_map(ROOM, MeshReading(resolution_m=0.5))
+        inside = ["?#.........#?", *["?#....##...#?"] * 6]
+        assert drawn(partial).split() == ["?" * 13, "?##########??", *inside, "?###########?", "?" * 13]
+        assert partial.mesh is ROOM
+
+    def test_unobserved_cells_are_unknown_and_their_mesh_is_gone(self) -> None:
+        partial = mesh_map(ROOM, MeshReading(observed=[(0, 0), (2, 0), (2, 4), (0, 4)], resolution_m=0.5))
+        assert partial.mesh is not None
+        np.testing.assert_allclose(partial.mesh.bounds_m, [[0, 0, 0], [2, 4, 3]], atol=1e-12)
+        assert partial.height_range_m == (0.0, 3.0)
+        columns = np.nonzero((partial.state != UNKNOWN).any(axis=0))[0]
+        assert (columns.min(), columns.max()) == (1, 4)
+
+    def test_observed_by_another_map(self) -> None:
+        state = np.full((4, 2), UNKNOWN)
+        state[:, 0] = FREE
+        other = PartialMap(state, 1.0, (1.0, 0.0))
+        partial = mesh_map(ROOM, MeshReading(observed=other, resolution_m=0.25))
+        y, x = np.nonzero(partial.state != UNKNOWN)
+        low, high = np.array([x.min(), y.min()]) * 0.25 - 0.25, np.array([x.max(), y.max()]) * 0.25
+        np.testing.assert_allclose([low, high], [[1, 0], [2, 4]])
+        nothing = mesh_map(ROOM, MeshReading(observed=PartialMap(np.full((2, 2), UNKNOWN), 1.0)))
+        assert (nothing.state == UNKNOWN).all()
+        assert nothing.mesh is not None
+        assert len(nothing.mesh.triangles) == 0
+
+    def test_height_band(self) -> None:
+        table = scene_mesh(box((0, 0, 0), (5, 4, 3)), box((2.1, 2.1, 0.6), (2.9, 2.9, 0.7)))
+        low, high = (
+            mesh_map(table, MeshReading(height_band_m=band, observed=OBSERVED, resolution_m=0.5))
+            for band in ((0.5, 0.8), (1.0, 1.8))
+        )
+        assert (low.state == WALL).sum() - (high.state == WALL).sum() == 4
+        touching = mesh_map(table, MeshReading(height_band_m=(0.0, 3.0), observed=OBSERVED, resolution_m=0.5))
+        assert touching == mesh_map(table, MeshReading(height_band_m=(0.5, 0.8), observed=OBSERVED, resolution_m=0.5))
+
+    def test_default_band_starts_at_the_lowest_point(self) -> None:
+        lifted = SceneMesh(np.add(ROOM.vertices_m, (0, 0, 7.0)), ROOM.triangles, ROOM.material)
+        high = mesh_map(lifted, MeshReading(resolution_m=0.5))
+        np.testing.assert_array_equal(high.state, mesh_map(ROOM, MeshReading(resolution_m=0.5)).state)
+        assert high.height_range_m == (7.0, 10.0)
+
+    def test_wall_that_ends_on_a_lattice_line_does_not_reach_over_it(self) -> None:
+        partial = mesh_map(upright([(0.0, 0.25), (1.0, 0.25)]), MeshReading(resolution_m=0.5))
+        assert drawn(partial) == "????? ?##?? ?????"
+
+    @pytest.mark.parametrize("noise", [0.0, 1e-7, -1e-7])
+    def test_wall_along_a_lattice_line_is_above_it(self, noise: float) -> None:
+        partial = mesh_map(upright([(0.25, 1.0 + noise), (1.75, 1.0 - noise)]), MeshReading(resolution_m=0.5))
+        rows = np.nonzero((partial.state == WALL).any(axis=1))[0]
+        np.testing.assert_array_equal(rows * 0.5 + partial.origin_m[1], [1.0])
+
+    @settings(max_examples=60)
+    @given(
+        st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), min_size=2, max_size=5),
+        st.sampled_from([0.0, 1e-7, 1e-6, 1e-3]),
+        st.integers(0, 9),
+    )
+    def test_walls_have_no_gaps(self, ends: list[tuple[int, int]], noise_m: float, seed: int) -> None:
+        corners = np.array(ends) * 0.25 + np.random.default_rng(seed).normal(0.0, noise_m, (len(ends), 2))
+        if (np.abs(np.diff(corners, axis=0)).max(axis=1) < 0.1).any():
+            return
+        partial = mesh_map(upright(corners.tolist()), MeshReading(resolution_m=0.5))
+        _, parts = ndimage.label(partial.state == WALL, np.ones((3, 3)))
+        assert parts == 1
+
+    @settings(max_examples=30)
+    @given(st.integers(0, 2**32 - 1))
+    def test_cells_are_those_that_surfaces_reach(self, seed: int) -> None:
+        vertices = np.random.default_rng(seed).uniform(0, 3, (9, 3))
+        mesh = SceneMesh(vertices, np.arange(9).reshape(3, 3), [0, 0, 0])
+        partial = mesh_map(mesh, MeshReading(resolution_m=0.25))
+        rows, columns = np.indices(partial.shape)
+        x, y = (index * 0.25 + start for index, start in zip((columns, rows), partial.origin_m, strict=True))
+        cells = shapely.box(x, y, x + 0.25, y + 0.25)
+        seen = shapely.union_all(shapely.polygons(mesh.corners_m[..., :2]))
+        np.testing.assert_array_equal(partial.state != UNKNOWN, shapely.area(shapely.intersection(cells, seen)) > 1e-7)
+
+
+class TestKnown:
+    def test_cut_to_known(self) -> None:
+        whole = mesh_map(ROOM, MeshReading(resolution_m=0.5))
+        state = whole.state.copy()
+        state[:, 5:] = UNKNOWN
+        cut = cut_to_known(PartialMap(state, 0.5, whole.origin_m, mesh=ROOM))
+        assert cut.mesh is not None
+        assert cut.mesh.bounds_m[1, 0] == 2.0
+        assert surface_m2(cut.mesh) == pytest.approx(2 * 8 + 12 + 12)
+
+    def test_maps_whose_lattice_is_not_on_multiples(self) -> None:
+        cut = cut_to_known(PartialMap(np.zeros((3, 3), int), 0.5, (1.1, 0.7), mesh=ROOM))
+        assert cut.mesh is not None
+        np.testing.assert_allclose(cut.mesh.bounds_m, [[1.1, 0.7, 0], [2.6, 2.2, 3]], atol=1e-12)
+
+    def test_plans_stay(self) -> None:
+        plan = PartialMap(np.zeros((3, 3), int), 0.5)
+        assert cut_to_known(plan) is plan
+        assert raised(plan) is plan
+
+
+def test_height_above_the_mesh() -> None:
+    partial = mesh_map(ROOM, MeshReading(), wall_height_m=8.0)
+    assert (partial.height_range_m, partial.wall_height_m) == ((0.0, 8.0), 8.0)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"up": "x"}, 'up = \'x\' is not allowed: choose "z" or "y".'),
+        ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
+        (
+            {"height_band_m": (2, 1)},
+            "height_band_m = (2, 1) is not allowed: give (low, high), z in metres, low < high.",
+        ),
+        ({"height_band_m": 2}, "height_band_m = 2 is not allowed: give (low, high), z in metres"),
+        ({"height_band_m": (0, np.inf)}, "height_band_m = (0, inf) is not allowed"),
+        ({"observed": "all"}, "observed is of type str: give the corners (M, 2) of a polygon without crossings"),
+        ({"observed": [(0, 0), (1, 1)]}, "observed has shape (2, 2) or values that are not finite: give the corners"),
+        ({"observed": [(0, 0), (1, 1), (np.nan, 1)]}, "observed has shape (3, 2) or values that are not finite"),
+        ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "observed is no polygon (Self-intersection"),
+        ({"observed": [(0, 0), (1, 1), (2, 2)]}, "observed is no polygon ("),
+        (
+            {"observed": [(9, 9), (10, 9), (9, 10)]},
+            "observed holds no cell of the map, which spans x -0.05 to 5.1 m and",
+        ),
+    ],
+)
+def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(MapError, match=re.escape(message)):
+        mesh_map(ROOM, MeshReading(**given))
+
+
+def test_too_many_cells() -> None:
+    large = SceneMesh(ROOM.vertices_m * 1e5, ROOM.triangles, ROOM.material)
+    message = r"resolution_m = 0.05 makes \d+ x \d+ cells of the mesh, more than 100,000,000: give (\d+) or more, check"
+    with pytest.raises(MapError, match=message):
+        mesh_map(large, MeshReading())
+
+
+@pytest.mark.parametrize(
+    "given", [{"height_band_m": (1, 2)}, {"observed": OBSERVED}, {"resolution_m": 0.1}, {"up": "z"}]
+)
+def test_for_meshes_alone(given: dict) -> None:  # type: ignore[type-arg]
+    (name,) = given
+    with pytest.raises(MapError, match=rf"{name} is for meshes alone, but path = 'a.npz' is none: leave it out\."):
+        MeshReading(**given).require_unused(Path("a.npz"), "none")
+    MeshReading().require_unused(Path("a.npz"), "none")
+
+
+@pytest.mark.parametrize(
+    ("height_m", "message"),
+    [(1.5, r"rx_height_m = 1.5 is not allowed: give a number in \(7, 10\]"), (10.0, "stay below the ceiling at 10 m")],
+)
+def test_receivers_are_between_the_ends_of_the_mesh(height_m: float, message: str) -> None:
+    lifted = SceneMesh(np.add(ROOM.vertices_m, (0, 0, 7.0)), ROOM.triangles, ROOM.material)
+    with pytest.raises(SettingsError, match=message):
+        predict_map(mesh_map(lifted, MeshReading()), (1.0, 1.0, 8.5), rx_height_m=height_m)

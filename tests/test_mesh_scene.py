@@ -1,0 +1,227 @@
+"""Mitsuba scene files: Sionna's own, ours, those of others, and hostile ones."""
+
+import re
+import sysconfig
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meshes import box, surface_m2
+
+from sionna_partial.errors import MapError
+from sionna_partial.maps import mesh_scene
+from sionna_partial.maps.mesh import SceneMesh
+from sionna_partial.maps.mesh_scene import exported_record, read_exported_mesh, read_mitsuba_scene
+from sionna_partial.maps.ros_map import MapWarning
+from sionna_partial.settings import Material
+
+SCENES = Path(sysconfig.get_paths()["purelib"]) / "sionna" / "rt" / "scenes"
+RADIO = '<bsdf type="itu-radio-material" id="wall"><string name="type" value="concrete"/></bsdf>'
+CONCRETE = Material(itu="concrete")
+
+
+def scene(folder: Path, content: str) -> Path:
+    """Write a scene file, and a box beside it."""
+    (folder / "meshes").mkdir(exist_ok=True)
+    box((0, 0, 0), (5, 4, 3)).export(folder / "meshes" / "box.ply")
+    path = folder / "any.xml"
+    path.write_text(f"<scene version='2.1.0'>{content}</scene>")
+    return path
+
+
+def shape(kind: str, inside: str = "", bsdf: str = '<ref id="wall"/>') -> str:
+    file = '<string name="filename" value="meshes/box.ply"/>' if kind == "ply" else ""
+    return f'<shape type="{kind}" id="it">{file}{inside}{bsdf}</shape>'
+
+
+def moved(*steps: str) -> str:
+    return f'<transform name="to_world">{"".join(steps)}</transform>'
+
+
+@pytest.mark.parametrize(
+    ("name", "triangles", "materials"),
+    [
+        ("box", 12, {"metal"}),
+        ("floor_wall", 4, {"concrete", "brick"}),
+        ("simple_wedge", 4, {"concrete"}),
+        ("simple_street_canyon", 74, {"glass", "wood", "marble", "brick", "concrete"}),
+        ("simple_street_canyon_with_cars", 234, {"glass", "wood", "marble", "brick", "concrete", "metal"}),
+    ],
+)
+def test_scenes_of_sionna(name: str, triangles: int, materials: set[str]) -> None:
+    mesh = read_mitsuba_scene(SCENES / name / f"{name}.xml")
+    assert len(mesh.triangles) == triangles
+    assert {material.itu for material in mesh.materials if material} == materials
+
+
+def test_shapes_share_vertices_and_keep_their_materials(tmp_path: Path) -> None:
+    other = '<bsdf type="radio-material" id="door"><float name="conductivity" value="0.5"/></bsdf>'
+    beside = shape("ply", moved('<translate x="5"/>'), '<ref id="door" name="bsdf"/>')
+    mesh = read_mitsuba_scene(scene(tmp_path, RADIO + other + shape("ply") + beside))
+    assert mesh.materials == (CONCRETE, Material(1.0, 0.5, 0.1))
+    np.testing.assert_array_equal(mesh.material, np.repeat([0, 1], 12))
+    assert len(mesh.vertices_m) == 12
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "material"),
+    [
+        ('<bsdf type="diffuse" id="mat-itu_concrete"/>', CONCRETE),
+        ('<bsdf type="twosided" id="itu_wood"><bsdf type="diffuse"/></bsdf>', Material(itu="wood")),
+        (
+            '<bsdf type="diffuse" id="itu-any"><string name="type" value="glass"/>'
+            '<float name="thickness" value="0.02"/></bsdf>',
+            Material(itu="glass", thickness_m=0.02),
+        ),
+        (
+            '<bsdf type="radio-material" id="x"><float name="relative_permittivity" value="3"/>'
+            '<float name="conductivity" value="0.1"/><float name="thickness" value="0.3"/></bsdf>',
+            Material(3.0, 0.1, 0.3),
+        ),
+    ],
+)
+def test_materials(tmp_path: Path, bsdf: str, material: Material) -> None:
+    nested = read_mitsuba_scene(scene(tmp_path, shape("ply", "", bsdf)))
+    assert nested.materials == (material,)
+    name = re.search('id="(.*?)"', bsdf)
+    assert name
+    referred = read_mitsuba_scene(scene(tmp_path, bsdf + shape("ply", "", f'<ref id="{name[1]}"/>')))
+    assert referred == nested
+
+
+def test_other_materials_are_those_of_the_settings(tmp_path: Path) -> None:
+    paint = '<bsdf type="diffuse" id="paint"/>'
+    with pytest.warns(MapWarning, match=r"bsdf 'paint' of type 'diffuse' is no radio material; the material of SceneS"):
+        mesh = read_mitsuba_scene(scene(tmp_path, paint + shape("ply", "", '<ref id="paint"/>')))
+    assert mesh.materials == (None,)
+    with pytest.warns(MapWarning, match=r"shape 'it' has no bsdf; the material of SceneSettings takes its place"):
+        read_mitsuba_scene(scene(tmp_path, shape("ply", "", "")))
+
+
+@pytest.mark.parametrize(
+    ("steps", "low", "high"),
+    [
+        ([], (0, 0, 0), (5, 4, 3)),
+        (['<translate x="1" z="-2"/>'], (1, 0, -2), (6, 4, 1)),
+        (['<translate value="1, 2, 3"/>'], (1, 2, 3), (6, 6, 6)),
+        (['<scale value="2"/>'], (0, 0, 0), (10, 8, 6)),
+        (['<scale y="2"/>'], (0, 0, 0), (5, 8, 3)),
+        (['<rotate z="2" angle="90"/>'], (-4, 0, 0), (0, 5, 3)),
+        (['<rotate value="1 0 0" angle="90"/>'], (0, -3, 0), (5, 0, 4)),
+        (['<translate x="1"/>', '<scale value="2"/>'], (2, 0, 0), (12, 8, 6)),
+        (['<matrix value="0 -1 0 7  1 0 0 0  0 0 1 0  0 0 0 1"/>'], (3, 0, 0), (7, 5, 3)),
+    ],
+)
+def test_to_world(tmp_path: Path, steps: list[str], low: tuple[float, ...], high: tuple[float, ...]) -> None:
+    mesh = read_mitsuba_scene(scene(tmp_path, RADIO + shape("ply", moved(*steps))))
+    np.testing.assert_allclose(mesh.bounds_m, [low, high], atol=1e-12)
+
+
+def test_rectangle_and_cube(tmp_path: Path) -> None:
+    cube = read_mitsuba_scene(scene(tmp_path, RADIO + shape("cube")))
+    np.testing.assert_array_equal(cube.bounds_m, [[-1, -1, -1], [1, 1, 1]])
+    assert (len(cube.triangles), surface_m2(cube)) == (12, 24.0)
+    a, b, c = cube.corners_m.transpose(1, 0, 2)
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a) > 0).all()
+    flat = read_mitsuba_scene(scene(tmp_path, RADIO + shape("rectangle")))
+    np.testing.assert_array_equal(flat.bounds_m, [[-1, -1, 0], [1, 1, 0]])
+    assert (len(flat.triangles), surface_m2(flat)) == (2, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "holds no shape: give a Mitsuba scene with meshes"),
+        (
+            '<include filename="/etc/passwd"/>' + shape("cube"),
+            "has an <include>, which is not followed: put everything",
+        ),
+        ('<path value="/etc"/>' + shape("cube"), "has an <path>, which is not followed"),
+        (
+            shape("sphere") + shape("disk"),
+            "has shapes of type disk, sphere: give ply, obj, rectangle, cube; Mitsuba wr",
+        ),
+        (RADIO + shape("obj"), "shape 'it' has the filename '', which is not allowed: put it into"),
+        (shape("cube"), "shape 'it' refers to 'wall', which is no bsdf of the scene: add it, or correct the id"),
+        (
+            RADIO.replace("concrete", "cheese") + shape("cube"),
+            "bsdf 'wall' is no radio material (itu = 'cheese' is not",
+        ),
+        ('<bsdf type="itu-radio-material" id="a"/>' + shape("cube"), "bsdf 'a' is no radio material (itu = '' is not"),
+        (
+            '<bsdf type="radio-material" id="a"><float name="conductivity" value="much"/></bsdf>' + shape("cube"),
+            "bsdf 'a' is no radio material (could not convert string to float: 'much'): correct it",
+        ),
+        (RADIO + shape("cube", moved("<lookat/>")), "shape 'it' has a to_world with <lookat {}>, which cannot be read"),
+        (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
+        (RADIO + shape("cube", moved('<rotate x="1"/>')), "has a to_world with <rotate {'x': '1'}>, which cannot"),
+        (RADIO + shape("cube", moved('<matrix value="1 2"/>')), "has a to_world with <matrix {'value': '1 2'}>, which"),
+        (RADIO + shape("cube", moved('<scale value="nan"/>')), "is not allowed: give finite numbers of metres"),
+        (RADIO + shape("cube", moved('<scale value="0"/>')), "holds degenerate triangles alone"),
+    ],
+)
+def test_refused(tmp_path: Path, content: str, message: str) -> None:
+    path = scene(tmp_path, content)
+    with pytest.raises(MapError, match=rf"path = '{re.escape(str(path))}'.*{re.escape(message)}"):
+        read_mitsuba_scene(path)
+
+
+@pytest.mark.parametrize("file", ["/etc/passwd", "../box.ply", "meshes/../../box.ply", "gone.ply"])
+def test_meshes_lie_in_the_folder(tmp_path: Path, file: str) -> None:
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    path = scene(folder, RADIO + shape("ply").replace("meshes/box.ply", file))
+    (folder / "meshes" / "box.ply").rename(tmp_path / "box.ply")
+    with pytest.raises(MapError, match=rf"shape 'it' has the filename '{file}', which is not (allowed|there): put it"):
+        read_mitsuba_scene(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is not valid XML (no element found"),
+        ("<scene>", "is not valid XML (no element found"),
+        ("<scene>&boom;</scene>", "is not valid XML (undefined entity"),
+        ("<svg/>", "has the root <svg>: give a Mitsuba scene file, with <scene>"),
+        ('<!DOCTYPE scene [<!ENTITY a "aa">]><scene>&a;</scene>', "has a DOCTYPE, which is not followed: remove it"),
+        ('<!DOCTYPE scene SYSTEM "file:///etc/passwd"><scene/>', "has a DOCTYPE, which is not followed"),
+    ],
+)
+def test_no_scene(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.xml").write_text(text)
+    with pytest.raises(MapError, match=rf"a.xml' {re.escape(message)}"):
+        read_mitsuba_scene(tmp_path / "a.xml")
+
+
+def test_unreadable_and_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(MapError, match=r"gone.xml' cannot be read \(No such file or directory\): check the path"):
+        read_mitsuba_scene(tmp_path / "gone.xml")
+    monkeypatch.setattr(mesh_scene, "MAX_XML_BYTES", 10)
+    with pytest.raises(MapError, match=r"any.xml' has more than 10 bytes: split the scene"):
+        read_mitsuba_scene(scene(tmp_path, RADIO))
+
+
+class TestExportedMesh:
+    MESH = SceneMesh(np.eye(3), [[0, 1, 2]], [1], (None, CONCRETE))
+
+    def test_other_shapes(self, tmp_path: Path) -> None:
+        scene(tmp_path, shape("cube")).rename(tmp_path / "scene.xml")
+        sheet = {"mesh": exported_record(self.MESH), "scene_offset": [0, 0, 0]}
+        with pytest.raises(MapError, match="has a shape 'it' that was not exported: export the scene again"):
+            read_exported_mesh(tmp_path, sheet)
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"mesh": None},
+            {"mesh": {}},
+            {"mesh": {"height_range": [0, 1], "materials": ["concrete"]}},
+            {"mesh": {"height_range": [0, 1], "materials": [{"itu": "cheese"}]}},
+            {"mesh": {"height_range": [0], "materials": []}},
+            {"scene_offset": [0, 0]},
+        ],
+    )
+    def test_damaged_entry(self, tmp_path: Path, change: dict) -> None:  # type: ignore[type-arg]
+        sheet = {"mesh": exported_record(self.MESH), "scene_offset": [0, 0, 0]} | change
+        with pytest.raises(MapError, match=r"map.yaml' has a damaged mesh entry \(.*\): export it again"):
+            read_exported_mesh(tmp_path, sheet)

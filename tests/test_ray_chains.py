@@ -1,0 +1,104 @@
+import numpy as np
+import trimesh
+
+from sionna_partial.tracing.mesh_planes import MeshPlanes, group_planes
+from sionna_partial.tracing.ray_chains import MARGIN, Chains, collect_chains, view_chains
+from sionna_partial.tracing.rays import Rays
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def box_planes() -> MeshPlanes:
+    mesh = trimesh.creation.box((8, 6, 3))
+    return group_planes(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+
+
+def rays_along(face: list[list[int]], leg_m: list[list[float]], direction: np.ndarray | None = None) -> Rays:
+    """Rays with given faces and lengths; all legs go up unless directions are given."""
+    shape = (len(leg_m), len(leg_m[0]), 3)
+    directions = np.broadcast_to(UP, shape) if direction is None else direction
+    return Rays(np.array(face, np.int32), np.array(leg_m, np.float32), directions.astype(np.float32))
+
+
+def chain_planes(chains: Chains, node: int) -> list[int]:
+    before = chain_planes(chains, int(chains.parent[node])) if chains.parent[node] >= 0 else []
+    return [*before, int(chains.plane[node])]
+
+
+class TestCollectChains:
+    def test_faces_of_one_plane_make_one_chain(self) -> None:
+        planes = box_planes()
+        first, second = (np.flatnonzero(planes.plane == plane) for plane in (0, 1))
+        rays = rays_along(
+            [[first[0], second[1]], [first[1], second[0]], [first[1], -1]], [[1, 2, 3], [2, 2, 1], [1, 9, 9]]
+        )
+        chains = collect_chains([rays], planes)
+        assert [chain_planes(chains, node) for node in range(chains.size)] == [[0], [0, 1]]
+        assert chains.rays == 3
+
+    def test_reach_is_the_longest_unfolded_length(self) -> None:
+        planes = box_planes()
+        rays = rays_along([[0, 5], [0, 5], [0, -1]], [[1, 2, 3], [2, 2, 1], [1, np.inf, np.inf]])
+        chains = collect_chains([rays], planes)
+        assert chains.reach_m[:2].tolist() == [np.inf, 6.0]
+
+    def test_boxes_hold_the_directions_in_which_rays_left(self) -> None:
+        direction = np.random.default_rng(0).normal(size=(50, 3, 3))
+        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
+        chains = collect_chains([rays_along([[0, 5]] * 50, [[1, 1, 1]] * 50, direction)], box_planes())
+        for node in range(2):
+            left = direction[:, node + 1].astype(np.float32)
+            np.testing.assert_array_equal(chains.low[node], left.min(axis=0))
+            np.testing.assert_array_equal(chains.high[node], left.max(axis=0))
+
+    def test_as_many_chains_as_there_are(self) -> None:
+        """More than the arrays hold at first, and the same for rays in parts."""
+        planes = box_planes()
+        first = np.array([np.flatnonzero(planes.plane == plane)[0] for plane in range(6)])
+        face = first[np.stack(np.unravel_index(np.arange(6**5), (6,) * 5), axis=1)]
+        rays = rays_along(face.tolist(), [[1.0] * 6] * len(face))
+        whole = collect_chains([rays], planes)
+        assert whole.size == sum(6**depth for depth in range(1, 6))
+        assert len({tuple(chain_planes(whole, node)) for node in range(whole.size)}) == whole.size
+        parts = [Rays(*(field[start : start + 1000] for field in rays)) for start in range(0, len(face), 1000)]
+        np.testing.assert_array_equal(collect_chains(parts, planes).plane[: whole.size], whole.plane[: whole.size])
+
+
+class TestViewChains:
+    def test_images_in_a_box(self) -> None:
+        planes = box_planes()
+        face = [int(np.flatnonzero(planes.normal[planes.plane] @ axis)[0]) for axis in np.eye(3)]
+        tx = np.array([1.0, 2.0, 0.5])
+        views = view_chains(collect_chains([rays_along([face], [[1, 1, 1, 1]])], planes), planes, tx)
+        walls = np.array(
+            [planes.offset_m[planes.plane[f]] * planes.normal[planes.plane[f]][k] for k, f in enumerate(face)]
+        )
+        image = 2.0 * walls - tx
+        np.testing.assert_allclose(views.source_m[0], [image[0], 2.0, 0.5])
+        np.testing.assert_allclose(views.source_m[2], image)
+        assert views.depth.tolist() == [1, 2, 3]
+
+    def test_chains_that_begin_alike_are_together(self) -> None:
+        planes = box_planes()
+        first = [int(np.flatnonzero(planes.plane == plane)[0]) for plane in range(4)]
+        face = [[first[0], first[1]], [first[2], first[1]], [first[0], first[3]], [first[2], first[0]]]
+        chains = collect_chains([rays_along(face, [[1, 1, 1]] * 4)], planes)
+        order = view_chains(chains, planes, np.zeros(3)).order
+        assert [chain_planes(chains, node) for node in order] == [[0], [0, 1], [0, 3], [2], [2, 1], [2, 0]]
+
+    def test_margin_is_no_more_than_a_small_plane_can_span(self) -> None:
+        corners = np.array([[0, 0, 9], [0.1, 0, 9], [0, 0.1, 9], [-9, -9, -1], [9, -9, -1], [0, 9, -1]], float)
+        planes = group_planes(corners, np.array([[0, 1, 2], [3, 4, 5]]))
+        rays = rays_along([[0, 1], [1, -1]], [[9, 10, 1], [1, np.inf, np.inf]])
+        chains = collect_chains([rays], planes)
+        margin = view_chains(chains, planes, np.zeros(3)).margin
+        assert chain_planes(chains, 1) == [planes.plane[0], planes.plane[1]]
+        assert 0.1 * np.sqrt(2) / 9 < margin[0] < 0.02
+        assert margin[1] == margin[0]
+        assert margin[2] > 1.0
+        np.testing.assert_allclose(
+            view_chains(chains._replace(rays=10**6), planes, np.zeros(3)).margin[2], MARGIN * 3.545e-3, rtol=1e-3
+        )
+
+    def test_no_rays(self) -> None:
+        assert len(view_chains(collect_chains([], box_planes()), box_planes(), np.zeros(3)).order) == 0

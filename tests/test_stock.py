@@ -1,0 +1,183 @@
+"""Paths by shooting rays: against closed forms, and against the exact engine where both apply."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.errors import BackendError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.beams import trace_beams
+from sionna_partial.tracing.candidates import specular_candidates
+from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.scene import SHAPES, build_scene, write_scene
+from sionna_partial.tracing.sionna_rt import load_sionna
+from sionna_partial.tracing.solver import SceneSolver
+from sionna_partial.tracing.stock import listed_before, stock_paths
+
+WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
+NO_FLOOR = SceneSettings(floor_extent="none")
+NOWHERE = np.zeros((0, 3))
+
+TX = np.array([1.03, 2.93, 1.4])
+RX = np.array([[2.21, 1.12, 1.2], [5.02, 2.03, 1.5], [4.02, 0.93, 1.5]])
+"""In the room: in sight, seen through the door, and beside it."""
+
+
+def _room(height: int = 42) -> PartialMap:
+    """6 m x 4 m of free cells in walls, parted by a wall with a door of 1 m."""
+    state = np.full((height, 62), CellState.WALL, dtype=np.uint8)
+    state[1:-1, 1:-1] = CellState.FREE
+    state[1:15, 30] = CellState.WALL
+    state[25:-1, 30] = CellState.WALL
+    return PartialMap(state, 0.1)
+
+
+def _write(partial: PartialMap, folder: Path, settings: SceneSettings | None = None) -> Path:
+    geometry = build_scene(partial, settings)
+    return write_scene(geometry, folder, offset_m=geometry.origin_m)
+
+
+def _solve(xml: Path, settings: TraceSettings, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> SolvedPaths:
+    return join_paths([paths for paths, _ in stock_paths(xml, settings, tx, rx)], settings.max_depth)
+
+
+@pytest.fixture(scope="module")
+def room_xml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _write(_room(), tmp_path_factory.mktemp("room"))
+
+
+class TestStockPaths:
+    def test_free_space(self, tmp_path: Path) -> None:
+        xml = _write(PartialMap(np.full((40, 40), CellState.FREE, np.uint8), 0.1), tmp_path, NO_FLOOR)
+        rx = np.array([[3.0, 3.5, 1.4], [1.0, 2.0, 2.9]])
+        paths = _solve(xml, TraceSettings(max_depth=0), np.array([1.0, 2.0, 1.4]), rx)
+        assert paths.path_rx.tolist() == [0, 1]
+        assert not paths.interactions.any()
+        np.testing.assert_allclose(paths.delay_s, np.array([2.5, 1.5]) / SPEED_OF_LIGHT_M_S, rtol=1e-6)
+        np.testing.assert_allclose(np.abs(paths.a), WAVELENGTH_M / (4 * np.pi * np.array([2.5, 1.5])), rtol=1e-4)
+        np.testing.assert_allclose(paths.departure_rad[0], [np.pi / 2, np.arctan2(1.5, 2.0)], atol=1e-6)
+        np.testing.assert_allclose(paths.arrival_rad[1, 0], np.pi, atol=1e-6)
+
+    def test_one_mirror_image(self, tmp_path: Path) -> None:
+        state = np.full((60, 100), CellState.FREE, np.uint8)
+        state[50, :] = CellState.WALL
+        xml = _write(PartialMap(state, 0.1), tmp_path, NO_FLOOR)
+        settings = TraceSettings(max_depth=2, samples_per_tx=10_000)
+        paths = _solve(xml, settings, np.array([1.0, 2.0, 1.5]), np.array([[5.0, 3.0, 1.5]]))
+        lengths = np.hypot(4.0, [1.0, 3.05 + 2.05])
+        np.testing.assert_allclose(paths.delay_s * SPEED_OF_LIGHT_M_S, lengths, rtol=1e-6)
+        assert paths.interactions.tolist() == [[0, 0], [1, 0]]
+        np.testing.assert_allclose(paths.vertices_m[1, 0], [1.0 + 4.0 * 3.05 / 5.1, 5.05, 1.5], atol=1e-4)
+        assert np.isnan(paths.vertices_m[1, 1]).all()
+
+    def test_finds_the_paths_of_exact_beams(self, room_xml: Path) -> None:
+        settings = TraceSettings(max_depth=2, samples_per_tx=100_000)
+        geometry, solver = build_scene(_room()), SceneSolver(room_xml, SHAPES, settings)
+        beams = trace_beams(geometry.walls_m, TX[:2], RX[:, :2], settings.max_depth)
+        blocks = specular_candidates(beams, geometry, TX, RX, settings.max_depth)
+        exact = join_paths([solver.verify(block, TX, RX) for block, _ in blocks], settings.max_depth)
+        shot = _solve(room_xml, settings, TX, RX)
+        assert len(exact.a) > 30
+        np.testing.assert_array_equal(shot.path_rx, exact.path_rx)
+        np.testing.assert_allclose(shot.delay_s, exact.delay_s, atol=1e-13)
+        np.testing.assert_allclose(shot.a, exact.a, rtol=1e-2, atol=1e-8)
+        np.testing.assert_allclose(shot.vertices_m, exact.vertices_m, atol=1e-3)
+        np.testing.assert_allclose(shot.departure_rad, exact.departure_rad, atol=1e-3)
+
+    def test_refraction_passes_the_wall_on_a_straight_line(self, room_xml: Path) -> None:
+        tx, rx = np.array([1.03, 0.52, 1.5]), np.array([[5.02, 0.53, 1.5]])
+        settings = TraceSettings(max_depth=1, refraction=True, samples_per_tx=20_000)
+        paths = _solve(room_xml, settings, tx, rx)
+        through = (paths.interactions == 4).any(axis=1)
+        assert through.sum() == 1
+        assert paths.delay_s[through] * SPEED_OF_LIGHT_M_S == pytest.approx(np.linalg.norm(rx[0] - tx), rel=1e-6)
+        assert paths.vertices_m[through, 0, 0] == pytest.approx(3.05, abs=1e-3)
+        no_walls = TraceSettings(max_depth=1, samples_per_tx=20_000)
+        assert len(_solve(room_xml, no_walls, tx, rx).a) == 0
+
+    def test_diffraction_at_the_door_jamb(self, room_xml: Path) -> None:
+        tx, rx = np.array([1.03, 0.52, 1.5]), np.array([[4.02, 0.93, 1.5]])
+        settings = TraceSettings(max_depth=1, diffraction=True, samples_per_tx=50_000)
+        paths = _solve(room_xml, settings, tx, rx)
+        jamb = paths.vertices_m[(paths.interactions == 8).any(axis=1), 0, :2]
+        assert np.abs(jamb - [3.05, 1.5]).max(axis=1).min() < 0.06
+        wedges_alone = [paths for paths, _ in stock_paths(room_xml, settings, tx, rx, edges=False)]
+        assert len(wedges_alone[0].a) < len(paths.a)
+
+    def test_diffuse_reflections_obey_the_length_of_their_way(self, tmp_path: Path) -> None:
+        state = np.full((60, 60), CellState.FREE, np.uint8)
+        state[50, :] = CellState.WALL
+        xml = _write(PartialMap(state, 0.1), tmp_path, NO_FLOOR)
+        text = xml.read_text()
+        xml.write_text(text.replace("</bsdf>", '<float name="scattering_coefficient" value="0.5" /></bsdf>'))
+        settings = TraceSettings(max_depth=1, diffuse_reflection=True, samples_per_tx=2_000)
+        tx, rx = np.array([1.0, 2.0, 1.5]), np.array([[4.0, 3.0, 1.5]])
+        paths = _solve(xml, settings, tx, rx)
+        diffuse = paths.interactions[:, 0] == 2
+        assert diffuse.sum() > 20
+        points = paths.vertices_m[diffuse, 0]
+        np.testing.assert_allclose(points[:, 1], 5.05, atol=1e-4)
+        length = np.linalg.norm(points - tx, axis=1) + np.linalg.norm(points - rx, axis=1)
+        np.testing.assert_allclose(paths.delay_s[diffuse] * SPEED_OF_LIGHT_M_S, length, rtol=1e-5)
+
+    def test_the_answer_does_not_depend_on_the_other_receivers(self, room_xml: Path) -> None:
+        settings = TraceSettings(max_depth=3, refraction=True, samples_per_tx=10_000)
+        together = _solve(room_xml, settings, TX, RX)
+        alone = _solve(room_xml, settings, TX, RX[2:])
+        last = together.path_rx == 2
+        assert last.sum() == len(alone.a) > 10
+        for name in ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m"):
+            assert getattr(together, name)[last].tobytes() == getattr(alone, name).tobytes()
+
+    def test_two_runs_give_the_same_bytes(self, room_xml: Path) -> None:
+        settings = TraceSettings(max_depth=2, diffraction=True, diffuse_reflection=True, samples_per_tx=5_000)
+        first, second = (_solve(room_xml, settings, TX, RX[:2]) for _ in range(2))
+        assert len(first.a) > 20
+        for name in ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m"):
+            assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
+
+    def test_share_done_ends_at_one(self, room_xml: Path) -> None:
+        settings = TraceSettings(max_depth=0)
+        assert [share for _, share in stock_paths(room_xml, settings, TX, RX[:2])] == [0.5, 1.0]
+
+    def test_no_receivers(self) -> None:
+        assert list(stock_paths(Path("nowhere"), TraceSettings(), TX, NOWHERE)) == []
+
+    @pytest.mark.parametrize("depth", [0, 3])
+    def test_a_receiver_that_nothing_reaches(self, tmp_path: Path, depth: int) -> None:
+        state = np.full((40, 40), CellState.FREE, np.uint8)
+        state[:, 20] = CellState.WALL
+        xml = _write(PartialMap(state, 0.1), tmp_path)
+        settings = TraceSettings(max_depth=depth, samples_per_tx=1000)
+        ((paths, _),) = stock_paths(xml, settings, np.array([1.0, 1.0, 1.5]), np.array([[3.0, 1.0, 1.5]]))
+        assert paths.interactions.shape == (0, max(1, depth))
+        assert paths.vertices_m.shape == (0, max(1, depth), 3)
+
+    def test_failure_of_sionna_is_a_backend_error(self, room_xml: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(*_: object, **__: object) -> None:
+            raise RuntimeError("out of memory")
+
+        monkeypatch.setattr(load_sionna(), "PathSolver", fail)
+        message = r"^Sionna RT 2\.\S+ cannot solve the paths \(RuntimeError\('out of memory'\)\): lower samples_per_tx"
+        with pytest.raises(BackendError, match=message):
+            list(stock_paths(room_xml, TraceSettings(), TX, RX))
+
+
+class TestListedBefore:
+    def test_one_path_of_each_kind_is_kept(self) -> None:
+        interactions = np.array([[1, 0], [1, 0], [1, 0], [4, 0], [1, 1], [1, 1], [0, 0], [0, 0]], np.uint8)
+        vertices = np.full((8, 2, 3), np.nan)
+        vertices[:4, 0] = [[1, 2, 3], [1.004, 2, 2.996], [1.02, 2, 3], [1, 2, 3]]
+        vertices[4:6] = [[[1, 2, 3], [4, 5, 6]], [[1, 2, 3], [4, 5.03, 6]]]
+        assert listed_before(interactions, vertices).tolist() == [False, True, False, False, False, False, False, True]
+
+    def test_diffuse_reflections_are_samples(self) -> None:
+        interactions = np.array([[2, 0], [2, 0], [1, 2], [1, 2]], np.uint8)
+        assert not listed_before(interactions, np.ones((4, 2, 3))).any()
+
+    def test_no_paths(self) -> None:
+        assert listed_before(np.zeros((0, 2), np.uint8), np.zeros((0, 2, 3))).shape == (0,)

@@ -1,0 +1,203 @@
+"""Traces of plans in which beams or rays might go astray, against the textbook image method."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from extruded import ROOM, SPLINTERS, drawn, extrude, specular_lengths_m
+from numpy.typing import NDArray
+from test_trace import _grid, _half_seen_room, _room
+
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.errors import PositionError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.beams import trace_beams
+from sionna_partial.tracing.candidates import specular_candidates
+from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.scene import SHAPES, SceneGeometry, write_scene
+from sionna_partial.tracing.solver import SceneSolver
+from sionna_partial.tracing.trace import TracedLinks, trace_links
+
+MARGIN_M = 1e-3
+"""Paths that pass the end of a wall by less than this may be found or not: the solver has single precision."""
+
+SHORTEST_M = 0.011
+"""Paths with a leg shorter than this may be left out: Sionna RT refuses those below 1 cm."""
+
+ARRAYS = ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m")
+GAP = np.array([[(1.0, 2.0), (2.99, 2.0)], [(3.01, 2.0), (5.0, 2.0)]])
+FLOOR = ((-10.0, -10.0, 16.0, 14.0),)
+PLANS = {
+    "no walls": (extrude(np.zeros((0, 2, 2)), floor_m=FLOOR), (1.07, 1.93, 1.2)),
+    "no walls, no floor": (extrude(np.zeros((0, 2, 2)), floor_m=()), (1.07, 1.93, 1.2)),
+    "free-standing wall": (extrude([[(2.0, 1.0), (2.4, 3.1)]], floor_m=FLOOR), (1.07, 1.93, 1.2)),
+    "crossing walls": (extrude(SPLINTERS, floor_m=FLOOR), (1.07, 1.93, 1.2)),
+    "collinear walls with a gap": (extrude(GAP, floor_m=FLOOR), (2.97, 0.5, 1.2)),
+    "2 cm from a corner": (extrude(ROOM), (0.02, 0.02, 1.2)),
+    "2 cm from a door jamb": (extrude(ROOM), (2.98, 1.5, 1.2)),
+    "in the door": (extrude(ROOM), (3.0, 2.0, 1.2)),
+    "in line with a wall": (extrude(GAP, floor_m=FLOOR), (0.5, 2.0, 1.2)),
+    "no ceiling": (extrude(ROOM, ceiling=False), (1.07, 1.93, 1.2)),
+    "no floor": (extrude(ROOM, floor_m=()), (1.07, 1.93, 1.2)),
+}
+LATTICE = np.array([[x, y, 1.2] for x in (0.5, 1.0, 2.0, 4.0, 5.0, 5.5) for y in (0.5, 1.0, 1.5, 2.5, 3.5)])
+"""Receivers in line with walls, door jambs and each other, at the height of the transmitter."""
+
+
+def _trace(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], folder: Path) -> SolvedPaths:
+    solver = SceneSolver(write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, TraceSettings())
+    beams = trace_beams(geometry.walls_m, tx[:2], rx[:, :2], 2)
+    blocks = specular_candidates(beams, geometry, tx, rx, 2)
+    return join_paths([solver.verify(block, tx, rx) for block, _ in blocks], 2)
+
+
+def _matched(lengths: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+    """Whether each length is among the others; single precision, and walls are seen 0.1 mm wide."""
+    return all(np.abs(others - length).min(initial=np.inf) < 2e-4 for length in lengths)
+
+
+@pytest.mark.parametrize("name", PLANS)
+def test_every_path_of_the_image_method_and_no_other(name: str, tmp_path: Path) -> None:
+    geometry, place = PLANS[name]
+    tx = np.array(place)
+    away = np.random.default_rng(1).uniform((0.1, 0.1, 0.2), (5.9, 3.9, 2.3), (25, 3))
+    rx = np.concatenate([LATTICE, away])
+    paths = _trace(geometry, tx, rx, tmp_path)
+    total = 0
+    for index in range(len(rx)):
+        found = np.sort(paths.delay_s[paths.path_rx == index]) * SPEED_OF_LIGHT_M_S
+        sure = specular_lengths_m(geometry, tx, rx[index], 2, MARGIN_M, SHORTEST_M)
+        possible = specular_lengths_m(geometry, tx, rx[index], 2, -MARGIN_M)
+        assert len(sure) <= len(found) <= len(possible), rx[index]
+        assert _matched(sure, found), rx[index]
+        assert _matched(found, possible), rx[index]
+        total += len(sure)
+    assert total >= len(rx) / 2
+
+
+class TestJunctions:
+    def test_nothing_leaks_through_the_joints_of_a_closed_wall(self) -> None:
+        state = _room().state.copy()
+        state[:, 30] = CellState.WALL
+        links = trace_links(PartialMap(state, 0.1), (1.05, 2.95, 1.5), _grid(PartialMap(state, 0.1), 0.5))
+        beyond = links.rx[:, 0] > 3.1
+        assert (links.link_state[beyond] == LinkState.OUTAGE).all()
+        assert (links.link_state[~beyond] == LinkState.LOS).all()
+
+    @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
+    def test_no_path_bends_where_three_walls_meet(self, partial: PartialMap) -> None:
+        links = trace_links(partial, (1.05, 2.95, 1.5), _grid(partial, 0.5), settings=TraceSettings(open_ends=True))
+        edges = np.unique(links.vertices_m[links.interactions == 8][:, :2].round(2), axis=0)
+        jambs = [[3.05, 1.45], [3.05, 2.55]]
+        assert {tuple(edge) for edge in jambs} <= {tuple(edge) for edge in edges.tolist()}
+        for y in (0.05, 4.15):
+            assert not (np.abs(edges - [3.05, y]) < 0.02).all(axis=1).any()
+
+
+class TestOpenEnds:
+    def test_a_wall_that_ends_unseen_bends_nothing_unless_asked(self) -> None:
+        partial = drawn("...... ...... ###??? ...... ......", 1.0)
+        tx, rx = (1.5, 0.5, 1.5), [[0.5, 4.5, 1.5]]
+        scene = SceneSettings(floor_extent="none")
+        quiet, asked = (
+            trace_links(partial, tx, rx, settings=TraceSettings(open_ends=each), scene_settings=scene)
+            for each in (False, True)
+        )
+        assert quiet.link_state.tolist() == [LinkState.OUTAGE]
+        assert asked.link_state.tolist() == [LinkState.NLOS]
+        assert 8 in asked.interactions
+
+    def test_a_wall_that_ends_in_free_space_does(self) -> None:
+        links = trace_links(drawn("...... ...... ###... ...... ......", 1.0), (1.5, 0.5, 1.5), [[0.5, 4.5, 1.5]])
+        edges = links.vertices_m[links.interactions == 8][:, :2]
+        np.testing.assert_allclose(edges, np.full((5, 2), 2.5), atol=1e-3)  # directly, and with 1 or 2 bounces
+
+
+class TestDiffractionSetting:
+    def test_plans_diffract_unless_told_otherwise(self) -> None:
+        tx, rx = (1.03, 0.52, 1.5), [[4.02, 0.93, 1.5]]
+        default, on, off = (
+            trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=2, diffraction=each))
+            for each in (None, True, False)
+        )
+        assert default.a.tobytes() == on.a.tobytes()
+        assert (off.interactions != 8).all()
+        kept = (on.interactions != 8).all(axis=1)
+        np.testing.assert_array_equal(off.a, on.a[kept])
+        assert 0 < kept.sum() < len(kept)
+
+
+class TestCeiling:
+    @pytest.mark.parametrize("diffraction", [False, True])
+    def test_without_it_the_paths_that_do_not_touch_it_remain(self, diffraction: bool) -> None:
+        tx, rx = (1.05, 2.95, 1.5), _grid(_room(), 1.0)
+        settings = TraceSettings(max_depth=3, diffraction=diffraction)
+        under, open_air = (
+            trace_links(_room(), tx, rx, settings=settings, scene_settings=SceneSettings(ceiling=each))
+            for each in (True, False)
+        )
+        below = ~(under.vertices_m[..., 2] > 3.0 - 1e-3).any(axis=1)
+        assert 0 < below.sum() < len(below)
+        assert np.nanmax(open_air.vertices_m[..., 2]) < 3.0 - 1e-3
+        np.testing.assert_array_equal(open_air.path_rx, under.path_rx[below])
+        np.testing.assert_array_equal(open_air.delay_s, under.delay_s[below])
+        np.testing.assert_allclose(np.abs(open_air.a), np.abs(under.a[below]), rtol=1e-4)
+
+
+class TestTransmitters:
+    TX = ((1.05, 2.95, 1.5), (5.03, 0.64, 2.1), (2.2, 1.1, 1.2))
+
+    def _one_by_one(self, rx: NDArray[np.float64]) -> list[TracedLinks]:
+        return [trace_links(_room(), tx, rx) for tx in self.TX]
+
+    def test_several_are_the_same_as_one_by_one(self) -> None:
+        rx = _grid(_room(), 1.0)
+        together, apart = trace_links(_room(), self.TX, rx), self._one_by_one(rx)
+        assert together.link_state.shape == together.gain_db.shape == (3, len(rx))
+        assert together.tx.tolist() == [list(tx) for tx in self.TX]
+        for index, links in enumerate(apart):
+            assert together.gain_db[index].tobytes() == links.gain_db.tobytes()
+            assert together.link_state[index].tobytes() == links.link_state.tobytes()
+            own = together.path_tx == index
+            assert together.path_rx[own].tobytes() == links.path_rx.tobytes()
+            for name in ARRAYS:
+                assert getattr(together, name)[own].tobytes() == getattr(links, name).tobytes()
+            assert (links.path_tx == 0).all()
+
+    def test_paths_are_ordered_by_transmitter_receiver_and_delay(self) -> None:
+        links = trace_links(_room(), self.TX, _grid(_room(), 1.0))
+        keys = list(zip(links.path_tx.tolist(), links.path_rx.tolist(), links.delay_s.tolist(), strict=True))
+        assert keys == sorted(keys)
+        assert set(links.path_tx.tolist()) == {0, 1, 2}
+
+    def test_one_may_be_given_as_a_list(self) -> None:
+        rx = _grid(_room(), 1.0)
+        alone, listed = trace_links(_room(), self.TX[0], rx), trace_links(_room(), self.TX[:1], rx)
+        assert alone.tx.shape == (3,)
+        assert listed.tx.shape == (1, 3)
+        for field in dataclasses.fields(TracedLinks):
+            one, other = getattr(alone, field.name), getattr(listed, field.name)
+            if field.name in ("tx", "gain_db", "link_state"):
+                assert other.shape == (1, *one.shape)
+            if isinstance(one, np.ndarray):
+                assert one.tobytes() == other.tobytes()
+
+    @pytest.mark.parametrize(("transmitters", "receivers"), [(0, 2), (3, 0), (0, 0)])
+    def test_none_of_either_gives_no_links(self, transmitters: int, receivers: int) -> None:
+        tx, rx = np.full((transmitters, 3), 1.0), np.full((receivers, 3), 2.0)
+        links = trace_links(_room(), tx, rx)
+        assert links.link_state.shape == links.gain_db.shape == (transmitters, receivers)
+        assert links.a.shape == links.path_tx.shape == (0,)
+
+    def test_progress_runs_through_all_of_them(self) -> None:
+        seen: list[float] = []
+        trace_links(_room(), self.TX, [[2.0, 1.0, 1.5]], progress=lambda share, message: seen.append(share))
+        assert seen == sorted(seen)
+        assert seen[0] == 0.0
+        assert seen[-1] == pytest.approx(1.0)
+
+    def test_the_faulty_one_is_named(self) -> None:
+        with pytest.raises(PositionError, match=r"^tx\[1\] = \(0.05, 1.0, 1.5\) is inside a wall"):
+            trace_links(_room(), [(1.0, 1.0, 1.5), (0.05, 1.0, 1.5)], [[2.0, 1.0, 1.5]])
