@@ -77,17 +77,24 @@ def link(paths: Paths) -> tuple[sp.LinkState, float]:
     return (sp.LinkState.NLOS if gain_db > -150.0 else sp.LinkState.OUTAGE), gain_db
 
 
-def upright(partial: sp.PartialMap, paths: Paths) -> Paths:
-    """Leave out diffracted paths at horizontal edges, open wall ends and junctions of walls, which are not traced."""
-    geometry = build_scene(partial)
-    bent = (paths["interactions"] == 8).any(axis=1)
-    rows = np.arange(len(bent)), (paths["interactions"] == 8).argmax(axis=1)
-    place = paths["vertices_m"][rows] - [*partial.origin_m, 0.0]
+def meant(partial: sp.PartialMap, tx: NDArray[np.float64], place: NDArray[np.float64], paths: Paths) -> Paths:
+    """Leave out diffracted paths that are not traced: at horizontal edges and open wall ends, and at junctions.
+
+    Where three walls or more meet, Sionna RT takes any two of them for a wedge. Only in a sector wider than a
+    half-plane there are directions that the walls hide from each other, so both legs must lie in it.
+    """
+    geometry, shift = build_scene(partial), np.array([*partial.origin_m, 0.0])
     wedges = find_wedges(geometry, open_ends=False)
-    kept = ~bent
-    if len(wedges.edge_m) and bent.any():
-        near = cKDTree(wedges.edge_m).query(place[bent, :2])[0] < 0.01
-        kept[bent] = near & (np.abs(place[bent, 2] - geometry.height_m / 2) < geometry.height_m / 2 - 1e-3)
+    kept = ~(paths["interactions"] == 8).any(axis=1)
+    edges = cKDTree(wedges.edge_m) if len(wedges.edge_m) else None
+    for k in np.flatnonzero(~kept) if edges is not None else ():
+        at = int((paths["interactions"][k] == 8).argmax())
+        vertices = paths["vertices_m"][k][np.isfinite(paths["vertices_m"][k, :, 0])]
+        points = np.concatenate([tx[None], vertices, place[None]]) - shift
+        distance, index = edges.query(points[at + 1, :2])
+        legs = points[[at, at + 2], :2] - wedges.edge_m[index]
+        inside = (legs @ wedges.normal[index].T > 0.0).any(axis=1).all()
+        kept[k] = distance < 0.01 and inside and 1e-3 < points[at + 1, 2] < geometry.height_m - 1e-3
     return {name: values[kept] for name, values in paths.items()}
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from agreement import agreement, paths_of, upright
+from agreement import Paths, agreement, meant, paths_of
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from stock import isolated, limit_cores, peak_memory_gb, trace_stock
@@ -99,7 +99,13 @@ def _compare(
         trace_stock, folder, tx, rx, tile=len(rx), rays=STOCK_RAYS, table=STOCK_TABLE, cores=1, **options
     )
     tiles = isolated(trace_stock, folder, tx, rx[sample], **options)
-    truth = [upright(partial, paths) for paths in tiles["paths"]] if settings.diffraction else tiles["paths"]
+
+    def comparable(paths: list[Paths]) -> list[Paths]:
+        if not settings.diffraction:
+            return paths
+        return [meant(partial, tx, place, each) for place, each in zip(rx[sample], paths, strict=True)]
+
+    truth = comparable(tiles["paths"])
     print(f"\n{title}, {len(rx)} receivers, depth {settings.max_depth}; truth on {len(sample)} of them")
     print(f"{'':20}{'time [s]':>10}{'first [s]':>11}{'memory [GB]':>13}{'recall':>9}{'state':>8}{'gain':>8}")
     scaled = tiles["seconds"] * len(rx) / len(sample)
@@ -108,7 +114,7 @@ def _compare(
     )
     for label in ("stock, all at once", "ours", "ours, all cores"):
         run = runs[label]
-        found = [upright(partial, run["paths"][k]) if settings.diffraction else run["paths"][k] for k in sample]
+        found = comparable([run["paths"][k] for k in sample])
         match = agreement(partial, tx, rx[sample], found, truth)
         shares = (
             match["found"] / match["truth"],

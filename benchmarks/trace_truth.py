@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from agreement import agreement, paths_of, upright
+from agreement import agreement, meant, paths_of
 from stock import isolated, trace_stock
 
 import sionna_partial as sp
@@ -67,7 +67,7 @@ def compare(partial: sp.PartialMap, receivers: int, rays: int, *, diffraction: b
     with TemporaryDirectory() as folder:
         sp.export_scene(partial, folder + "/scene")
         stock = isolated(trace_stock, folder + "/scene", tx, rx, rays=rays, max_depth=depth, diffraction=diffraction)
-    truth = [upright(partial, paths) for paths in stock["paths"]] if diffraction else stock["paths"]
+    truth = [meant(partial, tx, place, paths) for place, paths in zip(rx, stock["paths"], strict=True)]
     return agreement(partial, tx, rx, paths_of(links), truth) | {"twice": stock["repeats"]}
 
 

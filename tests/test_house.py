@@ -25,8 +25,9 @@ MODULES = (
     *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.homes", "maps.explore"),
     *("walls.lines", "walls.cells", "walls.chains", "walls.bridges", "walls.graph", "walls.outlines"),
     *("tracing.scene", "tracing.plan", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
-    *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver", "tracing.probe"),
-    *("tracing.generator", "tracing.trace", "tracing.gradients"),
+    *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
+    *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
+    *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.gradients"),
     *("learning.features", "learning.networks", "learning.fitting", "learning.predictor_files", "learning.predictor"),
     *("coverage", "plot", "export", "demo", "info", "cli"),
 )

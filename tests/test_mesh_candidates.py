@@ -71,6 +71,11 @@ def room() -> list[trimesh.Trimesh]:
     return [trimesh.creation.box(SIZE), ball, pillar, table]
 
 
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return load_meshes(tmp_path_factory.mktemp("room"), *room())
+
+
 class TestBox:
     """In a convex room every image of the transmitter is a path: an exact answer, whatever the faces look like."""
 
@@ -105,10 +110,6 @@ class TestBox:
 
 
 class TestRoom:
-    @pytest.fixture(scope="class")
-    def scene(self, tmp_path_factory: pytest.TempPathFactory) -> Any:
-        return load_meshes(tmp_path_factory.mktemp("room"), *room())
-
     def test_candidates_obey_the_law_of_reflection(self, scene: Any) -> None:
         found = candidates_of(scene, room(), TX, RX)
         vertices, triangles = joined(*room())
@@ -138,24 +139,24 @@ class TestRoom:
         assert len(found.rx) < 3 * valid.sum()
         for k, lengths in enumerate(by_receiver(found, lengths_m(found, TX, rx), len(rx))):
             away = np.abs(lengths[:, None] - LIGHT_M_S * delay[k][valid[k]]).min(axis=0)
-            assert len(away) > 40
+            assert len(away) > 30
             assert away.max() < 2e-3
 
     def test_no_chain_twice_and_each_in_one_piece(self, scene: Any) -> None:
         found = candidates_of(scene, room(), TX, RX)
-        _, triangles = joined(*room())
         assert len(np.unique(np.column_stack([found.rx, found.face]), axis=0)) == len(found.rx)
-        flat = found.vertices_m[:, 0, 2] == -1.5
+        flat = np.isclose(found.vertices_m[:, 0, 2], -1.5)
         floor = flat & (found.face[:, 0] >= 0) & (found.face[:, 1] < 0)
         assert np.ptp(np.flatnonzero(floor)) == floor.sum() - 1
 
     def test_a_receiver_has_its_candidates_whoever_is_beside(self, scene: Any) -> None:
-        whole, some = candidates_of(scene, room(), TX, RX), candidates_of(scene, room(), TX, RX[20:23])
-        for k in range(3):
-            kept = whole.rx == 20 + k
+        crowd = np.random.default_rng(2).uniform(-0.45 * SIZE, 0.45 * SIZE, (3000, 3))
+        whole = candidates_of(scene, room(), TX, crowd)
+        for k in range(0, 3000, 200):
+            kept, alone = whole.rx == k, candidates_of(scene, room(), TX, crowd[k : k + 1])
             assert kept.sum() > 20
-            assert whole.face[kept].tobytes() == some.face[some.rx == k].tobytes()
-            assert whole.vertices_m[kept].tobytes() == some.vertices_m[some.rx == k].tobytes()
+            assert whole.face[kept].tobytes() == alone.face.tobytes()
+            assert whole.vertices_m[kept].tobytes() == alone.vertices_m.tobytes()
 
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
         whole, parts = (

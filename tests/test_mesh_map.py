@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from meshes import OBSERVED, box, room, scene_mesh, surface_m2
@@ -123,7 +124,21 @@ class TestState:
         x, y = (index * 0.25 + start for index, start in zip((columns, rows), partial.origin_m, strict=True))
         cells = shapely.box(x, y, x + 0.25, y + 0.25)
         seen = shapely.union_all(shapely.polygons(mesh.corners_m[..., :2]))
-        np.testing.assert_array_equal(partial.state != UNKNOWN, shapely.area(shapely.intersection(cells, seen)) > 1e-7)
+        reached = shapely.area(shapely.intersection(cells, seen)) > 1e-7
+        known = partial.state != UNKNOWN
+        assert reached[known].all()
+        rims, inside = np.pad(reached & ~known, 1), np.ones((3, 3))
+        assert not ndimage.binary_erosion(rims, inside).any()
+
+    def test_rims_of_the_floor_beyond_the_walls_are_not_rooms(self) -> None:
+        walls = trimesh.creation.box(
+            (4.0, 3.0, 2.5), transform=trimesh.transformations.translation_matrix((0, 0, 1.25))
+        )
+        walls.update_faces(np.abs(walls.face_normals[:, 2]) < 0.5)
+        floor = trimesh.creation.box((4.4, 3.4, 0.01))
+        both = trimesh.util.concatenate([walls, floor])
+        mesh = SceneMesh(both.vertices, both.faces, np.zeros(len(both.faces), int))
+        assert mesh_map(mesh, MeshReading(resolution_m=0.05)).is_complete
 
 
 class TestKnown:

@@ -33,7 +33,7 @@ class TestShootRays:
         normal = trimesh.Trimesh(vertices, triangles, process=False).face_normals
         assert len(np.unique(rays.face)) > 20
         away = ((points(rays, 3) - vertices[triangles[rays.face, 0]]) * normal[rays.face]).sum(axis=2)
-        np.testing.assert_allclose(away, 0.0, atol=1e-4)
+        np.testing.assert_allclose(away, 0.0, atol=1e-3)  # Mitsuba moves a ray off its face
         before, after = rays.direction[:, :3], rays.direction[:, 1:]
         mirrored = before - 2.0 * (before * normal[rays.face]).sum(axis=2)[:, :, None] * normal[rays.face]
         np.testing.assert_allclose(after, mirrored, atol=1e-5)

@@ -171,8 +171,8 @@ class TestListedBefore:
     def test_one_path_of_each_kind_is_kept(self) -> None:
         interactions = np.array([[1, 0], [1, 0], [1, 0], [4, 0], [1, 1], [1, 1], [0, 0], [0, 0]], np.uint8)
         vertices = np.full((8, 2, 3), np.nan)
-        vertices[:4, 0] = [[1, 2, 3], [1.004, 2, 2.996], [1.02, 2, 3], [1, 2, 3]]
-        vertices[4:6] = [[[1, 2, 3], [4, 5, 6]], [[1, 2, 3], [4, 5.03, 6]]]
+        vertices[:4, 0] = [[1, 2, 3], [1.004, 2, 2.996], [1.05, 2, 3], [1, 2, 3]]
+        vertices[4:6] = [[[1, 2, 3], [4, 5, 6]], [[1, 2, 3], [4, 5.08, 6]]]
         assert listed_before(interactions, vertices).tolist() == [False, True, False, False, False, False, False, True]
 
     def test_diffuse_reflections_are_samples(self) -> None:

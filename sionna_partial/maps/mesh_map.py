@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -21,6 +22,10 @@ DEFAULT_BAND_M = (1.0, 1.8)
 
 DEFAULT_RESOLUTION_M = 0.05
 """Edge of the cells of a mesh's map [m], as robots have them."""
+
+
+RIM_M = 0.3
+"""Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,7 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading, wall_height_m: float | None 
     state = np.full(empty.shape, CellState.UNKNOWN, dtype=np.uint8)
     state[known] = CellState.FREE
     state[_walls(mesh, empty, (low, high), known)] = CellState.WALL
+    state[_rims(state, empty.resolution_m)] = CellState.UNKNOWN
     partial = replace(empty, state=state, mesh=mesh)
     if wall_height_m is not None:
         partial = raised(replace(partial, wall_height_m=wall_height_m))
@@ -117,6 +123,18 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
     if partial.mesh is None:
         return partial
     return replace(partial, mesh=partial.mesh.within(_known_area(partial)))
+
+
+def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
+    """Find the cells (ny, nx) of narrow free areas beside unknown cells."""
+    free = np.pad(state == CellState.FREE, 1)
+    area, count = ndimage.label(free)
+    to_border_m = (ndimage.distance_transform_edt(free) - 0.5) * resolution_m
+    widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
+    beside = np.zeros(count + 1, dtype=bool)
+    beside[area[ndimage.binary_dilation(np.pad(state == CellState.UNKNOWN, 1))]] = True
+    rims: NDArray[np.bool_] = (free & ((widest_m < RIM_M) & beside)[area])[1:-1, 1:-1]
+    return rims
 
 
 def _known_area(partial: PartialMap) -> Any:

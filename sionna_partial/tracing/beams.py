@@ -10,6 +10,7 @@ t (B - S)). The window is r = 1, t runs over the beam from 0 to 1, and on any li
 wall is the upper envelope of straight segments in (t, 1 / r).
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,14 +77,22 @@ def trace_beams_in(
     plan: Plan, receivers: PointBins, sources_m: NDArray[np.float64], max_depth: NDArray[np.int64]
 ) -> Beams:
     """Do the work of `trace_beams` for several sources (E, 2) [m], each with its own largest depth (E,)."""
-    parent, piece, depth, source, pair_node, pair_rx = _trace_beams(
-        plan.pieces_m, plan.line, sources_m, max_depth, receivers.points_m, receivers.start, receivers.grid
+    beam, node, pair = _trace_beams(
+        plan.pieces_m,
+        plan.line,
+        _root_beams(sources_m),
+        max_depth,
+        receivers.points_m,
+        receivers.start,
+        receivers.grid,
     )
+    parent, piece, depth = node[:, :3].T.copy()
+    pair_node, pair_rx = pair.T.copy()
     chain = _chain_ids(parent, np.append(plan.line, -1)[piece], depth)
     pair_rx = receivers.order[pair_rx].astype(np.int32)
     _, first = np.unique(chain[pair_node] * max(1, len(receivers.order)) + pair_rx, return_index=True)
     segment = np.append(plan.owner, -1)[piece].astype(np.int32)
-    return Beams(parent, segment, source, pair_node[first], pair_rx[first])
+    return Beams(parent, segment, beam[:, :2].copy(), pair_node[first], pair_rx[first])
 
 
 def _chain_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -99,52 +108,40 @@ def _chain_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArra
     return chain
 
 
+def _root_beams(sources: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Four quadrants of the view from each source, with a window at 1 m."""
+    low = [_ROOT_ANGLE_RAD + 0.5 * np.pi * root for root in range(4)]
+    window = [(0.0, 0.0, math.cos(angle), math.sin(angle), -math.sin(angle), math.cos(angle)) for angle in low]
+    return (np.tile(sources, 3)[:, None] + np.array(window)).reshape(-1, 6)
+
+
 @njit(cache=True)
-def _trace_beams(walls, line, sources, max_depth, points, bins, grid):  # type: ignore[no-untyped-def]
-    """Breadth-first beam trees and the points inside each beam (see `trace_beams`)."""
-    beam, count = _root_beams(sources), 4 * len(sources)
-    parent, segment, depth = np.full(count, -1, np.int32), np.full(count, -1, np.int32), np.zeros(count, np.int32)
-    left = np.repeat(max_depth, 4)
-    pair_node, pair_rx, pairs = np.empty(4096, np.int32), np.empty(4096, np.int32), 0
+def _trace_beams(walls, line, beam, left, points, bins, grid):  # type: ignore[no-untyped-def]
+    """Breadth-first beam trees and the points inside each beam (see `trace_beams`).
+
+    Returns the beams (M, 6), their (parent, segment, depth, depth left) and the pairs (node, point).
+    """
+    count = len(beam)
+    node = np.empty((count, 4), np.int32)
+    for root in range(count):
+        node[root, 0], node[root, 1], node[root, 2], node[root, 3] = -1, -1, 0, left[root // 4]
+    pair = np.empty((4096, 2), np.int32)
     piece = np.empty((2 * len(walls) + 3, 4))
     piece_wall = np.empty(2 * len(walls) + 3, np.int32)
-    node = 0
-    while node < count:
-        pieces = _visible_pieces(walls, line, beam[node], segment[node], piece, piece_wall)
-        for i in range(pieces):
-            found = _points_in_piece(beam[node], segment[node] >= 0, piece[i], points, bins, grid)
-            pair_node, pair_rx = grow(pair_node, pairs + len(found)), grow(pair_rx, pairs + len(found))
-            pair_node[pairs : pairs + len(found)] = node
-            pair_rx[pairs : pairs + len(found)] = found
-            pairs += len(found)
-            if piece_wall[i] < 0 or left[node] == 0:
+    k = pairs = np.int64(0)  # numba would compile a function that is called with the literal 0 twice
+    while k < count:
+        own = node[k, 1]
+        for i in range(_visible_pieces(walls, line, beam[k], own, piece, piece_wall)):
+            pair, pairs = _add_points(beam[k], own >= 0, piece[i], points, bins, grid, k, pair, pairs)
+            if piece_wall[i] < 0 or node[k, 3] == 0:
                 continue
-            beam, parent = grow(beam, count + 1), grow(parent, count + 1)
-            segment, depth, left = grow(segment, count + 1), grow(depth, count + 1), grow(left, count + 1)
-            if _reflect(beam[node], piece[i], walls[piece_wall[i]], beam[count]):
-                parent[count], segment[count] = node, piece_wall[i]
-                depth[count], left[count] = depth[node] + 1, left[node] - 1
+            beam, node = grow(beam, count + 1), grow(node, count + 1)
+            if _reflect(beam[k], piece[i], walls[piece_wall[i]], beam[count]):
+                node[count, 0], node[count, 1] = k, piece_wall[i]
+                node[count, 2], node[count, 3] = node[k, 2] + 1, node[k, 3] - 1
                 count += 1
-        node += 1
-    return (
-        parent[:count].copy(),
-        segment[:count].copy(),
-        depth[:count].copy(),
-        beam[:count, :2].copy(),
-        pair_node[:pairs].copy(),
-        pair_rx[:pairs].copy(),
-    )
-
-
-@njit(cache=True)
-def _root_beams(sources):  # type: ignore[no-untyped-def]
-    """Four quadrants of the view from each source, with a window at 1 m."""
-    beam = np.empty((4 * len(sources), 6))
-    for root in range(len(beam)):
-        x, y = sources[root // 4]
-        low = _ROOT_ANGLE_RAD + 0.5 * np.pi * (root % 4)
-        beam[root] = (x, y, x + np.cos(low), y + np.sin(low), x - np.sin(low), y + np.cos(low))
-    return beam
+        k += 1
+    return beam[:count], node[:count], pair[:pairs]
 
 
 @njit(cache=True)
@@ -193,14 +190,14 @@ def _visible_pieces(walls, line, beam, own, piece, piece_wall):  # type: ignore[
             continue
         t0, w0, t1, w1 = _clip(beam, walls[i], own >= 0)
         if t1 - t0 > 1e-12:
-            found[count] = (t0, w0, t1, w1)
+            found[count, 0], found[count, 1], found[count, 2], found[count, 3] = t0, w0, t1, w1
             index[count] = i
             edge[2 * count + 2], edge[2 * count + 3] = min(max(t0, 0.0), 1.0), min(max(t1, 0.0), 1.0)
             count += 1
-    edges = np.sort(edge[: 2 * count + 2])
+    _sort(edge, 2 * count + 2)
     pieces = 0
-    for i in range(len(edges) - 1):
-        t0, t1 = edges[i], edges[i + 1]
+    for i in range(2 * count + 1):
+        t0, t1 = edge[i], edge[i + 1]
         if t1 - t0 < 1e-12:
             continue
         best, w0, w1 = _nearest(found[:count], t0, t1)
@@ -212,10 +209,21 @@ def _visible_pieces(walls, line, beam, own, piece, piece_wall):  # type: ignore[
         if same:
             piece[pieces - 1, 2], piece[pieces - 1, 3] = t1, w1
         else:
-            piece[pieces] = (t0, w0, t1, w1)
+            piece[pieces, 0], piece[pieces, 1], piece[pieces, 2], piece[pieces, 3] = t0, w0, t1, w1
             piece_wall[pieces] = wall
             pieces += 1
     return pieces
+
+
+@njit(cache=True)
+def _sort(values, count):  # type: ignore[no-untyped-def]
+    """Sort the first `count` values in place; `np.sort` takes a second to compile."""
+    for i in range(1, count):
+        value, k = values[i], i
+        while k > 0 and values[k - 1] > value:
+            values[k] = values[k - 1]
+            k -= 1
+        values[k] = value
 
 
 @njit(cache=True)
@@ -236,34 +244,30 @@ def _nearest(found, t0, t1):  # type: ignore[no-untyped-def]
 def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
     """Write the beam reflected by one visible piece of a wall; False if it is too thin to matter."""
     sx, sy = beam[0], beam[1]
-    ends = np.empty((2, 2))
     for k in range(2):
         t, w = piece[2 * k], piece[2 * k + 1]
-        ends[k, 0] = sx + ((1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)) / w
-        ends[k, 1] = sy + ((1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)) / w
+        child[4 - 2 * k] = sx + ((1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)) / w
+        child[5 - 2 * k] = sy + ((1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)) / w
     dx, dy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
     away = (dx * (sy - wall[0, 1]) - dy * (sx - wall[0, 0])) / (dx * dx + dy * dy)
-    width = np.hypot(ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1])
+    width = np.hypot(child[2] - child[4], child[3] - child[5])
     distance = abs(away) * np.hypot(dx, dy)
     if width < 1e-9 or distance < 1e-9:
         return False
     child[0], child[1] = sx + 2.0 * away * dy, sy - 2.0 * away * dx
-    child[2:4], child[4:6] = ends[1], ends[0]
     area = (child[2] - child[0]) * (child[5] - child[1]) - (child[3] - child[1]) * (child[4] - child[0])
     return area > 1e-15
 
 
 @njit(cache=True)
-def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignore[no-untyped-def]
-    """Find the points between the window of a beam and one piece of its view."""
+def _add_points(beam, reflected, piece, points, bins, grid, node, pair, pairs):  # type: ignore[no-untyped-def]
+    """Pair a node with the points between the window of its beam and one piece of its view."""
     x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
     rows = (len(bins) - 1) // columns
     corner = _corners(beam, reflected, piece)
     normal, offset = _inward_edges(corner)
-    found = np.empty(16, np.int32)
-    count = 0
-    low = corner[:, 1].min() - TOLERANCE_M
-    high = corner[:, 1].max() + TOLERANCE_M
+    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
+    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
     first = max(0, int(np.floor((low - y0) / edge)))
     last = min(rows - 1, int(np.floor((high - y0) / edge)))
     for row in range(first, last + 1):
@@ -280,10 +284,10 @@ def _points_in_piece(beam, reflected, piece, points, bins, grid):  # type: ignor
                     inside = False
                     break
             if inside:
-                found = grow(found, count + 1)
-                found[count] = i
-                count += 1
-    return found[:count]
+                pair = grow(pair, pairs + 1)
+                pair[pairs, 0], pair[pairs, 1] = node, i
+                pairs += 1
+    return pair, pairs
 
 
 @njit(cache=True)
@@ -298,20 +302,21 @@ def _corners(beam, reflected, piece):  # type: ignore[no-untyped-def]
         far = _FAR_M / np.hypot(dx, dy)
         r_far = 1.0 / w if w * far > 1.0 else far
         r_near = 1.0 if reflected else 0.0
-        corner[k] = (sx + r_near * dx, sy + r_near * dy)
-        corner[3 - k] = (sx + r_far * dx, sy + r_far * dy)
+        corner[k, 0], corner[k, 1] = sx + r_near * dx, sy + r_near * dy
+        corner[3 - k, 0], corner[3 - k, 1] = sx + r_far * dx, sy + r_far * dy
     return corner
 
 
 @njit(cache=True)
 def _inward_edges(corner):  # type: ignore[no-untyped-def]
     """Give unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
-    normal, offset = np.zeros((4, 2)), np.full(4, -1.0)
+    normal, offset = np.empty((4, 2)), np.empty(4)
     for k in range(4):
+        normal[k, 0], normal[k, 1], offset[k] = 0.0, 0.0, -1.0
         dx, dy = corner[(k + 1) % 4, 0] - corner[k, 0], corner[(k + 1) % 4, 1] - corner[k, 1]
         length = np.hypot(dx, dy)
         if length > 0.0:
-            normal[k] = (dy / length, -dx / length)
+            normal[k, 0], normal[k, 1] = dy / length, -dx / length
             offset[k] = normal[k, 0] * corner[k, 0] + normal[k, 1] * corner[k, 1]
     return normal, offset
 

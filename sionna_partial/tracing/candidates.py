@@ -26,8 +26,8 @@ class Wedges:
     """Vertical edges, each with the two faces that bound the room around it.
 
     Around an edge, walls bound sectors. Only a sector wider than a half-plane holds directions that the walls hide from
-    each other, so an edge diffracts in one sector at most, and where three or more walls meet mostly in none. A free end
-    of a wall has both of its sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
+    each other, so an edge diffracts in one sector at most, and where three or more walls meet mostly in none. A free
+    end of a wall has both of its sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ class Wedges:
     height_m : float
         Height that they rise to from 0 [m].
     face : (2 W, 2) int32 array
-        0-face and n-face of the scene: counterclockwise from the 0-face of wedge i < W lies the sector, then the n-face.
+        0-face and n-face of the scene: counterclockwise from the 0-face of wedge i < W, the sector ends at the n-face.
     normal : (2 W, 2, 2) float64 array
         Their unit normals, which point into the sector.
     """
@@ -160,7 +160,7 @@ def _expand_heights(  # type: ignore[no-untyped-def]
                 out_rx[count] = pair_rx[i]
                 merge_heights(chain[:k], place[:k], tx, target, height, bounces, first, surface[count], vertices[count])
                 count += 1
-    return out_rx[:count].copy(), surface[:count].copy(), vertices[:count].copy()
+    return out_rx[:count], surface[:count], vertices[:count]
 
 
 @njit(cache=True)
@@ -203,7 +203,7 @@ def unfold(parent, segment, source, node, walls, target, chain, place):  # type:
         share = from_source / (from_source - from_point)
         x, y = sx + share * (x - sx), sy + share * (y - sy)
         chain[level] = segment[node]
-        place[level] = (x, y, np.hypot(x - sx, y - sy) / total)
+        place[level, 0], place[level, 1], place[level, 2] = x, y, np.hypot(x - sx, y - sy) / total
         node = parent[node]
     return k, total, True
 
@@ -223,7 +223,8 @@ def merge_heights(chain, place, tx, target, height, bounces, first, surface, ver
         if walls < len(chain) and place[walls, 2] <= share:
             px, py, done = place[walls, 0], place[walls, 1], place[walls, 2]
             surface[depth] = chain[walls]
-            vertices[depth] = (px, py, _height_at(done, tx[2], target[2], height, bounces, first, to_first, climb))
+            vertices[depth, 0], vertices[depth, 1] = px, py
+            vertices[depth, 2] = _height_at(done, tx[2], target[2], height, bounces, first, to_first, climb)
             walls += 1
             continue
         nx, ny, stop = target[0], target[1], 1.0
@@ -231,7 +232,8 @@ def merge_heights(chain, place, tx, target, height, bounces, first, surface, ver
             nx, ny, stop = place[walls, 0], place[walls, 1], place[walls, 2]
         part = (share - done) / (stop - done) if stop > done else 0.0
         surface[depth] = FLOOR if is_floor else CEILING
-        vertices[depth] = (px + part * (nx - px), py + part * (ny - py), 0.0 if is_floor else height)
+        vertices[depth, 0], vertices[depth, 1] = px + part * (nx - px), py + part * (ny - py)
+        vertices[depth, 2] = 0.0 if is_floor else height
         flats += 1
 
 

@@ -175,11 +175,11 @@ def _departures(
 @njit(cache=True)
 def _unfold_all(parent, segment, source, node, edge, walls, edges, tx, reflections):  # type: ignore[no-untyped-def]
     """Reflections on the way to each edge, and whether the last of them is not at the edge itself."""
-    good, count = np.zeros(len(node), np.bool_), np.zeros(len(node), np.int64)
-    length, wall = np.zeros(len(node)), np.zeros((len(node), reflections), np.int64)
-    place = np.zeros((len(node), reflections, 3))
+    good, count = np.empty(len(node), np.bool_), np.empty(len(node), np.int64)
+    length, wall = np.empty(len(node)), np.empty((len(node), reflections), np.int64)
+    place = np.empty((len(node), reflections, 3))
     for i in range(len(node)):
-        x, y = edges[edge[i]]
+        x, y = edges[edge[i], 0], edges[edge[i], 1]
         count[i], length[i], good[i] = unfold(
             parent, segment, source, node[i], walls, edges[edge[i]], wall[i], place[i]
         )
@@ -234,7 +234,8 @@ def _combine(  # type: ignore[no-untyped-def]
             for bounces in range(left + 1):
                 for flat in (FLOOR, CEILING):
                     if can_bounce(bounces, flat, floor, ceiling):
-                        rows[used] = (i, j, edge if lit else edge + len(edges), bounces, flat)
+                        rows[used, 0], rows[used, 1], rows[used, 2] = i, j, edge if lit else edge + len(edges)
+                        rows[used, 3], rows[used, 4] = bounces, flat
                         used += 1
     return rows[:used].copy()
 
@@ -251,7 +252,7 @@ def _write(  # type: ignore[no-untyped-def]
     vertices = np.zeros((len(rows), reflections + 1, 3))
     chain, way = np.empty(reflections + 1, np.int64), np.empty((reflections + 1, 3))
     for k in range(len(rows)):
-        i, j = rows[k, 0], rows[k, 1]
+        i, j, bounces, flat = rows[k, 0], rows[k, 1], np.int64(rows[k, 3]), np.int64(rows[k, 4])
         edge = group[_root(parent, pair_node[i]) // 4]
         target = rx[pair_rx[i]]
         before = count[j]
@@ -259,11 +260,13 @@ def _write(  # type: ignore[no-untyped-def]
             parent, segment, source, pair_node[i], walls, target, chain[before + 1 :], way[before + 1 :]
         )
         total = length[j] + onward
-        chain[:before], way[:before] = wall[j, :before], place[j, :before]
-        way[:before, 2] *= length[j] / total
-        chain[before], way[before] = BEND, (edges[edge, 0], edges[edge, 1], length[j] / total)
-        size = before + 1 + after
-        way[before + 1 : size, 2] = (length[j] + onward * way[before + 1 : size, 2]) / total
+        share, size = length[j] / total, before + 1 + after
+        for n in range(before):
+            chain[n], way[n, 0], way[n, 1] = wall[j, n], place[j, n, 0], place[j, n, 1]
+            way[n, 2] = place[j, n, 2] * share
+        chain[before], way[before, 0], way[before, 1], way[before, 2] = BEND, edges[edge, 0], edges[edge, 1], share
+        for n in range(before + 1, size):
+            way[n, 2] = (length[j] + onward * way[n, 2]) / total
         out_rx[k] = pair_rx[i]
-        merge_heights(chain[:size], way[:size], tx, target, height, rows[k, 3], rows[k, 4], surface[k], vertices[k])
+        merge_heights(chain[:size], way[:size], tx, target, height, bounces, flat, surface[k], vertices[k])
     return out_rx, surface, vertices

@@ -26,7 +26,7 @@ from sionna_partial.tracing.probe import fast_engine_works
 from sionna_partial.tracing.solver import Offsets, SceneSolver
 from sionna_partial.tracing.trace import Progress, checked_positions, checked_settings, link_summary
 
-PATHS_PER_BLOCK = 30_000
+PATHS_PER_BLOCK = 50_000
 """Number of paths that are differentiated together, which bounds the memory."""
 
 
@@ -148,7 +148,19 @@ def gain_gradients(
             _add_paths(total, written, settings, tx_m[0] - shift, rx_m - shift, report)
     link_state, gain_db = link_summary(total.power, total.is_direct)
     slopes_db = total.slopes_db()
-    return GainGradients(tx_m[0], rx_m, link_state, gain_db, slopes_db[:3].T, *slopes_db[3:], settings, scene_settings)
+    return GainGradients(
+        tx=tx_m[0],
+        rx=rx_m,
+        link_state=link_state,
+        gain_db=gain_db,
+        tx_db_per_m=slopes_db[:3].T,
+        relative_permittivity_db=slopes_db[3],
+        conductivity_db_per_s_m=slopes_db[4],
+        thickness_db_per_m=slopes_db[5],
+        frequency_db_per_hz=slopes_db[6],
+        settings=settings,
+        scene_settings=scene_settings,
+    )
 
 
 def path_slopes(
@@ -193,7 +205,7 @@ class _Sums:
             total += np.bincount(paths.path_rx, weights=slope, minlength=count)
 
     def slopes_db(self) -> NDArray[np.float64]:
-        """Derivatives (7, N) of the gain in decibels, 0 at its floor."""
+        """Turn the derivatives (7, N) into those of the gain [dB], which are 0 at its floor."""
         _, gain_db = link_summary(self.power, self.is_direct)
         above = gain_db > GAIN_FLOOR_DB
         return np.where(above, 10.0 / math.log(10.0) * self.slopes / np.where(above, self.power, 1.0), 0.0)
@@ -215,7 +227,7 @@ def _add_paths(
     report: Progress,
 ) -> None:
     """Find, verify and differentiate the paths in scene coordinates, block by block."""
-    if not written.is_plan:
+    if written.wedges is None:
         _require_off(settings, "diffraction")
     if not fast_engine_works():
         raise BackendError(

@@ -26,6 +26,10 @@ class SolvedPaths:
         """Whether each path (P,) is the line of sight."""
         return (self.interactions == 0).all(axis=1)
 
+    def take(self, index: NDArray[Any]) -> "SolvedPaths":
+        """Return the paths that an index array or a mask (P,) selects."""
+        return SolvedPaths(*(getattr(self, field.name)[index] for field in fields(self)))
+
     @classmethod
     def of_vertices(
         cls,

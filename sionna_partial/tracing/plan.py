@@ -6,6 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+_WALLS_AT_ONCE = 64
+"""Number of walls that are cut together, which bounds the memory."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -72,61 +75,41 @@ def grow(array, size):  # type: ignore[no-untyped-def]
     if size <= array.shape[0]:
         return array
     larger = np.empty((max(size, 2 * array.shape[0]),) + array.shape[1:], array.dtype)  # noqa: RUF005 (numba)
-    larger[: array.shape[0]] = array
+    for place in np.ndindex(array.shape):
+        larger[place] = array[place]
     return larger
 
 
-@njit(cache=True)
-def _split_at_crossings(walls):  # type: ignore[no-untyped-def]
+def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Cut segments where others cross them: the pieces (K, 2, 2), which meet only at ends, and their owners (K,)."""
-    pieces, owner, count = np.empty((2 * len(walls) + 1, 2, 2)), np.empty(2 * len(walls) + 1, np.int32), 0
-    cut = np.empty(len(walls) + 2)
-    for i in range(len(walls)):
-        ax, ay = walls[i, 1, 0] - walls[i, 0, 0], walls[i, 1, 1] - walls[i, 0, 1]
-        cut[0], cut[1], cuts = 0.0, 1.0, 2
-        for j in range(len(walls)):
-            bx, by = walls[j, 1, 0] - walls[j, 0, 0], walls[j, 1, 1] - walls[j, 0, 1]
-            cx, cy = walls[j, 0, 0] - walls[i, 0, 0], walls[j, 0, 1] - walls[i, 0, 1]
-            area = ax * by - ay * bx
-            if i == j or abs(area) < 1e-12:
-                continue
-            u, v = (cx * by - cy * bx) / area, (cx * ay - cy * ax) / area
-            if 1e-9 < u < 1.0 - 1e-9 and 1e-9 < v < 1.0 - 1e-9:
-                cut[cuts] = u
-                cuts += 1
-        places = np.sort(cut[:cuts])
-        pieces, owner = grow(pieces, count + cuts), grow(owner, count + cuts)
-        for k in range(cuts - 1):
-            for end in range(2):
-                u = places[k + end]
-                pieces[count, end, 0] = walls[i, 0, 0] + u * ax if u < 1.0 else walls[i, 1, 0]
-                pieces[count, end, 1] = walls[i, 0, 1] + u * ay if u < 1.0 else walls[i, 1, 1]
-            owner[count] = i
-            count += 1
-    return pieces[:count].copy(), owner[:count].copy()
+    start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
+    owners, places = [np.repeat(np.arange(len(walls)), 2)], [np.tile([0.0, 1.0], len(walls))]
+    for first in range(0, len(walls), _WALLS_AT_ONCE):
+        own = along[first : first + _WALLS_AT_ONCE, None]
+        away = start - start[first : first + _WALLS_AT_ONCE, None]
+        area = _cross(own, along)
+        area[np.abs(area) < 1e-12] = np.inf
+        u, v = _cross(away, along) / area, _cross(away, own) / area
+        crossed = (u > 1e-9) & (u < 1.0 - 1e-9) & (v > 1e-9) & (v < 1.0 - 1e-9)
+        owners.append(first + np.nonzero(crossed)[0])
+        places.append(u[crossed])
+    owner, place = np.concatenate(owners), np.concatenate(places)
+    order = np.lexsort([place, owner])
+    owner, place = owner[order], place[order, None]
+    ends = np.where(place < 1.0, start[owner] + place * along[owner], walls[owner, 1])
+    piece = np.flatnonzero(owner[:-1] == owner[1:])
+    return np.stack([ends[piece], ends[piece + 1]], axis=1), owner[piece].astype(np.int32)
 
 
-@njit(cache=True)
-def _line_ids(walls):  # type: ignore[no-untyped-def]
+def _line_ids(walls: NDArray[np.float64]) -> NDArray[np.int32]:
     """Give numbers to the infinite lines that the segments lie on; collinear segments share one."""
-    count = walls.shape[0]
-    line = np.full(count, -1, np.int32)
-    used = 0
-    for i in range(count):
-        if line[i] >= 0:
-            continue
-        line[i] = used
-        px, py = walls[i, 0, 0], walls[i, 0, 1]
-        dx, dy = walls[i, 1, 0] - px, walls[i, 1, 1] - py
-        length = np.hypot(dx, dy)
-        for j in range(i + 1, count):
-            if line[j] >= 0:
-                continue
-            near = True
-            for end in range(2):
-                away = (dx * (walls[j, end, 1] - py) - dy * (walls[j, end, 0] - px)) / length
-                near = near and abs(away) < 1e-6
-            if near:
-                line[j] = used
-        used += 1
+    line = np.full(len(walls), -1, np.int32)
+    for i, (start, end) in enumerate(walls):
+        if line[i] < 0:
+            away = _cross(end - start, walls - start) / np.hypot(*(end - start))
+            line[(line < 0) & (np.abs(away) < 1e-6).all(axis=1)] = line.max() + 1
     return line
+
+
+def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

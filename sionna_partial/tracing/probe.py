@@ -1,8 +1,6 @@
 """Whether the fast engine can be trusted with the Sionna RT that is installed."""
 
 import functools
-import itertools
-from pathlib import Path
 
 import numpy as np
 
@@ -10,13 +8,10 @@ from sionna_partial.constants import CellState
 from sionna_partial.files import temporary_folder
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import specular_candidates
+from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.contract import TESTED_VERSIONS, contract_breaches, sionna_version, warn_of_breaches
-from sionna_partial.tracing.diffraction import diffraction_candidates, find_wedges
+from sionna_partial.tracing.generator import WrittenScene, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.scene import SHAPES, SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.stock import stock_paths
 
@@ -76,11 +71,9 @@ def probe_breaches() -> tuple[str, ...]:
     breaches = []
     try:
         with temporary_folder() as folder:
-            geometry = build_scene(small_room())
-            xml = write_scene(geometry, folder, offset_m=geometry.origin_m)
             for settings in SETTINGS:
-                ours, theirs = _fast(geometry, xml, settings), _stock(xml, settings)
-                breaches += differences(ours, theirs)
+                scene = write_scene_of(small_room(), folder, settings, SceneSettings())
+                breaches += differences(_fast(scene, settings), _stock(scene, settings))
     except Exception as error:
         breaches.append(f"a small room cannot be solved ({error!r})")
     return tuple(dict.fromkeys(breaches))
@@ -107,16 +100,12 @@ def small_room() -> PartialMap:
     return PartialMap(state, 0.1)
 
 
-def _fast(geometry: SceneGeometry, scene_xml: Path, settings: TraceSettings) -> SolvedPaths:
-    solver, depth = SceneSolver(scene_xml, SHAPES, settings), settings.max_depth
-    beams = trace_beams(geometry.walls_m, TX_M[:2], RX_M[:, :2], depth)
-    blocks = specular_candidates(beams, geometry, TX_M, RX_M, depth)
-    if settings.diffraction:
-        wedges = find_wedges(geometry, open_ends=False)
-        blocks = itertools.chain(blocks, diffraction_candidates(geometry, wedges, TX_M, RX_M, depth))
-    return join_paths([solver.verify(candidates, TX_M, RX_M) for candidates, _ in blocks], depth)
+def _fast(scene: WrittenScene, settings: TraceSettings) -> SolvedPaths:
+    solver = SceneSolver(scene.xml, scene.shapes, settings)
+    parts = [solver.verify(candidates, TX_M, RX_M) for candidates, _, _ in scene.candidates(solver, TX_M, RX_M)]
+    return join_paths(parts, settings.max_depth)
 
 
-def _stock(scene_xml: Path, settings: TraceSettings) -> SolvedPaths:
-    parts = [paths for paths, _ in stock_paths(scene_xml, settings, TX_M, RX_M, edges=False)]
+def _stock(scene: WrittenScene, settings: TraceSettings) -> SolvedPaths:
+    parts = [paths for paths, _ in stock_paths(scene.xml, settings, TX_M, RX_M, edges=False)]
     return join_paths(parts, settings.max_depth)

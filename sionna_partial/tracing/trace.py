@@ -15,7 +15,7 @@ from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
-from sionna_partial.tracing.generator import Generator, write_scene_of
+from sionna_partial.tracing.generator import Generator, WrittenScene, bends_at, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.probe import fast_engine_works
 from sionna_partial.tracing.solver import SceneSolver
@@ -180,7 +180,7 @@ def _solver(partial: PartialMap, folder: Path, settings: TraceSettings, scene_se
     shoot = settings.refraction or settings.diffuse_reflection or (settings.diffraction and not scene.is_plan)
     if shoot or not fast_engine_works():
         diffraction = scene.is_plan if settings.diffraction is None else settings.diffraction
-        return partial_function(_shoot, scene.xml, replace(settings, diffraction=diffraction))
+        return partial_function(_shoot, scene, replace(settings, diffraction=diffraction))
     return partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
 
 
@@ -193,17 +193,18 @@ def _verify(
 
 
 def _shoot(
-    scene_xml: Path, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+    scene: WrittenScene, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
 ) -> Iterator[tuple[SolvedPaths, float, str]]:
     """Let Sionna RT's public path solver shoot rays."""
-    for paths, share in stock_paths(scene_xml, settings, tx_m, rx_m):
-        yield paths, share, f"shooting rays to {len(rx_m)} receivers"
+    for paths, share in stock_paths(scene.xml, settings, tx_m, rx_m):
+        kept = paths if scene.wedges is None else paths.take(bends_at(scene.wedges, paths))
+        yield kept, share, f"shooting rays to {len(rx_m)} receivers"
 
 
 def _summary(paths: SolvedPaths, transmitters: int, receivers: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Link state and path gain [dB] of all links, transmitter by transmitter."""
     link, links = paths.path_tx.astype(np.int64) * receivers + paths.path_rx, transmitters * receivers
-    power = np.bincount(link, weights=np.abs(paths.a) ** 2, minlength=links)
+    power = np.bincount(link, weights=np.abs(paths.a) ** 2, minlength=links).astype(float)
     return link_summary(power, np.isin(np.arange(links), link[paths.is_direct]))
 
 

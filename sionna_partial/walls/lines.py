@@ -9,10 +9,12 @@ RAGGED_FACTOR = 2.0
 
 _CORNERS = 64
 _RESIDUAL_COST = 16.0
-_STEEPEST = 1.05
 _RAGGED_TURNS = 4
 _RAGGED_SPACING = 10.0
 _LEVEL_CELLS = 1.0
+
+_ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
+"""Corners (slope, offset) of the polygon of lines that are not steep and pass near the origin."""
 
 
 def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -40,37 +42,27 @@ def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.
     lines : (r, 4) float64 array
         Point x, y on and direction x, y of every run's line.
     """
-    start, swap = _best_split(points, tolerance + 1e-6)
-    lines = np.empty((len(start), 4))
-    for k in range(len(start)):
-        end = start[k + 1] if k + 1 < len(start) else len(points) - 1
-        lines[k] = _line(points[start[k] : end + 1], tolerance + 1e-6, bool(swap[k]))
-    return start, lines
+    points, tolerance = np.ascontiguousarray(points), tolerance + 1e-6
+    previous, along_y = np.zeros(len(points), np.int64), np.zeros(len(points), np.bool_)
+    _find_runs(points, tolerance, np.full(len(points), np.inf), previous, along_y)
+    starts, lines, end = [], [], len(points) - 1
+    while end > 0:
+        starts.append(int(previous[end]))
+        lines.append(_line(points, starts[-1], end, tolerance, along_y[end]))
+        end = starts[-1]
+    return np.array(starts[::-1], np.int64), np.array(lines[::-1]).reshape(-1, 4)
 
 
 @njit(cache=True)
-def _best_split(points, tolerance):  # type: ignore[no-untyped-def]
-    """Find the starts of the cheapest runs, and whether each runs along y rather than x, by dynamic programming."""
-    n = len(points)
-    cost = np.full(n, np.inf)
+def _find_runs(points, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
+    """Write where the cheapest run to every corner begins, and whether it is along y, by dynamic programming."""
     cost[0] = 0.0
-    previous = np.zeros(n, np.int64)
-    along_y = np.zeros(n, np.bool_)
-    for i in range(n - 1):
+    for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
             cost[i + 1], previous[i + 1] = cost[i] + 1.0, i
             along_y[i + 1] = abs(points[i + 1, 1] - points[i, 1]) > abs(points[i + 1, 0] - points[i, 0])
         for swap in (False, True):
             _extend(points, tolerance, i, swap, cost, previous, along_y)
-    count, k = 0, n - 1
-    while k > 0:
-        count, k = count + 1, previous[k]
-    starts, swaps = np.empty(count, np.int64), np.empty(count, np.bool_)
-    k = n - 1
-    for r in range(count - 1, -1, -1):
-        starts[r], swaps[r] = previous[k], along_y[k]
-        k = previous[k]
-    return starts, swaps
 
 
 @njit(cache=True)
@@ -101,35 +93,38 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
 
 
 @njit(cache=True)
-def _line(points, tolerance, swap):  # type: ignore[no-untyped-def]
+def _line(points, start, end, tolerance, swap):  # type: ignore[no-untyped-def]
     """Point on and direction of the line that fits a run; a ragged one is parallel to an axis if that is as good."""
-    polygon, size, sums = _lines_within(points, tolerance, swap)
+    polygon, size, sums = _lines_within(points, start, end, tolerance, swap)
     ragged = size == 0
     if ragged:
         tolerance = RAGGED_FACTOR * tolerance
-        polygon, size, sums = _lines_within(points, tolerance, swap)
+        polygon, size, sums = _lines_within(points, start, end, tolerance, swap)
     mean_x, mean_y = sums[1] / sums[0], sums[2] / sums[0]
     spread = sums[3] - sums[1] * mean_x
     slope = (sums[4] - sums[1] * mean_y) / spread if spread > 1e-9 else 0.0
-    if ragged and abs(slope * (points[-1, int(swap)] - points[0, int(swap)])) <= _LEVEL_CELLS:
+    if ragged and abs(slope * (points[end, int(swap)] - points[start, int(swap)])) <= _LEVEL_CELLS:
         slope = 0.0
     offset = mean_y - slope * mean_x
-    if size > 0 and not _fits(points, tolerance, swap, slope, offset):
-        slope, offset = polygon[:size, 0].mean(), polygon[:size, 1].mean()
-    x, y = points[0, int(swap)] + mean_x, points[0, 1 - int(swap)] + slope * mean_x + offset
+    if size > 0 and not _fits(points, start, end, tolerance, swap, slope, offset):
+        slope, offset = 0.0, 0.0
+        for k in range(size):
+            slope, offset = slope + polygon[k, 0], offset + polygon[k, 1]
+        slope, offset = slope / size, offset / size
+    x, y = points[start, int(swap)] + mean_x, points[start, 1 - int(swap)] + slope * mean_x + offset
     norm = np.sqrt(1.0 + slope * slope)
     if swap:
-        return np.array([y, x, slope / norm, 1.0 / norm])
-    return np.array([x, y, 1.0 / norm, slope / norm])
+        return y, x, slope / norm, 1.0 / norm
+    return x, y, 1.0 / norm, slope / norm
 
 
 @njit(cache=True)
-def _lines_within(points, tolerance, swap):  # type: ignore[no-untyped-def]
+def _lines_within(points, start, end, tolerance, swap):  # type: ignore[no-untyped-def]
     """Polygon of the lines that fit a run, its number of corners, and the sums over the run."""
     polygon, size = _all_lines()
     sums = np.zeros(6)
-    for k in range(len(points) - 1):
-        element = _middles(points, 0, k, swap)
+    for k in range(start, end):
+        element = _middles(points, start, k, swap)
         size = _clip_element(polygon, size, element, tolerance)
         _accumulate(sums, element)
     return polygon, size, sums
@@ -147,9 +142,9 @@ def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _fits(points, tolerance, swap, slope, offset):  # type: ignore[no-untyped-def]
-    for k in range(len(points) - 1):
-        x0, y0, x1, y1, _ = _middles(points, 0, k, swap)
+def _fits(points, start, end, tolerance, swap, slope, offset):  # type: ignore[no-untyped-def]
+    for k in range(start, end):
+        x0, y0, x1, y1, _ = _middles(points, start, k, swap)
         if max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) > tolerance:
             return False
     return True
@@ -196,11 +191,11 @@ def _residual_variance(sums):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _all_lines():  # type: ignore[no-untyped-def]
-    """Corners (slope, offset) of the polygon of lines that are not steep and pass near the origin."""
-    polygon = np.zeros((_CORNERS, 2))
-    polygon[0], polygon[1] = (-_STEEPEST, -3.0), (_STEEPEST, -3.0)
-    polygon[2], polygon[3] = (_STEEPEST, 3.0), (-_STEEPEST, 3.0)
-    return polygon, 4
+    """Polygon of all lines, with room to cut it, and its number of corners."""
+    polygon = np.empty((_CORNERS, 2))
+    for k in range(len(_ALL_LINES)):
+        polygon[k, 0], polygon[k, 1] = _ALL_LINES[k, 0], _ALL_LINES[k, 1]
+    return polygon, len(_ALL_LINES)
 
 
 @njit(cache=True)
@@ -210,17 +205,21 @@ def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
     for side in (1.0, -1.0):
         count = 0
         for k in range(size):
-            a, b = polygon[k], polygon[(k + 1) % size]
-            inside_a = tolerance - side * (a[0] * x + a[1] - y)
-            inside_b = tolerance - side * (b[0] * x + b[1] - y)
-            if inside_a >= 0.0:
-                kept[count] = a
+            slope, offset = polygon[k, 0], polygon[k, 1]
+            next_slope, next_offset = polygon[(k + 1) % size, 0], polygon[(k + 1) % size, 1]
+            inside = tolerance - side * (slope * x + offset - y)
+            next_inside = tolerance - side * (next_slope * x + next_offset - y)
+            if inside >= 0.0:
+                kept[count, 0], kept[count, 1] = slope, offset
                 count += 1
-            if inside_a * inside_b < 0.0:
-                kept[count] = a + (b - a) * (inside_a / (inside_a - inside_b))
+            if inside * next_inside < 0.0:
+                share = inside / (inside - next_inside)
+                kept[count, 0] = slope + (next_slope - slope) * share
+                kept[count, 1] = offset + (next_offset - offset) * share
                 count += 1
             if count > _CORNERS - 2:
                 return 0
         size = count
-        polygon[:size] = kept[:size]
+        for k in range(size):
+            polygon[k, 0], polygon[k, 1] = kept[k, 0], kept[k, 1]
     return size

@@ -1,0 +1,263 @@
+"""Gradients agree with formulas in double precision and with finite differences of the trace."""
+
+import dataclasses
+import doctest
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.errors import BackendError, PositionError, SettingsError
+from sionna_partial.tracing import gradients
+from sionna_partial.tracing.generator import write_scene_of
+from sionna_partial.tracing.gradients import GainGradients, gain_gradients, path_slopes
+from sionna_partial.tracing.probe import RX_M, TX_M, small_room
+from sionna_partial.tracing.solver import Offsets, SceneSolver
+
+SLOPES = (
+    *("tx_db_per_m", "relative_permittivity_db", "conductivity_db_per_s_m", "thickness_db_per_m"),
+    "frequency_db_per_hz",
+)
+FIELD = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.1)
+OPEN = sp.SceneSettings(floor_extent="none")
+FLOOR = sp.SceneSettings(floor_extent="map", ceiling=False, material=sp.Material(thickness_m=0.02))
+TX = np.array([1.03, 1.92, 1.4])
+RX = np.array([[3.2, 2.1, 1.1], [1.5, 3.3, 0.4], [5.1, 0.7, 2.2], [1.1, 1.8, 0.2]])
+SETTINGS = sp.TraceSettings(max_depth=2)
+
+
+def all_slopes(found: GainGradients) -> NDArray[np.float64]:
+    """Derivatives (7, N) in the order of `Offsets`."""
+    return np.vstack([found.tx_db_per_m.T, *(getattr(found, name) for name in SLOPES[1:])])
+
+
+def same_bytes(one: GainGradients, other: GainGradients) -> bool:
+    names = ("gain_db", "link_state", *SLOPES)
+    return all(getattr(one, name).tobytes() == getattr(other, name).tobytes() for name in names)
+
+
+def floor_gain_db(parameters: NDArray[np.float64], rx: NDArray[np.float64], direct: bool) -> float:
+    """Gain [dB] over a floor at z = 0 in double precision (ITU-R P.2040-3, eq. 31b and 37; vertical waves are TM)."""
+    x, y, z, permittivity, conductivity, thickness_m, frequency_hz = parameters
+    wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
+    across_m = np.hypot(rx[0] - x, rx[1] - y)
+    eta = permittivity - 1j * conductivity / (2 * np.pi * frequency_hz * 8.8541878128e-12)
+    reflected_m = np.hypot(across_m, rx[2] + z)
+    cosine = (rx[2] + z) / reflected_m
+    root = np.sqrt(eta - (1 - cosine**2))
+    face = (eta * cosine - root) / (eta * cosine + root)
+    through = np.exp(-4j * np.pi * thickness_m / wavelength_m * root)
+    slab = face * (1 - through) / (1 - face**2 * through)
+    power = np.abs(slab) ** 2 / reflected_m**2 + direct / (across_m**2 + (rx[2] - z) ** 2)
+    return 10 * np.log10(power * (wavelength_m / (4 * np.pi)) ** 2)
+
+
+def floor_slopes(material: sp.Material, rx: NDArray[np.float64], frequency_hz: float) -> NDArray[np.float64]:
+    """Derivatives (7,) of `floor_gain_db`, by central differences in double precision."""
+    constants = (material.relative_permittivity, material.conductivity_s_m, material.thickness_m, frequency_hz)
+    at = np.array([*TX, *constants])
+    steps = np.diag([1e-5, 1e-5, 1e-5, 1e-5, 1e-6, 1e-8, 1e4])
+    return np.array(
+        [(floor_gain_db(at + d, rx, True) - floor_gain_db(at - d, rx, True)) / (2 * d.sum()) for d in steps]
+    )
+
+
+@pytest.fixture(scope="module")
+def found() -> GainGradients:
+    return gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS)
+
+
+class TestAgainstFormulas:
+    def test_line_of_sight(self) -> None:
+        found = gain_gradients(FIELD, TX, RX, scene_settings=OPEN)
+        away = TX - RX
+        expected = -20 / np.log(10) * away / (away**2).sum(axis=1, keepdims=True)
+        np.testing.assert_allclose(found.tx_db_per_m, expected, rtol=2e-5, atol=1e-6)
+        np.testing.assert_allclose(found.frequency_db_per_hz, -20 / np.log(10) / 28e9, rtol=1e-5)
+        assert not all_slopes(found)[3:6].any()
+        assert (found.link_state == LinkState.LOS).all()
+
+    @pytest.mark.parametrize(
+        "material",
+        [FLOOR.material, sp.Material(7.0, 0.02, 0.011), sp.Material(1.2, 2.0, 0.01)],
+        ids=["drywall", "low loss", "lossy"],
+    )
+    def test_reflection_off_the_floor(self, material: sp.Material) -> None:
+        found = gain_gradients(FIELD, TX, RX, scene_settings=dataclasses.replace(FLOOR, material=material))
+        expected = np.stack([floor_slopes(material, rx, 28e9) for rx in RX], axis=1)
+        scale = np.abs(expected).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(all_slopes(found) / scale, expected / scale, rtol=0.01, atol=2e-4)
+
+
+class TestAgainstDifferencesOfTheTrace:
+    """In a room with a pillar: walls, floor, ceiling and edges, partly behind the pillar."""
+
+    @staticmethod
+    def difference(change: Callable[[float], sp.TracedLinks], step: float) -> NDArray[np.float64]:
+        ends = change(step), change(-step)
+        np.testing.assert_array_equal(ends[0].interactions, ends[1].interactions)
+        np.testing.assert_array_equal(ends[0].path_rx, ends[1].path_rx)
+        return (ends[0].gain_db - ends[1].gain_db) / (2 * step)
+
+    def test_room_has_diffracted_paths_and_every_receiver_reflections(self) -> None:
+        links = sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS)
+        assert (links.interactions == 8).any()
+        assert {*links.path_rx[(links.interactions == 1).any(axis=1)]} == {0, 1, 2}
+
+    def test_transmitter(self, found: GainGradients) -> None:
+        slopes = [
+            self.difference(
+                lambda step, axis=axis: sp.trace_links(small_room(), TX_M + step * axis, RX_M, settings=SETTINGS), 2e-3
+            )
+            for axis in np.eye(3)
+        ]
+        off = np.linalg.norm(found.tx_db_per_m - np.transpose(slopes), axis=1)
+        assert (off <= 0.01 * np.linalg.norm(found.tx_db_per_m, axis=1)).all()
+
+    @pytest.mark.parametrize(
+        ("field", "step", "name"),
+        [
+            ("relative_permittivity", 4e-3, "relative_permittivity_db"),
+            ("conductivity_s_m", 4e-3, "conductivity_db_per_s_m"),
+            ("thickness_m", 3e-5, "thickness_db_per_m"),
+        ],
+    )
+    def test_material(self, field: str, step: float, name: str, found: GainGradients) -> None:
+        def change(value: float) -> sp.TracedLinks:
+            material = dataclasses.replace(sp.Material(), **{field: getattr(sp.Material(), field) + value})
+            scene_settings = sp.SceneSettings(material=material)
+            return sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS, scene_settings=scene_settings)
+
+        np.testing.assert_allclose(getattr(found, name), self.difference(change, step), rtol=0.01)
+
+    def test_frequency_takes_an_itu_material_along(self) -> None:
+        concrete = dataclasses.replace(FLOOR, material=sp.Material(itu="concrete", thickness_m=0.01))
+
+        def change(value: float) -> sp.TracedLinks:
+            settings = sp.TraceSettings(frequency_hz=5e9 + value)
+            return sp.trace_links(FIELD, TX, RX, settings=settings, scene_settings=concrete)
+
+        settings = sp.TraceSettings(frequency_hz=5e9)
+        found = gain_gradients(FIELD, TX, RX, settings=settings, scene_settings=concrete)
+        np.testing.assert_allclose(found.frequency_db_per_hz, self.difference(change, 2e7), rtol=0.01)
+
+
+class TestGainGradients:
+    def test_gain_and_state_are_those_of_the_trace(self, found: GainGradients) -> None:
+        links = sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS)
+        np.testing.assert_array_equal(found.link_state, links.link_state)
+        np.testing.assert_allclose(found.gain_db, links.gain_db, rtol=1e-13)
+        np.testing.assert_array_equal([*found.tx, *found.rx.ravel()], [*links.tx, *links.rx.ravel()])
+        assert (found.settings, found.scene_settings) == (SETTINGS, sp.SceneSettings())
+
+    def test_outage_has_no_slopes(self) -> None:
+        state = np.zeros((22, 60), dtype=np.uint8)
+        state[[0, -1], :] = state[:, [0, 29, -1]] = CellState.WALL
+        found = gain_gradients(sp.PartialMap(state, 0.1), (1.0, 1.1, 1.5), [(4.5, 0.8, 1.2), (1.7, 0.7, 1.1)])
+        assert found.link_state.tolist() == [LinkState.OUTAGE, LinkState.LOS]
+        assert found.gain_db[0] == -150
+        assert not all_slopes(found)[:, 0].any()
+        assert all_slopes(found)[:, 1].all()
+
+    def test_moved_map(self, found: GainGradients) -> None:
+        """Where the origin of the map lies changes nothing."""
+        room, move = small_room(), np.array([64.0, -32.0, 0.0])
+        moved = dataclasses.replace(room, origin_m=(64.0, -32.0))
+        other = gain_gradients(moved, TX_M + move, RX_M + move, settings=SETTINGS)
+        np.testing.assert_allclose(all_slopes(other), all_slopes(found), rtol=1e-3)
+
+    def test_two_runs_give_the_same_bytes(self, found: GainGradients) -> None:
+        assert same_bytes(found, gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS))
+
+    def test_blocks_change_nothing(self, found: GainGradients, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(gradients, "PATHS_PER_BLOCK", 29)
+        in_blocks = gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS)
+        np.testing.assert_allclose(all_slopes(in_blocks), all_slopes(found), rtol=1e-6)
+
+    def test_no_receivers(self) -> None:
+        found = gain_gradients(FIELD, TX, [])
+        assert found.tx_db_per_m.shape == (0, 3)
+        assert all(getattr(found, name).shape == (0,) for name in ("gain_db", "link_state", *SLOPES[1:]))
+
+    def test_progress_rises_to_one(self) -> None:
+        calls: list[tuple[float, str]] = []
+        gain_gradients(
+            small_room(), TX_M, RX_M, settings=SETTINGS, progress=lambda share, message: calls.append((share, message))
+        )
+        shares, messages = zip(*calls, strict=True)
+        assert list(shares) == sorted(shares)
+        assert shares[0] == 0.0
+        assert shares[-1] == pytest.approx(1.0)
+        assert list(dict.fromkeys(messages)) == [
+            "building the scene",
+            "differentiating reflections",
+            "differentiating diffractions",
+        ]
+
+    def test_example_in_the_docstring(self) -> None:
+        result = doctest.testmod(gradients)
+        assert result.attempted > 0
+        assert result.failed == 0
+
+
+class TestErrors:
+    @pytest.mark.parametrize("name", ["refraction", "diffuse_reflection"])
+    def test_rays_are_shot(self, name: str) -> None:
+        message = f"{name} = True is not allowed: paths that are found by shooting rays have no gradients: give False"
+        with pytest.raises(SettingsError, match=message):
+            gain_gradients(FIELD, TX, RX, settings=sp.TraceSettings(**{name: True}))
+
+    def test_diffraction_on_a_mesh(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(
+            gradients, "write_scene_of", lambda *given: dataclasses.replace(write_scene_of(*given), wedges=None)
+        )
+        with pytest.raises(SettingsError, match="diffraction = True is not allowed: paths that are found by shooting"):
+            gain_gradients(FIELD, TX, RX, settings=sp.TraceSettings(diffraction=True))
+
+    def test_several_transmitters(self) -> None:
+        with pytest.raises(PositionError, match=r"tx has shape \(2, 3\): give one transmitter as \(3,\)\."):
+            gain_gradients(FIELD, [TX, TX], RX)
+
+    def test_places_and_settings_as_for_the_trace(self) -> None:
+        with pytest.raises(PositionError, match="rx"):
+            gain_gradients(FIELD, TX, [(99.0, 1.0, 1.0)])
+        with pytest.raises(SettingsError, match="frequency_hz"):
+            gain_gradients(FIELD, TX, RX, scene_settings=sp.SceneSettings(material=sp.Material(itu="wet_ground")))
+
+    def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(gradients, "fast_engine_works", lambda: False)
+        message = r'Gradients need .* that the fast engine has: run pip install "sionna-rt=='
+        with pytest.raises(BackendError, match=message):
+            gain_gradients(FIELD, TX, RX)
+
+
+class TestPathPower:
+    """What a bridge to another library needs: fixed paths, and derivatives backwards."""
+
+    def test_backward_as_forward_and_nothing_left_behind(self, tmp_path: Path) -> None:
+        written = write_scene_of(small_room(), tmp_path, SETTINGS, sp.SceneSettings())
+        solver = SceneSolver(written.xml, written.shapes, SETTINGS)
+        import drjit as dr
+        import mitsuba as mi
+
+        for candidates, *_ in written.candidates(solver, TX_M, RX_M):
+            before, rows = solver.verify_rows(candidates, TX_M, RX_M)
+            found = candidates.rows(rows)
+            slopes = path_slopes(solver, found, TX_M, RX_M)
+            offsets = Offsets(*(dr.opaque(mi.Float, 0.0) for _ in slopes))
+            leaves = [getattr(offsets, field.name) for field in dataclasses.fields(Offsets)]
+            dr.enable_grad(leaves)
+            power = solver.path_power(found, TX_M, RX_M, offsets)
+            np.testing.assert_allclose(power.numpy(), np.abs(before.a) ** 2, rtol=1e-4)
+            dr.backward(dr.sum(power))
+            backward = np.array([dr.grad(leaf)[0] for leaf in leaves])
+            forward = slopes.sum(axis=1)
+            np.testing.assert_allclose(backward[3:], forward[3:], rtol=1e-4)
+            # terms of a diffraction cancel, in another order backwards
+            assert np.linalg.norm((backward - forward)[:3]) <= 1e-3 * np.linalg.norm(forward[:3])
+            after = solver.verify(candidates, TX_M, RX_M)
+            assert after.a.tobytes() == before.a.tobytes()
