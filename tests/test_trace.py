@@ -189,6 +189,22 @@ def test_two_runs_give_the_same_bytes() -> None:
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
 
 
+def test_the_number_of_threads_changes_nothing() -> None:
+    load_sionna()
+    import drjit as dr
+
+    tx, rx = (1.05, 2.95, 1.5), _grid(_room(), 0.2)
+    threads, runs = dr.thread_count(), []
+    try:
+        for count in (1, 2, 3):
+            dr.set_thread_count(count)
+            runs.append(trace_links(_room(), tx, rx))
+    finally:
+        dr.set_thread_count(threads)
+    for name in ("a", "delay_s", "departure_rad", "vertices_m", "gain_db", "path_rx"):
+        assert len({getattr(run, name).tobytes() for run in runs}) == 1
+
+
 def test_moving_the_map_changes_nothing() -> None:
     here = _room()
     shift = np.array([512_345.7, 4_512_345.1, 0.0])
