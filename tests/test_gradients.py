@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from meshes import room
 from numpy.typing import NDArray
 
 import sionna_partial as sp
@@ -134,6 +135,20 @@ class TestAgainstDifferencesOfTheTrace:
 
         np.testing.assert_allclose(getattr(found, name), self.difference(change, step), rtol=0.01)
 
+    def test_mesh(self, tmp_path: Path) -> None:
+        room().export(tmp_path / "room.ply")
+        scene, rx = sp.load_map(tmp_path / "room.ply"), np.array([[4.2, 3.1, 1.1], [1.9, 0.9, 2.0]])
+        slopes = [
+            self.difference(
+                lambda step, axis=axis: sp.trace_links(scene, TX + step * axis, rx, settings=SETTINGS), 4e-3
+            )
+            for axis in np.eye(3)
+        ]
+        found = gain_gradients(scene, TX, rx, settings=SETTINGS)
+        assert found.relative_permittivity_db.all()
+        off = np.linalg.norm(found.tx_db_per_m - np.transpose(slopes), axis=1)
+        assert (off <= 0.01 * np.linalg.norm(found.tx_db_per_m, axis=1)).all()
+
     def test_frequency_takes_an_itu_material_along(self) -> None:
         concrete = dataclasses.replace(FLOOR, material=sp.Material(itu="concrete", thickness_m=0.01))
 
@@ -211,12 +226,10 @@ class TestErrors:
         with pytest.raises(SettingsError, match=message):
             gain_gradients(FIELD, TX, RX, settings=sp.TraceSettings(**{name: True}))
 
-    def test_diffraction_on_a_mesh(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(
-            gradients, "write_scene_of", lambda *given: dataclasses.replace(write_scene_of(*given), wedges=None)
-        )
+    def test_diffraction_on_a_mesh(self, tmp_path: Path) -> None:
+        room().export(tmp_path / "room.ply")
         with pytest.raises(SettingsError, match="diffraction = True is not allowed: paths that are found by shooting"):
-            gain_gradients(FIELD, TX, RX, settings=sp.TraceSettings(diffraction=True))
+            gain_gradients(tmp_path / "room.ply", TX, TX[None] + 0.1, settings=sp.TraceSettings(diffraction=True))
 
     def test_several_transmitters(self) -> None:
         with pytest.raises(PositionError, match=r"tx has shape \(2, 3\): give one transmitter as \(3,\)\."):

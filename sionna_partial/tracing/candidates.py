@@ -74,7 +74,7 @@ class Candidates:
 
     def rows(self, index: NDArray[np.intp]) -> "Candidates":
         """Pick some of the candidates."""
-        wedge = None if self.wedge is None else self.wedge[index]
+        wedge = None if self.wedges is None or self.wedge is None else self.wedge[index]
         return replace(self, rx=self.rx[index], face=self.face[index], vertices_m=self.vertices_m[index], wedge=wedge)
 
 

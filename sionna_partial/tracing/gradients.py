@@ -227,7 +227,7 @@ def _add_paths(
     report: Progress,
 ) -> None:
     """Find, verify and differentiate the paths in scene coordinates, block by block."""
-    if written.wedges is None:
+    if not written.is_plan:
         _require_off(settings, "diffraction")
     if not fast_engine_works():
         raise BackendError(

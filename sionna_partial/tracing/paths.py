@@ -62,32 +62,42 @@ class SolvedPaths:
 def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
     """Join lists of paths, ordered by transmitter, receiver and delay.
 
-    Takes the parts out of the list one by one, so that memory need not hold all paths twice.
+    Empties the list: each field of the parts is let go as soon as it is joined, since dense grids have millions of
+    paths.
     """
-    total, depth = sum(len(part.a) for part in parts), max(1, max_depth)
-    joined = SolvedPaths(
-        path_tx=np.zeros(total, np.int32),
-        path_rx=np.zeros(total, np.int32),
-        a=np.zeros(total, np.complex128),
-        delay_s=np.zeros(total),
-        departure_rad=np.zeros((total, 2)),
-        arrival_rad=np.zeros((total, 2)),
-        interactions=np.zeros((total, depth), np.uint8),
-        vertices_m=np.full((total, depth, 3), math.nan),
-    )
-    place, start = np.empty(total, np.int64), 0
-    place[_path_order(parts)] = np.arange(total)
-    while parts:
-        part = parts.pop(0)
-        at = place[start : start + len(part.a)]
-        for field in fields(SolvedPaths):
-            target = getattr(joined, field.name)
-            if target.ndim == 1 or field.name.endswith("_rad"):
-                target[at] = getattr(part, field.name)
-        joined.interactions[at, : part.interactions.shape[1]] = part.interactions
-        joined.vertices_m[at, : part.interactions.shape[1]] = part.vertices_m
-        start += len(part.a)
-    return joined
+    place = _places(parts)
+    names = [field.name for field in fields(SolvedPaths)]
+    columns = {name: [getattr(part, name) for part in parts] for name in names}
+    parts.clear()
+    depth = max(1, max_depth)
+    shapes = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
+    kinds = {"path_tx": np.int32, "path_rx": np.int32, "a": np.complex128, "interactions": np.uint8}
+    joined = {}
+    for name in names:
+        column: NDArray[Any] = np.zeros((len(place), *shapes.get(name, ())), kinds.get(name, np.float64))
+        if name == "vertices_m":
+            column[:] = math.nan
+        _scatter(columns.pop(name), place, column)
+        joined[name] = column
+    return SolvedPaths(**joined)
+
+
+def _scatter(values: list[NDArray[Any]], place: NDArray[np.int64], column: NDArray[Any]) -> None:
+    """Write arrays, one after the other, to their places in a column that may be deeper; empties the list."""
+    start = 0
+    while values:
+        part = values.pop(0)
+        at = place[start : start + len(part)]
+        column[at if part.shape[1:] == column.shape[1:] else (at, slice(0, part.shape[1]))] = part
+        start += len(part)
+
+
+def _places(parts: list[SolvedPaths]) -> NDArray[np.int64]:
+    """Place of every path in the joined order."""
+    order = _path_order(parts)
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    return place
 
 
 def _path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
