@@ -59,7 +59,10 @@ app = typer.Typer(
 )
 
 MapArgument = Annotated[
-    Path, typer.Argument(metavar="MAP", help="ROS map_server YAML, exported scene folder, .npz, or mesh.", show_default=False)
+    Path,
+    typer.Argument(
+        metavar="MAP", help="ROS map_server YAML, exported scene folder, .npz, or mesh.", show_default=False
+    ),
 ]
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.paths import PathColumns, SolvedPaths, join_paths
 
 
 def _paths(*rows: tuple[int, int, float, complex], depth: int = 1) -> SolvedPaths:
@@ -22,6 +22,24 @@ def _paths(*rows: tuple[int, int, float, complex], depth: int = 1) -> SolvedPath
         interactions=np.full((count, depth), 1, np.uint8),
         vertices_m=np.broadcast_to(a.real[:, None, None], (count, depth, 3)).astype(np.float32),
     )
+
+
+class TestPathColumns:
+    def test_what_is_added_later_stands_later(self) -> None:
+        columns = PathColumns(2)
+        columns.append([_paths((0, 5, 2e-8, 1), (0, 4, 1e-8, 2))])
+        columns.append([])
+        columns.append([_paths((0, 1, 1e-8, 3), depth=2), _paths((0, 0, 1e-8, 4))])
+        paths = columns.paths()
+        assert paths.a.tolist() == [2, 1, 4, 3]
+        assert paths.vertices_m.shape == (4, 2, 3)
+        assert np.isnan(paths.vertices_m[:3, 1]).all()
+
+    def test_between_names_both_ends(self) -> None:
+        paths = _paths((0, 5, 2e-8, 1), (0, 4, 1e-8, 2)).between(3, 100)
+        assert paths.path_tx.tolist() == [3, 3]
+        assert paths.path_rx.tolist() == [105, 104]
+        assert paths.path_tx.dtype == paths.path_rx.dtype == np.int32
 
 
 class TestJoinPaths:
@@ -57,11 +75,6 @@ class TestJoinPaths:
         for tx, rx in ((999, 999_999), (0, 2**31 - 1)):
             rows = [(tx, rx, 1e-3, 1), (tx, 0, 1.0, 2), (0, rx, 1.0, 3), (0, 0, 0.0, 4), (tx, rx, 1e-9, 5)]
             assert join_paths([_paths(*rows)], 1).a.real.tolist() == [row[3] for row in sorted(rows)]
-
-    def test_empties_the_list_of_parts(self) -> None:
-        parts = [_paths((0, 0, 1e-8, 1)), _paths()]
-        assert len(join_paths(parts, 1).a) == 1
-        assert parts == []
 
     @pytest.mark.parametrize("parts", [[], [_paths()], [_paths(), _paths(depth=2)]], ids=["none", "one", "two"])
     @pytest.mark.parametrize(("max_depth", "depth"), [(0, 1), (1, 1), (6, 6)])

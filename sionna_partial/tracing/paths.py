@@ -1,7 +1,7 @@
 """Verified paths, whichever way they were found, and how lists of them are joined."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,11 @@ class SolvedPaths:
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
         """Return the paths that an index array or a mask (P,) selects."""
         return SolvedPaths(*(getattr(self, field.name)[index] for field in fields(self)))
+
+    def between(self, tx: int, first_rx: int) -> "SolvedPaths":
+        """Return the paths of transmitter `tx`, with receivers counted from `first_rx`."""
+        path_tx = np.full(len(self.a), tx, np.int32)
+        return replace(self, path_tx=path_tx, path_rx=self.path_rx + np.int32(first_rx))
 
     @classmethod
     def of_vertices(
@@ -59,45 +64,48 @@ class SolvedPaths:
         )
 
 
-def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
-    """Join lists of paths, ordered by transmitter, receiver and delay.
+class PathColumns:
+    """All paths of a trace, in columns that grow in place: memory should not hold the millions of a dense grid twice.
 
-    Empties the list: each field of the parts is let go as soon as it is joined, since dense grids have millions of
-    paths.
+    Parameters
+    ----------
+    depth : int
+        Largest number of interactions of a path.
     """
-    place = _places(parts)
-    names = [field.name for field in fields(SolvedPaths)]
-    columns = {name: [getattr(part, name) for part in parts] for name in names}
-    parts.clear()
-    depth = max(1, max_depth)
-    shapes = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
-    kinds = {"path_tx": np.int32, "path_rx": np.int32, "a": np.complex128, "interactions": np.uint8}
-    joined = {}
-    for name in names:
-        column: NDArray[Any] = np.zeros((len(place), *shapes.get(name, ())), kinds.get(name, np.float64))
-        if name == "vertices_m":
-            column[:] = math.nan
-        _scatter(columns.pop(name), place, column)
-        joined[name] = column
-    return SolvedPaths(**joined)
+
+    def __init__(self, depth: int) -> None:
+        shape = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
+        kind = {"path_tx": np.int32, "path_rx": np.int32, "a": np.complex128, "interactions": np.uint8}
+        self._columns: dict[str, NDArray[Any]] = {
+            field.name: np.zeros((0, *shape.get(field.name, ())), kind.get(field.name, np.float64))
+            for field in fields(SolvedPaths)
+        }
+
+    def append(self, parts: list[SolvedPaths]) -> None:
+        """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
+        order = _path_order(parts)
+        place, start = np.empty(len(order), np.int64), len(self._columns["a"])
+        place[order] = start + np.arange(len(order))
+        for name, column in self._columns.items():
+            column.resize((start + len(order), *column.shape[1:]), refcheck=False)
+            if name == "vertices_m":
+                column[start:] = math.nan
+            first = 0
+            for values in (getattr(part, name) for part in parts):
+                at = place[first : first + len(values)]
+                column[at if values.shape[1:] == column.shape[1:] else (at, slice(0, values.shape[1]))] = values
+                first += len(values)
+
+    def paths(self) -> SolvedPaths:
+        """Return all paths. Nothing may be added any more."""
+        return SolvedPaths(**self._columns)
 
 
-def _scatter(values: list[NDArray[Any]], place: NDArray[np.int64], column: NDArray[Any]) -> None:
-    """Write arrays, one after the other, to their places in a column that may be deeper; empties the list."""
-    start = 0
-    while values:
-        part = values.pop(0)
-        at = place[start : start + len(part)]
-        column[at if part.shape[1:] == column.shape[1:] else (at, slice(0, part.shape[1]))] = part
-        start += len(part)
-
-
-def _places(parts: list[SolvedPaths]) -> NDArray[np.int64]:
-    """Place of every path in the joined order."""
-    order = _path_order(parts)
-    place = np.empty(len(order), np.int64)
-    place[order] = np.arange(len(order))
-    return place
+def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
+    """Join lists of paths, ordered by transmitter, receiver and delay."""
+    columns = PathColumns(max(1, max_depth))
+    columns.append(parts)
+    return columns.paths()
 
 
 def _path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
 from sionna_partial.tracing.generator import Generator, WrittenScene, bends_at, write_scene_of
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.paths import PathColumns, SolvedPaths
 from sionna_partial.tracing.probe import fast_engine_works
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.stock import stock_paths
@@ -24,6 +24,10 @@ from sionna_partial.tracing.stock import stock_paths
 Progress = Callable[[float, str], None]
 """Called with the share of the work done, in [0, 1], and what is being done."""
 
+
+RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 3_000, 50_000
+"""Number of receivers whose paths are found together, which bounds the memory. A mesh has fewer paths, and costs rays
+each time."""
 
 Solve = Callable[[NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[SolvedPaths, float, str]]]
 """Solves the paths from one transmitter (3,) to receivers (N, 3), in scene coordinates, block by block: the paths of a
@@ -128,15 +132,18 @@ def trace_links(
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
     shift = np.array([*partial.origin_m, 0.0])
-    with temporary_folder() as folder:
-        parts = []
-        if len(rx_m):
-            solve = _solver(partial, folder, settings, scene_settings)
-            for index, place in enumerate(tx_m):
-                for paths, share, message in solve(place - shift, rx_m - shift):
-                    parts.append(replace(paths, path_tx=np.full(len(paths.a), index, np.int32)))
-                    report(0.1 + 0.9 * (index + share) / len(tx_m), message)
-    paths = join_paths(parts, settings.max_depth)
+    columns = PathColumns(max(1, settings.max_depth))
+    if len(rx_m):
+        with temporary_folder() as folder:
+            solve, at_once = _solver(partial, folder, settings, scene_settings)
+            blocks = [(tx, start) for tx in range(len(tx_m)) for start in range(0, len(rx_m), at_once)]
+            for number, (index, start) in enumerate(blocks):
+                parts = []
+                for paths, share, message in solve(tx_m[index] - shift, rx_m[start : start + at_once] - shift):
+                    parts.append(paths.between(index, start))
+                    report(0.1 + 0.9 * (number + share) / len(blocks), message)
+                columns.append(parts)
+    paths = columns.paths()
     paths.vertices_m[:] += shift
     shape = (*np.shape(tx)[:-1], len(rx_m))
     link_state, gain_db = _summary(paths, len(tx_m), len(rx_m))
@@ -174,14 +181,18 @@ def checked_positions(
     return tx_m.reshape(-1, 3), rx_m
 
 
-def _solver(partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings) -> Solve:
-    """Write the scene, and choose how its paths are found."""
+def _solver(
+    partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings
+) -> tuple[Solve, int]:
+    """Write the scene, and choose how its paths are found, and for how many receivers at once."""
     scene = write_scene_of(partial, folder, settings, scene_settings)
     shoot = settings.refraction or settings.diffuse_reflection or (settings.diffraction and not scene.is_plan)
     if shoot or not fast_engine_works():
         diffraction = scene.is_plan if settings.diffraction is None else settings.diffraction
-        return partial_function(_shoot, scene, replace(settings, diffraction=diffraction))
-    return partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
+        solve = partial_function(_shoot, scene, replace(settings, diffraction=diffraction))
+    else:
+        solve = partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
+    return solve, RECEIVERS_OF_PLAN if scene.is_plan else RECEIVERS_OF_MESH
 
 
 def _verify(
