@@ -153,7 +153,7 @@ def predict_map(
     tx_m = _transmitter(partial, tx)
     receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
     complete = partial.is_complete
-    chosen = None if complete and predictor is None else _predictor(predictor, trace_settings.frequency_hz)
+    chosen = None if complete and predictor is None else _predictor(predictor)
     model = None if complete else chosen
     report = progress or (lambda share, message: None)
     links = trace_links(
@@ -164,13 +164,15 @@ def predict_map(
         scene_settings=scene_settings,
         progress=lambda share, message: report(0.8 * share, message),
     )
+    if model is not None:
+        _warn_of_other_traces(model, links.settings)
     report(0.8, "measuring unobserved distances")
     phi = link_features(partial, links)
     report(0.9, f"predicting {len(receivers.rx_m)} links")
     variables = _variables(partial, receivers, phi, model)
     variables["wall_parts"] = _wall_parts(partial, receivers, spacing_m)
     attributes = {
-        **_provenance(partial, model, scene_settings, trace_settings),
+        **_provenance(partial, model, scene_settings, links.settings),
         "transmitter_m": tx_m,
         "rx_height_m": float(rx_height_m),
         "spacing_m": float(spacing_m),
@@ -208,17 +210,21 @@ def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
     return tx_m
 
 
-def _predictor(predictor: Predictor | str | Path | None, frequency_hz: float) -> Predictor:
-    model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
-    trained_hz = model.settings.frequency_hz
-    if not math.isclose(trained_hz, frequency_hz, rel_tol=0.05):
-        _log.warning(
-            "predictor %r was trained at %g GHz, and is used at %g GHz: what it says of unobserved links is biased",
-            model.name,
-            trained_hz / 1e9,
-            frequency_hz / 1e9,
-        )
-    return model
+def _predictor(predictor: Predictor | str | Path | None) -> Predictor:
+    return predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+
+
+def _warn_of_other_traces(model: Predictor, settings: TraceSettings) -> None:
+    """Warn if a predictor is used on traces of another kind than it was trained on."""
+    trained, ways = model.settings, {True: "with diffraction", False: "without diffraction"}
+    if not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
+        then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
+    elif trained.diffraction != settings.diffraction:
+        then, now = ways[trained.diffraction], ways[bool(settings.diffraction)]
+    else:
+        return
+    message = "predictor %r was trained %s, and is used %s: what it says of unobserved links is biased"
+    _log.warning(message, model.name, then, now)
 
 
 def _receivers(

@@ -1,6 +1,7 @@
 """A tracer and a predictor that answer at once, for tests of what is made of their answers."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def fake_trace(
         arrival_rad=np.zeros((0, 2)),
         interactions=np.zeros((0, settings.max_depth), dtype=np.uint8),
         vertices_m=np.zeros((0, settings.max_depth, 3)),
-        settings=settings,
+        settings=settings if settings.diffraction is False else replace(settings, diffraction=True),
         scene_settings=scene_settings,
     )
 

@@ -261,6 +261,12 @@ def test_a_predictor_trained_at_another_frequency_is_warned_about(fakes, caplog)
     assert message.startswith("predictor 'fake' was trained at 28 GHz, and is used at 60 GHz")
 
 
+def test_a_predictor_trained_with_diffraction_is_warned_about_without(fakes, caplog):
+    predict_map(map_of(PICTURE), TX, spacing_m=0.5, trace_settings=TraceSettings(diffraction=False))
+    (message,) = caplog.messages
+    assert message.startswith("predictor 'fake' was trained with diffraction, and is used without diffraction: what it")
+
+
 def test_settings_reach_the_tracer_and_the_attributes(fakes):
     coverage = predict_map(
         map_of(PICTURE),

@@ -167,7 +167,7 @@ class TestGainGradients:
         np.testing.assert_array_equal(found.link_state, links.link_state)
         np.testing.assert_allclose(found.gain_db, links.gain_db, rtol=1e-13)
         np.testing.assert_array_equal([*found.tx, *found.rx.ravel()], [*links.tx, *links.rx.ravel()])
-        assert (found.settings, found.scene_settings) == (SETTINGS, sp.SceneSettings())
+        assert (found.settings, found.scene_settings) == (links.settings, links.scene_settings)
 
     def test_outage_has_no_slopes(self) -> None:
         state = np.zeros((22, 60), dtype=np.uint8)

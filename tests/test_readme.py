@@ -6,6 +6,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import pytest
+import trimesh
 
 from sionna_partial.resources import scenes_folder
 
@@ -23,6 +24,9 @@ def test_python_lines_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     mpl.use("Agg")
     for name in ("map.yaml", "map.pgm"):
         shutil.copy(scenes_folder() / "apartment" / "step100" / name, tmp_path)
+    trimesh.creation.box((7.0, 5.0, 3.0), transform=trimesh.transformations.translation_matrix((3, 2, 1.5))).export(
+        tmp_path / "scan.ply"
+    )
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for block in blocks("python"):

@@ -51,6 +51,8 @@ class PredictorSettings:
     ----------
     frequency_hz : float
         Carrier frequency of the links [Hz]; it sets the gain of free space.
+    diffraction : bool
+        Whether the links were traced with diffraction.
     steps : int
         Gradient steps of each network.
     batch_size : int
@@ -69,6 +71,7 @@ class PredictorSettings:
     """
 
     frequency_hz: float = CARRIER_FREQUENCY_HZ
+    diffraction: bool = True
     steps: int = 4000
     batch_size: int = 1024
     learning_rate: float = 0.01
@@ -77,6 +80,7 @@ class PredictorSettings:
 
     def __post_init__(self) -> None:
         require_number("frequency_hz", self.frequency_hz, 1e6, 1e12)
+        require(isinstance(self.diffraction, bool), "diffraction", self.diffraction, "give True or False.")
         require_number("learning_rate", self.learning_rate, 0.0, 1.0, open_low=True)
         for name, low, high in (
             ("steps", 1, 1_000_000),

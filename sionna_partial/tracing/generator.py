@@ -113,12 +113,11 @@ def _plan_candidates(
     rx_m: NDArray[np.float64],
 ) -> Iterator[tuple[Candidates, float, str]]:
     """Exact candidates of an extruded floor plan: beams, then beams over edges."""
-    diffraction = settings.diffraction is not False
-    part = 0.2 if diffraction else 1.0
+    part = 0.2 if settings.diffraction else 1.0
     beams = trace_beams(geometry.walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
     for candidates, share in specular_candidates(beams, geometry, tx_m, rx_m, settings.max_depth):
         yield candidates, part * share, "verifying reflections"
-    if not diffraction:
+    if not settings.diffraction:
         return
     for candidates, share in diffraction_candidates(geometry, wedges, tx_m, rx_m, settings.max_depth):
         yield candidates, part + (1.0 - part) * share, "verifying diffractions"

@@ -132,9 +132,9 @@ def gain_gradients(
     >>> (found.frequency_db_per_hz * 1e9).round(4).tolist()
     [-0.3102]
     """
-    settings, scene_settings = checked_settings(settings, scene_settings)
-    _require_off(settings, "refraction", "diffuse_reflection")
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    settings, scene_settings = checked_settings(partial, settings, scene_settings)
+    _require_off(settings, "refraction", "diffuse_reflection")
     tx_m, rx_m = checked_positions(partial, tx, rx)
     if np.ndim(tx) != 1:
         raise PositionError(f"tx has shape {np.shape(tx)}: give one transmitter as (3,).")

@@ -62,6 +62,7 @@ class TracedLinks:
     vertices_m : (P, D, 3) float64 array
         Places of the interactions [m]; NaN where there is none.
     settings : TraceSettings
+        With `diffraction` True or False.
     scene_settings : SceneSettings
     """
 
@@ -126,8 +127,8 @@ def trace_links(
     OutputError
         If no temporary file can be written.
     """
-    settings, scene_settings = checked_settings(settings, scene_settings)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    settings, scene_settings = checked_settings(partial, settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, tx, rx)
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
@@ -159,12 +160,14 @@ def trace_links(
 
 
 def checked_settings(
-    settings: TraceSettings | None, scene_settings: SceneSettings | None
+    partial: PartialMap, settings: TraceSettings | None, scene_settings: SceneSettings | None
 ) -> tuple[TraceSettings, SceneSettings]:
     """Put defaults in place of None; raise a SettingsError unless the material covers the frequency."""
     settings = settings_or_default("settings", settings, TraceSettings)
     scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
     scene_settings.material.require_frequency(settings.frequency_hz)
+    if settings.diffraction is None:
+        settings = replace(settings, diffraction=partial.mesh is None)
     return settings, scene_settings
 
 
@@ -188,8 +191,7 @@ def _solver(
     scene = write_scene_of(partial, folder, settings, scene_settings)
     shoot = settings.refraction or settings.diffuse_reflection or (settings.diffraction and not scene.is_plan)
     if shoot or not fast_engine_works():
-        diffraction = scene.is_plan if settings.diffraction is None else settings.diffraction
-        solve = partial_function(_shoot, scene, replace(settings, diffraction=diffraction))
+        solve = partial_function(_shoot, scene, settings)
     else:
         solve = partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
     return solve, RECEIVERS_OF_PLAN if scene.is_plan else RECEIVERS_OF_MESH
