@@ -351,4 +351,4 @@ def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> N
 
 def _warn(sheet: _Sheet, what: str) -> None:
     message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
-    warnings.warn(message, MapWarning, stacklevel=5)
+    warnings.warn(message, MapWarning, stacklevel=6)
