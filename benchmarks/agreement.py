@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import sionna_partial as sp
-from sionna_partial.tracing.diffraction import find_wedges
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, find_wedges
 from sionna_partial.tracing.scene import SceneGeometry, build_scene
 
 Paths = dict[str, NDArray[Any]]
@@ -78,7 +78,7 @@ def link(paths: Paths) -> tuple[sp.LinkState, float]:
 
 
 def meant(partial: sp.PartialMap, tx: NDArray[np.float64], place: NDArray[np.float64], paths: Paths) -> Paths:
-    """Leave out diffracted paths that are not traced: at horizontal edges and open wall ends, and at junctions.
+    """Leave out diffracted paths that are not traced: with many reflections, at horizontal edges, open ends, junctions.
 
     Where three walls or more meet, Sionna RT takes any two of them for a wedge. Only in a sector wider than a
     half-plane there are directions that the walls hide from each other, so both legs must lie in it.
@@ -94,7 +94,8 @@ def meant(partial: sp.PartialMap, tx: NDArray[np.float64], place: NDArray[np.flo
         distance, index = edges.query(points[at + 1, :2])
         legs = points[[at, at + 2], :2] - wedges.edge_m[index]
         inside = (legs @ wedges.normal[index].T > 0.0).any(axis=1).all()
-        kept[k] = distance < 0.01 and inside and 1e-3 < points[at + 1, 2] < geometry.height_m - 1e-3
+        few = len(vertices) <= 1 + MAX_REFLECTIONS
+        kept[k] = few and distance < 0.01 and inside and 1e-3 < points[at + 1, 2] < geometry.height_m - 1e-3
     return {name: values[kept] for name, values in paths.items()}
 
 
