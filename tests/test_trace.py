@@ -252,6 +252,16 @@ def _stock_scene(folder: Path, tx: NDArray[np.float64], rx: NDArray[np.float64])
     return scene
 
 
+def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
+    tx, rx = (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]]
+    trace_links(_room(), tx, rx)
+    assert not caplog.messages
+    trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=1, refraction=True, samples_per_tx=1000))
+    assert caplog.messages == [
+        "refraction: Sionna RT shoots 1000 rays for one receiver after the other, and finds most paths, not all"
+    ]
+
+
 def test_refraction_passes_walls() -> None:
     tx, rx = (1.03, 0.52, 1.5), [[5.02, 0.53, 1.5]]
     without = trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=1, diffraction=False))

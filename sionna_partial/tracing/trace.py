@@ -1,5 +1,6 @@
 """The one door to the path solver: scene + transmitter + receivers -> TracedLinks."""
 
+import logging
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -20,6 +21,8 @@ from sionna_partial.tracing.paths import PathColumns, SolvedPaths
 from sionna_partial.tracing.probe import fast_engine_works
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.stock import stock_paths
+
+_log = logging.getLogger(__name__)
 
 Progress = Callable[[float, str], None]
 """Called with the share of the work done, in [0, 1], and what is being done."""
@@ -189,12 +192,25 @@ def _solver(
 ) -> tuple[Solve, int]:
     """Write the scene, and choose how its paths are found, and for how many receivers at once."""
     scene = write_scene_of(partial, folder, settings, scene_settings)
-    shoot = settings.refraction or settings.diffuse_reflection or (settings.diffraction and not scene.is_plan)
-    if shoot or not fast_engine_works():
+    if _shoots(settings, scene) or not fast_engine_works():
         solve = partial_function(_shoot, scene, settings)
     else:
         solve = partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
     return solve, RECEIVERS_OF_PLAN if scene.is_plan else RECEIVERS_OF_MESH
+
+
+def _shoots(settings: TraceSettings, scene: WrittenScene) -> bool:
+    """Whether the settings ask for paths that only rays find; a warning says so."""
+    wanted = {
+        "refraction": settings.refraction,
+        "diffuse reflection": settings.diffuse_reflection,
+        "diffraction on a mesh": settings.diffraction and not scene.is_plan,
+    }
+    names = [name for name, is_wanted in wanted.items() if is_wanted]
+    if names:
+        message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
+        _log.warning(message, " and ".join(names), settings.samples_per_tx)
+    return bool(names)
 
 
 def _verify(
