@@ -67,6 +67,13 @@ MapArgument = Annotated[
 StrictOption = Annotated[
     bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")
 ]
+HeightBandOption = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LOW HIGH", help="Of a mesh: z between which its surfaces are walls [m].", show_default=False),
+]
+UpOption = Annotated[
+    str | None, typer.Option(metavar="y|z", help="Of a mesh: the axis that points up.", show_default=False)
+]
 MaterialOption = Annotated[
     str, typer.Option(help="ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall.")
 ]
@@ -110,6 +117,8 @@ def predict(
     max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
     predictor: Annotated[str, typer.Option(help="'paper', or a .keras file. Default: the shipped one.")] = "",
     strict: StrictOption = False,
+    height_band: HeightBandOption = None,
+    up: UpOption = None,
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
@@ -119,7 +128,7 @@ def predict(
     trace_settings = TraceSettings(frequency_hz=frequency, max_depth=max_depth)
     from sionna_partial.maps.map_files import load_map
 
-    partial = load_map(map_path, strict=strict)
+    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
     require_writable(out)
     with _progress() as report:
         report(0.0, "loading the predictor")
@@ -151,6 +160,8 @@ def export_scene_command(
     material: MaterialOption = "",
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     strict: StrictOption = False,
+    height_band: HeightBandOption = None,
+    up: UpOption = None,
 ) -> None:
     """Write a map as a scene folder that stock Sionna RT loads."""
     settings = SceneSettings(material=parse_material(material))
@@ -158,7 +169,8 @@ def export_scene_command(
     from sionna_partial.maps.map_files import load_map
     from sionna_partial.tracing.scene import export_scene
 
-    scene = export_scene(load_map(map_path, strict=strict), out, settings, frequency_hz=frequency)
+    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    scene = export_scene(partial, out, settings, frequency_hz=frequency)
     _print_files([scene])
 
 
@@ -168,15 +180,18 @@ def explore(
     home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
     steps: Annotated[list[int], typer.Option(help="Robot steps; may be repeated.")] = [50, 100, 150, 200],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of the home and of the robot.")] = 0,
+    height_band: HeightBandOption = None,
+    up: UpOption = None,
 ) -> None:
     """Explore a home with a robot, and write its partial maps."""
     from sionna_partial.maps.explore import explore as explore_home
     from sionna_partial.maps.homes import make_home
     from sionna_partial.maps.map_files import load_map, save_map
 
-    complete = load_map(home) if home else make_home(seed)
-    maps = {f"steps_{count:03d}.yaml": partial for count, partial in _by_steps(explore_home, complete, steps, seed)}
-    maps["complete.yaml"] = complete
+    complete = load_map(home, height_band_m=height_band, up=up) if home else make_home(seed)
+    suffix = ".yaml" if complete.mesh is None else ".npz"
+    maps = {f"steps_{count:03d}{suffix}": partial for count, partial in _by_steps(explore_home, complete, steps, seed)}
+    maps[f"complete{suffix}"] = complete
     for name, partial in maps.items():
         save_map(partial, out / name)
     _print_files([out / name for name in maps])

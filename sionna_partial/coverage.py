@@ -15,20 +15,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.learning.features import LinkFeatures, link_features
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
-from sionna_partial.tracing.trace import Progress, trace_links
+from sionna_partial.tracing.trace import SHORTEST_M, Progress, checked_settings, nearest_m, trace_links
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
-
-MIN_LEG_M = 0.01
-"""Sionna RT drops path legs shorter than this, so that no receiver stands nearer to the transmitter or a wall [m]."""
 
 WALL_PARTS = 6
 """`wall_parts` says for 6 x 6 parts of each cell where walls are, so that pictures show walls thinner than a cell."""
@@ -107,7 +104,7 @@ def predict_map(
     was not observed (paper, Section III). On a complete map the trace itself is the answer.
 
     Probabilities and gains are those of a receiver that is indoors, as in the paper; `p_indoor` says how likely
-    that is. No receiver stands inside a wall, within 1 cm of one, or at the transmitter (nearer than 1 cm, or than
+    that is. No receiver stands inside a wall, within 1.1 cm of one, or at the transmitter (nearer than 1.1 cm, or than
     the distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
     variables are NaN and link states 255.
 
@@ -149,7 +146,7 @@ def predict_map(
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
     scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
-    scene_settings.material.require_frequency(trace_settings.frequency_hz)
+    trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     tx_m = _transmitter(partial, tx)
     receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
     complete = partial.is_complete
@@ -236,21 +233,21 @@ def _receivers(
     require(rx_height_m < high_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {high_m:g} m.")
     x_m, y_m = _grid_axes(partial, spacing_m)
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
-    nearest_m = max(MIN_LEG_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4 * math.pi))
+    limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
-    far = np.linalg.norm(points - tx_m, axis=-1) >= nearest_m
+    far = np.linalg.norm(points - tx_m, axis=-1) >= limit_m
     valid = far & (cell_state != CellState.WALL)
-    for corner in itertools.product((-MIN_LEG_M, MIN_LEG_M), repeat=2):
+    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
         valid &= partial.state_at(points[..., :2] + corner) != CellState.WALL
     if not valid.any():
-        raise _no_receiver(spacing_m, frequency_hz, nearest_m, near=not far.any())
+        raise _no_receiver(spacing_m, frequency_hz, limit_m, near=not far.any())
     return _Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
-def _no_receiver(spacing_m: float, frequency_hz: float, nearest_m: float, *, near: bool) -> PositionError:
-    if near and nearest_m > MIN_LEG_M:
+def _no_receiver(spacing_m: float, frequency_hz: float, limit_m: float, *, near: bool) -> PositionError:
+    if near and limit_m > SHORTEST_M:
         return PositionError(
-            f"every receiver is within {nearest_m:.3g} m of the transmitter, where Friis' formula does not hold at "
+            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
             f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
         )
     return PositionError(

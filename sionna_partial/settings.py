@@ -157,12 +157,12 @@ class Material:
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """How a map becomes a scene.
+    """How a map becomes a scene. Of a map with a mesh, only the material counts.
 
     Parameters
     ----------
     material : Material
-        Material of walls, floor and ceiling.
+        Material of walls, floor and ceiling, or of those parts of a mesh that name none.
     outline_tolerance_cells : float
         Largest distance of a simplified wall outline from the lattice outline [cells]; twice as much along ragged
         walls, whose face turns to and fro at least once in 10 cells.

@@ -236,15 +236,20 @@ class TestPredict:
 
     def test_strict(self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         read: list[Any] = []
-        monkeypatch.setattr("sionna_partial.maps.map_files.load_map", lambda path, strict: read.append((path, strict)))
+        monkeypatch.setattr(
+            "sionna_partial.maps.map_files.load_map", lambda path, **options: read.append((path, options))
+        )
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
-        run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path, "--strict")
-        assert read == [(tmp_path, False), (tmp_path, True)]
+        run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path, "--strict", "--up", "y", "--height-band", 0.5, 2)
+        assert read == [
+            (tmp_path, {"strict": False, "height_band_m": None, "up": None}),
+            (tmp_path, {"strict": True, "height_band_m": (0.5, 2.0), "up": "y"}),
+        ]
 
     def test_warnings_are_one_line_each(
         self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap
     ) -> None:
-        def read(path: Path, strict: bool) -> PartialMap:
+        def read(path: Path, **_: object) -> PartialMap:
             logging.getLogger("sionna_partial.maps.map_turn").warning("origin yaw %g rad", 0.5)
             with warnings.catch_warnings():
                 warnings.simplefilter("always")

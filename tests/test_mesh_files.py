@@ -108,9 +108,7 @@ def empty_zip() -> bytes:
 def test_no_mesh(tmp_path: Path, suffix: str, content: bytes) -> None:
     path = tmp_path / f"room.{suffix}"
     path.write_bytes(content)
-    message = (
-        rf"path = '{re.escape(str(path))}' (is damaged or not a {suffix.upper()} mesh|holds 0 triangles|holds deg)"
-    )
+    message = rf"path = '{re.escape(str(path))}' (is damaged or no {suffix.upper()} mesh|holds 0 triangles|holds deg)"
     with pytest.raises(MapError, match=message):
         read_mesh(path)
 

@@ -304,6 +304,11 @@ def test_shot_and_exact_paths_agree_where_both_apply() -> None:
         ),
         ((1.0, 1.0, 1.5), [[1.0, 1.0, 1.0], [1.0]], r"rx = .* is not numeric: give x, y, z in metres\."),
         ((1.0, 1.0, 1.5), (1.0, 1.0, 1.0), r"rx has shape \(3,\): give receivers as \(N, 3\)"),
+        (
+            (1.0, 1.0, 1.5),
+            [[2.0, 1.0, 1.0], [1.0, 1.005, 1.5]],
+            r"rx\[1\] = \(1.0, 1.005, 1.5\) is 0.005 m from the transmitter.*: leave out receivers nearer than 0.011 m",
+        ),
     ],
 )
 def test_positions_are_checked(tx: object, rx: object, message: str) -> None:
@@ -322,6 +327,12 @@ def test_frequency_must_suit_the_material() -> None:
         trace_links(
             _room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], scene_settings=SceneSettings(Material(itu="wet_ground"))
         )
+
+
+def test_links_shorter_than_friis_allows_are_refused() -> None:
+    settings = TraceSettings(frequency_hz=10e6)
+    with pytest.raises(PositionError, match=r"is 1.* m from the transmitter.*: leave out receivers nearer than 2.39 m"):
+        trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], settings=settings)
 
 
 def test_progress_ends_at_one() -> None:

@@ -5,7 +5,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import yaml
@@ -46,7 +46,7 @@ def load_map(
     height_band_m: tuple[float, float] | None = None,
     observed: ArrayLike | PartialMap | None = None,
     resolution_m: float | None = None,
-    up: Literal["z", "y"] | None = None,
+    up: str | None = None,
 ) -> PartialMap:
     """Read a map from a file or a scene folder.
 
@@ -62,7 +62,7 @@ def load_map(
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
-        wall.
+        wall. Other files have no such doubts.
     wall_height_m : float or None
         Wall height [m] in place of the file's. For a mesh, the height above its lowest point up to which radios may
         be (by default its highest point), as on roofs.
@@ -97,7 +97,7 @@ def load_map(
         return _read_scene_map(source, wall_height_m, reading)
     if source.suffix.lower() in MESH_SUFFIXES:
         return mesh_map(read_mesh(source, up), reading, wall_height_m)
-    reading.require_unused(source, "none")
+    reading.require_unused(source, "no mesh")
     return _read_grid_file(source, strict=strict, wall_height_m=wall_height_m)
 
 

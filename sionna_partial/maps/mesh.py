@@ -111,6 +111,10 @@ class SceneMesh:
         """Corners (F, 3, 3) of every triangle [m]."""
         return self.vertices_m[self.triangles]
 
+    def used_materials(self, default: Material) -> set[Material]:
+        """Return the materials of its triangles, with `default` in place of None."""
+        return {self.materials[index] or default for index in np.unique(self.material)}
+
     def within(self, area: Any) -> "SceneMesh":
         """Cut the mesh at the border of an area seen from above.
 

@@ -98,7 +98,7 @@ def read_triangles(path: Path, kind: str) -> tuple[NDArray[np.float64], NDArray[
         raise
     except Exception as error:  # decoders fail in many ways on damaged files
         raise MapError(
-            f"path = '{path}' is damaged or not a {kind.upper()} mesh ({error}): export the mesh again."
+            f"path = '{path}' is damaged or no {kind.upper()} mesh ({error}): export the mesh again."
         ) from error
     if not any(len(triangles) for _, triangles in parts):
         raise MapError(f"path = '{path}' holds 0 triangles: give a mesh with surfaces, not points or lines alone.")

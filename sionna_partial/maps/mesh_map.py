@@ -174,6 +174,9 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
         low, high = math.nan, math.nan
     if not -math.inf < low < high < math.inf:
         raise MapError(f"height_band_m = {given!r} is not allowed: give (low, high), z in metres, low < high.")
+    lowest, highest = (float(value) for value in mesh.bounds_m[:, 2])
+    if high < lowest or low > highest:
+        raise MapError(f"height_band_m = {given!r} is outside the mesh, which spans z {lowest:g} to {highest:g} m.")
     return low, high
 
 

@@ -13,7 +13,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.beams import trace_beams
 from sionna_partial.tracing.candidates import Candidates, Wedges, specular_candidates
-from sionna_partial.tracing.diffraction import diffraction_candidates, find_wedges
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, diffraction_candidates, find_wedges
 from sionna_partial.tracing.mesh_candidates import mesh_candidates
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.rays import shoot_rays
@@ -25,8 +25,8 @@ Generator = Callable[[SceneSolver, NDArray[np.float64], NDArray[np.float64]], It
 candidates, the share of the work done, and what is being done."""
 
 
-DIFFRACTION = 8
-"""Sionna RT's `InteractionType.DIFFRACTION`."""
+REFLECTION, DIFFRACTION = 1, 8
+"""Sionna RT's `InteractionType.SPECULAR` and `DIFFRACTION`."""
 
 SAME_EDGE_M = 1e-3
 """Distance from an edge within which a diffraction is at that edge [m]."""
@@ -90,9 +90,10 @@ def write_scene_of(
 
 
 def bends_at(wedges: Wedges, paths: SolvedPaths) -> NDArray[np.bool_]:
-    """Whether each path (P,) diffracts at one of the wedges, if it does at all.
+    """Whether each path (P,) diffracts as exact candidates do, if it does at all.
 
-    Sionna RT's rays diffract at the rims of floor and ceiling and at junctions of walls as well.
+    Sionna RT's rays diffract at the rims of floor and ceiling and at junctions of walls as well, and with any number of
+    reflections around it.
     """
     bent = (paths.interactions == DIFFRACTION).any(axis=1)
     kept = ~bent
@@ -100,7 +101,8 @@ def bends_at(wedges: Wedges, paths: SolvedPaths) -> NDArray[np.bool_]:
         which = (paths.interactions == DIFFRACTION).argmax(axis=1)
         x, y, z = paths.vertices_m[np.arange(len(bent)), which][bent].T
         beside = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))[0] < SAME_EDGE_M
-        kept[bent] = beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
+        few = (paths.interactions[bent] == REFLECTION).sum(axis=1) <= MAX_REFLECTIONS
+        kept[bent] = few & beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
     return kept
 
 

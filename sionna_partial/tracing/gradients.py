@@ -109,7 +109,8 @@ def gain_gradients(
     Raises
     ------
     PositionError
-        For a transmitter or receiver that is not finite, outside the map or inside a wall, or several transmitters.
+        For a transmitter or receiver that is not finite, outside the map or inside a wall, a receiver at the
+        transmitter, or several transmitters.
     SettingsError
         For a frequency that the material does not cover, settings of another kind, or paths that only rays find.
     BackendError
@@ -135,7 +136,7 @@ def gain_gradients(
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
     _require_off(settings, "refraction", "diffuse_reflection")
-    tx_m, rx_m = checked_positions(partial, tx, rx)
+    tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
     if np.ndim(tx) != 1:
         raise PositionError(f"tx has shape {np.shape(tx)}: give one transmitter as (3,).")
     report = progress or (lambda share, message: None)

@@ -183,7 +183,7 @@ def _export_mesh_scene(
     frequency_hz: float,
 ) -> Path:
     material = settings_or_default("settings", settings, SceneSettings).material
-    for used in {mesh.materials[index] or material for index in np.unique(mesh.material)}:
+    for used in mesh.used_materials(material):
         used.require_frequency(frequency_hz)
     x0, y0, x1, y1 = partial.bounds_m
     offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]

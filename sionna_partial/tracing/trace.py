@@ -1,6 +1,7 @@
 """The one door to the path solver: scene + transmitter + receivers -> TracedLinks."""
 
 import logging
+import math
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -10,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -27,6 +28,9 @@ _log = logging.getLogger(__name__)
 Progress = Callable[[float, str], None]
 """Called with the share of the work done, in [0, 1], and what is being done."""
 
+
+SHORTEST_M = 0.011
+"""Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
 
 RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 3_000, 50_000
 """Number of receivers whose paths are found together, which bounds the memory. A mesh has fewer paths, and costs rays
@@ -97,10 +101,12 @@ def trace_links(
     """Trace every path from one or more transmitters to N receivers with Sionna RT.
 
     On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge of the walls
-    (corners, door jambs) and at most two reflections around it are complete: candidates come from exact beams and are
-    verified by Sionna RT's image method. With refraction or diffuse reflection switched on, Sionna RT shoots rays
-    instead, for paths of every kind, which is slow and finds most paths, not all. The answer for a receiver does not
-    depend on the other receivers.
+    (corners, door jambs) and at most two reflections around it are complete, but for legs of 1 cm or less, which Sionna
+    RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays say which
+    chains of planes there are; line of sight and nearly all specular reflections are found. With refraction, diffuse
+    reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver shoots rays instead, receiver by
+    receiver, which is slow and finds most paths, not all. So it is where Sionna RT is another than `contract` expects.
+    The answer for a receiver does not depend on the other receivers.
 
     Parameters
     ----------
@@ -122,9 +128,10 @@ def trace_links(
     Raises
     ------
     PositionError
-        For a transmitter or receiver that is not finite, outside the map or inside a wall.
+        For a transmitter or receiver that is not finite, outside the map or inside a wall, or a receiver within 1.1 cm
+        of a transmitter (at low frequencies, where Friis' formula is above 0 dB).
     SettingsError
-        For a frequency that the material does not cover, or settings of another kind.
+        For a frequency that a material does not cover, or settings of another kind.
     BackendError
         If LLVM or Sionna RT cannot be used.
     OutputError
@@ -132,7 +139,7 @@ def trace_links(
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
-    tx_m, rx_m = checked_positions(partial, tx, rx)
+    tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
     shift = np.array([*partial.origin_m, 0.0])
@@ -165,17 +172,24 @@ def trace_links(
 def checked_settings(
     partial: PartialMap, settings: TraceSettings | None, scene_settings: SceneSettings | None
 ) -> tuple[TraceSettings, SceneSettings]:
-    """Put defaults in place of None; raise a SettingsError unless the material covers the frequency."""
+    """Put defaults in place of None; raise a SettingsError unless all materials cover the frequency."""
     settings = settings_or_default("settings", settings, TraceSettings)
     scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
-    scene_settings.material.require_frequency(settings.frequency_hz)
+    default = scene_settings.material
+    for material in {default} if partial.mesh is None else partial.mesh.used_materials(default):
+        material.require_frequency(settings.frequency_hz)
     if settings.diffraction is None:
         settings = replace(settings, diffraction=partial.mesh is None)
     return settings, scene_settings
 
 
+def nearest_m(frequency_hz: float) -> float:
+    """Shortest distance of a link [m]: Sionna RT takes none of 1 cm, and Friis' formula is above 0 dB nearer by."""
+    return max(SHORTEST_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi))
+
+
 def checked_positions(
-    partial: PartialMap, tx: ArrayLike, rx: ArrayLike
+    partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
     tx_m = partial.require_positions("tx", tx)
@@ -184,7 +198,16 @@ def checked_positions(
     rx_m = partial.require_positions("rx", rx)
     if rx_m.ndim != 2:
         raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
-    return tx_m.reshape(-1, 3), rx_m
+    tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
+    for place in tx_m:
+        distance_m = np.linalg.norm(rx_m - place, axis=1)
+        if distance_m.min(initial=math.inf) < limit_m:
+            index = int(distance_m.argmin())
+            raise PositionError(
+                f"rx[{index}] = {tuple(rx_m[index].tolist())} is {distance_m[index]:.3g} m from the transmitter, where "
+                f"the path gain has no meaning: leave out receivers nearer than {limit_m:.3g} m."
+            )
+    return tx_m, rx_m
 
 
 def _solver(
