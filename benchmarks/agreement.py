@@ -17,6 +17,9 @@ Paths = dict[str, NDArray[Any]]
 SAME_DELAY_S = 1e-11
 """Paths to one receiver whose delays differ by less are the same [s]: 3 mm."""
 
+SAME_POINT_M = 0.03
+"""Largest distance between the points of equal paths [m]. Sionna RT mirrors at either of two nearly coplanar walls."""
+
 TOUCH_M = 2e-3
 """Distance from the ends of a leg within which it may touch a wall [m]."""
 
@@ -49,7 +52,7 @@ def agreement(
     shift = np.array([*partial.origin_m, 0.0])
     count = dict.fromkeys(("links", "truth", "found", "extra", "real", "leaks", "same_state", "same_gain"), 0)
     for place, ours, theirs in zip(rx, found, truth, strict=True):
-        pairs = pair_delays(ours["delay_s"], theirs["delay_s"])
+        pairs = pair_paths(ours, theirs)
         extra, alone = (np.setdiff1d(np.arange(len(p["a"])), k) for p, k in zip((ours, theirs), pairs.T, strict=True))
         real, sound = np.zeros(len(extra), bool), np.ones(len(theirs["a"]), bool)
         if geometry is not None:
@@ -99,16 +102,32 @@ def meant(partial: sp.PartialMap, tx: NDArray[np.float64], place: NDArray[np.flo
     return {name: values[kept] for name, values in paths.items()}
 
 
-def pair_delays(first_s: NDArray[np.float64], second_s: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Match delays one to one: indices (M, 2)."""
-    first, second = np.argsort(first_s), np.argsort(second_s)
-    pairs, i, k = [], 0, 0
-    while i < len(first) and k < len(second):
-        difference = first_s[first[i]] - second_s[second[k]]
-        if abs(difference) < SAME_DELAY_S:
-            pairs.append((first[i], second[k]))
-        i, k = i + int(difference < SAME_DELAY_S), k + int(difference > -SAME_DELAY_S)
+def pair_paths(first: Paths, second: Paths) -> NDArray[np.intp]:
+    """Match paths of one receiver one to one, nearest first: indices (M, 2).
+
+    Paths are the same if their interactions are, their delays within `SAME_DELAY_S` and all points within
+    `SAME_POINT_M`: in dense homes many paths have nearly equal delays.
+    """
+    deep = max(each["interactions"].shape[1] for each in (first, second))
+    kinds, points = zip(*(_padded(each, deep) for each in (first, second)), strict=True)
+    one, other = np.nonzero(np.abs(first["delay_s"][:, None] - second["delay_s"]) < SAME_DELAY_S)
+    apart = np.abs(points[0][one] - points[1][other]).max(axis=1, initial=0.0)
+    same = (kinds[0][one] == kinds[1][other]).all(axis=1) & (apart < SAME_POINT_M)
+    pairs, taken = [], (set(), set())
+    for k in np.flatnonzero(same)[np.argsort(apart[same], kind="stable")]:
+        if one[k] not in taken[0] and other[k] not in taken[1]:
+            pairs.append((one[k], other[k]))
+            taken[0].add(one[k])
+            taken[1].add(other[k])
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
+
+
+def _padded(paths: Paths, deep: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Interactions (P, D) and their places (P, 3 D), 0 where there is none."""
+    missing = deep - paths["interactions"].shape[1]
+    kinds = np.pad(paths["interactions"], ((0, 0), (0, missing)))
+    places = np.nan_to_num(np.pad(paths["vertices_m"], ((0, 0), (0, missing), (0, 0))))
+    return kinds, places.reshape(len(kinds), 3 * deep)
 
 
 def is_real(

@@ -87,9 +87,7 @@ def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
     ground = SceneMesh(solid.vertices, solid.faces, np.zeros(12, int), (sp.Material(itu="wet_ground"),))
     partial = mesh_map(ground, MeshReading(resolution_m=0.1))
     for call in (sp.trace_links, sp.gain_gradients):
-        with pytest.raises(
-            SettingsError, match=r"^frequency_hz = 2.* 'wet_ground' is defined for 1-10 GHz"
-        ):
+        with pytest.raises(SettingsError, match=r"^frequency_hz = 2.* 'wet_ground' is defined for 1-10 GHz"):
             call(partial, TX, RX)
     with pytest.raises(SettingsError, match=r"^frequency_hz = 2.* 'wet_ground' is defined for 1-10 GHz"):
         sp.predict_map(partial, TX)
