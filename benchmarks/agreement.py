@@ -38,7 +38,7 @@ def agreement(
 
     Stock Sionna RT misses paths, because no ray met their chain of walls or because its rays travel in packets, and
     lets some through a wall at a corner. So every path that only one side has is checked by itself, in double
-    precision: its legs must cross no wall. On a mesh no path is checked, and each one of truth counts as real.
+    precision: its legs must cross no wall, or no triangle of a mesh.
 
     Returns
     -------
@@ -48,17 +48,16 @@ def agreement(
         `same_state`, `same_gain`: links with equal state, and with gains within 0.5 dB, where every real path counts
         for the truth.
     """
-    geometry = build_scene(partial) if partial.mesh is None else None
     shift = np.array([*partial.origin_m, 0.0])
+    geometry = build_scene(partial) if partial.mesh is None else partial.mesh.corners_m - shift
     count = dict.fromkeys(("links", "truth", "found", "extra", "real", "leaks", "same_state", "same_gain"), 0)
     for place, ours, theirs in zip(rx, found, truth, strict=True):
         pairs = pair_paths(ours, theirs)
         extra, alone = (np.setdiff1d(np.arange(len(p["a"])), k) for p, k in zip((ours, theirs), pairs.T, strict=True))
         real, sound = np.zeros(len(extra), bool), np.ones(len(theirs["a"]), bool)
-        if geometry is not None:
-            ends = tx - shift, place - shift
-            real[:] = [is_real(geometry, *ends, each - shift) for each in ours["vertices_m"][extra]]
-            sound[alone] = [is_real(geometry, *ends, each - shift) for each in theirs["vertices_m"][alone]]
+        ends = tx - shift, place - shift
+        real[:] = [is_real(geometry, *ends, each - shift) for each in ours["vertices_m"][extra]]
+        sound[alone] = [is_real(geometry, *ends, each - shift) for each in theirs["vertices_m"][alone]]
         best = {name: np.concatenate([theirs[name][sound], ours[name][extra[real]]]) for name in ("a", "interactions")}
         (state, gain_db), (true_state, true_gain_db) = link(ours), link(best)
         count["links"] += 1
@@ -131,19 +130,44 @@ def _padded(paths: Paths, deep: int) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def is_real(
-    geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], vertices_m: NDArray[np.float64]
+    geometry: SceneGeometry | NDArray[np.float64],
+    tx: NDArray[np.float64],
+    rx: NDArray[np.float64],
+    vertices_m: NDArray[np.float64],
 ) -> bool:
-    """Check one path in double precision: its legs cross no wall but where they end."""
+    """Check one path in double precision: its legs cross no wall of a plan, or no triangle (F, 3, 3), within them."""
     points = np.concatenate([tx[None], vertices_m[np.isfinite(vertices_m[:, 0])], rx[None]])
-    a, b = geometry.walls_m[:, 0], geometry.walls_m[:, 1]
-    wall = b - a
-    for start, stop in zip(points[:-1, :2], points[1:, :2], strict=True):
-        way = stop - start
-        area = way[0] * wall[:, 1] - way[1] * wall[:, 0]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            along = ((a - start)[:, 0] * wall[:, 1] - (a - start)[:, 1] * wall[:, 0]) / area
-            across = ((a - start)[:, 0] * way[1] - (a - start)[:, 1] * way[0]) / area
-        margin = TOUCH_M / max(float(np.hypot(*way)), TOUCH_M)
-        if ((along > margin) & (along < 1 - margin) & (across > 0) & (across < 1)).any():
+    for start, way in zip(points[:-1], np.diff(points, axis=0), strict=True):
+        margin = TOUCH_M / max(float(np.linalg.norm(way)), TOUCH_M)
+        along = (
+            _plan_crossings(geometry, start, way)
+            if isinstance(geometry, SceneGeometry)
+            else _hits(geometry, start, way)
+        )
+        if ((along > margin) & (along < 1 - margin)).any():
             return False
     return True
+
+
+def _plan_crossings(
+    geometry: SceneGeometry, start: NDArray[np.float64], way: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Shares of a leg at which it crosses walls, seen from above."""
+    wall = geometry.walls_m[:, 1] - geometry.walls_m[:, 0]
+    x, y = (geometry.walls_m[:, 0] - start[:2]).T
+    area = way[0] * wall[:, 1] - way[1] * wall[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along, across = (x * wall[:, 1] - y * wall[:, 0]) / area, (x * way[1] - y * way[0]) / area
+    return along[(across > 0) & (across < 1)]
+
+
+def _hits(corners: NDArray[np.float64], start: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Shares of a leg at which it passes triangles (Moeller and Trumbore 1997)."""
+    first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], start - corners[:, 0]
+    normal = np.cross(way, second)
+    side = np.cross(offset, first)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / (first * normal).sum(axis=1)
+        u, v = (offset * normal).sum(axis=1) * scale, (side * way).sum(axis=1) * scale
+        along = (side * second).sum(axis=1) * scale
+    return along[(u > 0) & (v > 0) & (u + v < 1)]

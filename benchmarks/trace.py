@@ -24,7 +24,7 @@ import trimesh
 from agreement import Paths, agreement, meant, paths_of
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from stock import isolated, limit_cores, peak_memory_gb, trace_stock
+from stock import isolated, limit_cores, peak_memory_gb, trace_stock, true_paths
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
@@ -98,7 +98,7 @@ def _compare(
     runs["stock, all at once"] = isolated(
         trace_stock, folder, tx, rx, tile=len(rx), rays=STOCK_RAYS, table=STOCK_TABLE, cores=1, **options
     )
-    tiles = isolated(trace_stock, folder, tx, rx[sample], **options)
+    tiles = isolated(true_paths, folder, tx, rx[sample], **options)
 
     def comparable(paths: list[Paths]) -> list[Paths]:
         if not settings.diffraction:
@@ -130,7 +130,7 @@ def _compare(
     print(
         f"truth: {match['truth']} paths, and {tiles['repeats']} listed twice, {match['leaks']} through a wall; ours has"
     )
-    print(f"{match['extra']} more, of which {match['real']} are confirmed to cross no wall", flush=True)
+    print(f"{match['extra']} more, of which {match['real']} are confirmed to cross nothing", flush=True)
 
 
 def receivers(partial: sp.PartialMap, tx: NDArray[np.float64], count: int) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from agreement import agreement, meant, paths_of
-from stock import isolated, trace_stock
+from stock import isolated, true_paths
 
 import sionna_partial as sp
 
@@ -66,7 +66,7 @@ def compare(partial: sp.PartialMap, receivers: int, rays: int, *, diffraction: b
     links = sp.trace_links(partial, tx, rx, settings=sp.TraceSettings(max_depth=depth, diffraction=diffraction))
     with TemporaryDirectory() as folder:
         sp.export_scene(partial, folder + "/scene")
-        stock = isolated(trace_stock, folder + "/scene", tx, rx, rays=rays, max_depth=depth, diffraction=diffraction)
+        stock = isolated(true_paths, folder + "/scene", tx, rx, rays=rays, max_depth=depth, diffraction=diffraction)
     truth = [meant(partial, tx, place, paths) for place, paths in zip(rx, stock["paths"], strict=True)]
     return agreement(partial, tx, rx, paths_of(links), truth) | {"twice": stock["repeats"]}
 

@@ -201,3 +201,18 @@ class TestTransmitters:
     def test_the_faulty_one_is_named(self) -> None:
         with pytest.raises(PositionError, match=r"^tx\[1\] = \(0.05, 1.0, 1.5\) is inside a wall"):
             trace_links(_room(), [(1.0, 1.0, 1.5), (0.05, 1.0, 1.5)], [[2.0, 1.0, 1.5]])
+
+
+def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:
+    """Sionna RT makes a path longer that has fewer interactions after its diffraction than others in its buffer."""
+    walls = drawn(
+        "............. .###########. .#....#....#. .#....#....#. .#.........#. .###########. .............", 0.5
+    )
+    tx, rx = np.array([1.3, 1.7, 1.2]), np.array([[4.4, 2.2, 1.5], [3.9, 1.4, 1.9]])
+    shallow, deep = (trace_links(walls, tx, rx, settings=TraceSettings(max_depth=depth)) for depth in (2, 3))
+    bent = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
+    assert len(bent) > 3
+    for path in bent:
+        places = np.abs(deep.vertices_m[:, :2] - shallow.vertices_m[path]).max(axis=(1, 2))
+        same = (deep.path_rx == shallow.path_rx[path]) & (deep.interactions[:, 2] == 0) & (places < 1e-4)
+        assert abs(deep.a[same]) == pytest.approx(abs(shallow.a[path]), rel=1e-3)
