@@ -6,7 +6,7 @@ the receivers. Run it with
 
     python benchmarks/trace.py --out benchmark-output
 
-which takes about half an hour on two cores; `--only growth`, for instance, runs one part.
+which takes half an hour on two cores; `--only growth`, for instance, runs one part.
 """
 
 import argparse
@@ -41,13 +41,13 @@ def main() -> None:
     parser.add_argument("--maps", nargs="+", default=["house/complete", "house/step100"], help="below scenes/")
     parser.add_argument("--receivers", type=int, default=3000)
     parser.add_argument("--sample", type=int, default=100, help="receivers in the sample for truth")
-    parser.add_argument("--only", choices=["plan", "mesh", "predict", "first", "growth"])
+    parser.add_argument("--only", choices=["reflections", "diffraction", "mesh", "predict", "first", "growth"])
     arguments = parser.parse_args()
     arguments.out.mkdir(parents=True, exist_ok=True)
     for name in arguments.maps:
-        if arguments.only in (None, "plan"):
-            for diffraction in (False, True):
-                compare(name, arguments.receivers, arguments.sample, diffraction=diffraction)
+        for kind in ("reflections", "diffraction"):
+            if arguments.only in (None, kind):
+                compare(name, arguments.receivers, arguments.sample, diffraction=kind == "diffraction")
         if arguments.only in (None, "mesh"):
             compare_mesh(name, arguments.receivers, arguments.sample)
         if arguments.only in (None, "predict"):
