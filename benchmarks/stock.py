@@ -2,9 +2,10 @@
 
 import multiprocessing
 import os
-import resource
+import re
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -128,5 +129,6 @@ def limit_cores(cores: int | None) -> None:
 
 
 def peak_memory_gb() -> float:
-    """Largest resident memory of this process so far [GB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    """Largest resident memory of this process so far [GB]; `getrusage` would count the parent's at the fork."""
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return int(re.search(r"VmHWM:\s+(\d+) kB", status)[1]) / 1e6
