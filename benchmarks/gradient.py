@@ -32,6 +32,8 @@ from sionna_partial.tracing.solver import Offsets, SceneSolver
 REACHES = (0.01, 0.01, 0.025, 0.01, 0.01, 1e-4, 3e7)
 """How far each parameter is moved to either side, in the order of `Offsets`: its own unit."""
 
+SETTINGS = sp.TraceSettings(diffraction=True)
+
 POINTS = 25
 DEGREE = 4
 
@@ -132,8 +134,8 @@ def receivers(partial: sp.PartialMap, spacing_m: float) -> NDArray[np.float64]:
 
 
 def moved_settings(name: str, step: float) -> tuple[sp.TraceSettings, sp.SceneSettings]:
-    """Move one parameter of the default settings by a step."""
-    settings, material = sp.TraceSettings(), sp.Material()
+    """Move one parameter by a step."""
+    settings, material = SETTINGS, sp.Material()
     if name == "frequency_hz":
         settings = replace(settings, frequency_hz=settings.frequency_hz + step)
     elif hasattr(material, name):
@@ -167,7 +169,7 @@ def paths(
 ) -> Iterator[Candidates]:
     """Give the candidates that are paths, block by block."""
     with tempfile.TemporaryDirectory() as folder:
-        written = write_scene_of(partial, Path(folder), sp.TraceSettings(), sp.SceneSettings())
+        written = write_scene_of(partial, Path(folder), SETTINGS, sp.SceneSettings())
         for candidates, *_ in written.candidates(solver, tx, rx):
             yield candidates.rows(solver.verify_rows(candidates, tx, rx)[1])
 
