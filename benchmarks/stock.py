@@ -66,7 +66,7 @@ def true_paths(folder: str, tx: NDArray[np.float64], rx: NDArray[np.float64], **
     """Run `trace_stock` for the truth: with diffraction, each diffracted path is taken from a run of just its depth.
 
     Sionna RT 2.2 counts the way from the last reflection twice for a path that has fewer interactions than the largest
-    depth allows, and reflections after a diffraction: it is up to 9 dB too weak.
+    depth allows, and reflections after a diffraction: it is some dB too weak.
     """
     result = trace_stock(folder, tx, rx, **options)
     if not options["diffraction"]:

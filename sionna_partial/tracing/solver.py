@@ -129,7 +129,7 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
     """Put the receiver where a path has no more interactions.
 
     There `ImageMethod` leaves images of the edge, and `FieldCalculator` 2.2 takes the first of them for a place on the
-    way from the edge: a path with fewer interactions than others in its buffer came out longer, and up to 9 dB weaker.
+    way from the edge: a path with fewer interactions than others in its buffer came out longer, and some dB weaker.
     """
     import drjit as dr
     import mitsuba as mi

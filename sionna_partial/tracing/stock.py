@@ -40,7 +40,7 @@ def stock_paths(
     """Find paths of every enabled kind by shooting rays, receiver by receiver.
 
     Most paths are found, not all: the more rays, the more. Sionna RT 2.2 takes paths that are reflected after a
-    diffraction, and have fewer than `max_depth` interactions, for longer than they are, and up to 9 dB too weak.
+    diffraction, and have fewer than `max_depth` interactions, for longer than they are, and some dB too weak.
 
     Parameters
     ----------
