@@ -170,4 +170,4 @@ def _hits(corners: NDArray[np.float64], start: NDArray[np.float64], way: NDArray
         scale = 1.0 / (first * normal).sum(axis=1)
         u, v = (offset * normal).sum(axis=1) * scale, (side * way).sum(axis=1) * scale
         along = (side * second).sum(axis=1) * scale
-    return along[(u > 0) & (v > 0) & (u + v < 1)]
+        return along[(u > 0) & (v > 0) & (u + v < 1)]

@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("--rays", type=int, default=1_000_000)
     arguments = parser.parse_args()
     homes = [(f"home {seed}", sp.make_home(seed)) for seed in arguments.seeds]
-    homes += [(path.stem if path.suffix else path.name, sp.load_map(path)) for path in arguments.maps]
+    homes += [(path.parent.name if path.suffix else path.name, sp.load_map(path)) for path in arguments.maps]
     for diffraction in (False, True):
         print(f"\n{'one diffraction, depth 3' if diffraction else 'specular, depth 6'}")
         print(f"{'map':22}{'truth':>8}{'recall':>9}{'state':>8}{'gain':>8}" + "".join(f"{c:>8}" for c in COLUMNS))
