@@ -24,7 +24,7 @@ PARTS = {
 def _candidates(
     geometry: SceneGeometry, tx: NDArray[np.float64] = TX, rx: NDArray[np.float64] = RX, max_depth: int = 3
 ) -> Candidates:
-    beams = trace_beams(geometry.walls_m, tx[:2], rx[:, :2], max_depth)
+    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], max_depth)
     candidates, share = next(specular_candidates(beams, geometry, tx, rx, max_depth))
     assert share == 1.0
     return candidates
@@ -109,7 +109,7 @@ class TestSpecularCandidates:
     def test_blocks_together_hold_what_one_block_holds(self) -> None:
         geometry = PARTS["floor and ceiling"]
         whole = _candidates(geometry)
-        beams = trace_beams(geometry.walls_m, TX[:2], RX[:, :2], 3)
+        beams = trace_beams(geometry.plan, TX[:2], RX[:, :2], 3)
         parts, shares = zip(*specular_candidates(beams, geometry, TX, RX, 3, pairs_per_block=3), strict=True)
         assert len(parts) > 3
         assert list(shares) == sorted(shares)

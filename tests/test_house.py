@@ -20,11 +20,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 MODULES = (
-    *("constants", "errors", "resources", "settings", "files", "llvm", "llvm_probe"),
+    *("constants", "errors", "resources", "settings", "files", "planar", "llvm", "llvm_probe"),
     *("maps.mesh_cut", "maps.mesh", "maps.partial_map", "maps.map_turn", "maps.ros_map"),
     *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.homes", "maps.explore"),
     *("walls.lines", "walls.cells", "walls.chains", "walls.bridges", "walls.graph", "walls.outlines"),
-    *("tracing.scene", "tracing.plan", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
+    *("tracing.plan", "tracing.scene", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
     *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.gradients"),

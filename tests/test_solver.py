@@ -27,7 +27,7 @@ def _solver(geometry: SceneGeometry, folder: Path) -> SceneSolver:
 
 
 def _specular(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
-    beams = trace_beams(geometry.walls_m, tx[:2], rx[:, :2], depth)
+    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], depth)
     return next(specular_candidates(beams, geometry, tx, rx, depth))[0]
 
 

@@ -77,7 +77,7 @@ class TestStockPaths:
     def test_finds_the_paths_of_exact_beams(self, room_xml: Path) -> None:
         settings = TraceSettings(max_depth=2, samples_per_tx=100_000)
         geometry, solver = build_scene(_room()), SceneSolver(room_xml, SHAPES, settings)
-        beams = trace_beams(geometry.walls_m, TX[:2], RX[:, :2], settings.max_depth)
+        beams = trace_beams(geometry.plan, TX[:2], RX[:, :2], settings.max_depth)
         blocks = specular_candidates(beams, geometry, TX, RX, settings.max_depth)
         exact = join_paths([solver.verify(block, TX, RX) for block, _ in blocks], settings.max_depth)
         shot = _solve(room_xml, settings, TX, RX)

@@ -48,7 +48,7 @@ LATTICE = np.array([[x, y, 1.2] for x in (0.5, 1.0, 2.0, 4.0, 5.0, 5.5) for y in
 
 def _trace(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], folder: Path) -> SolvedPaths:
     solver = SceneSolver(write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, TraceSettings())
-    beams = trace_beams(geometry.walls_m, tx[:2], rx[:, :2], 2)
+    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], 2)
     blocks = specular_candidates(beams, geometry, tx, rx, 2)
     return join_paths([solver.verify(block, tx, rx) for block, _ in blocks], 2)
 

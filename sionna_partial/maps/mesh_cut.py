@@ -10,6 +10,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from sionna_partial.planar import cross
+
 BORDER_M = 1e-5
 """Distance within which a surface lies on a border, and stays [m]: float32 files round that much."""
 
@@ -210,12 +212,8 @@ def _seen_from_above(flat_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     return edges[rows, longest], np.abs(_doubled_area(flat_m)) <= UPRIGHT_M * lengths[rows, longest]
 
 
-def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    return first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-
-
 def _doubled_area(flat_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _cross(flat_m[:, 1] - flat_m[:, 0], flat_m[:, 2] - flat_m[:, 0])
+    return cross(flat_m[:, 1] - flat_m[:, 0], flat_m[:, 2] - flat_m[:, 0])
 
 
 def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
@@ -228,8 +226,8 @@ def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Tr
     first, second, third = corners_m[source].transpose(1, 0, 2)
     doubled = _doubled_area(corners_m[source][..., :2])
     offset = flat - first[:, None, :2]
-    along_second = _cross(offset, (third - first)[:, None, :2]) / doubled[:, None]
-    along_third = _cross((second - first)[:, None, :2], offset) / doubled[:, None]
+    along_second = cross(offset, (third - first)[:, None, :2]) / doubled[:, None]
+    along_third = cross((second - first)[:, None, :2], offset) / doubled[:, None]
     height = first[:, 2:] + along_second * (second - first)[:, 2:] + along_third * (third - first)[:, 2:]
     cut = np.concatenate([flat, height[..., None]], axis=2)
     cut[doubled < 0] = cut[doubled < 0][:, ::-1]
@@ -281,15 +279,15 @@ def _border_stops(ends_m: NDArray[np.float64], area: Any) -> tuple[NDArray[np.in
     start, way = ends_m[line, 0], ends_m[line, 1] - ends_m[line, 0]
     border = edges[edge, 1] - edges[edge, 0]
     offset = edges[edge, 0] - start
-    doubled = _cross(way, border)
+    doubled = cross(way, border)
     lengths = np.linalg.norm(way, axis=1)
     slanted = np.abs(doubled) > 1e-9 * lengths * np.linalg.norm(border, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        crossing, along = _cross(offset, border) / doubled, _cross(offset, way) / doubled
+        crossing, along = cross(offset, border) / doubled, cross(offset, way) / doubled
     crossed = slanted & (along >= 0) & (along <= 1)
     lines, shares = [line[crossed]], [crossing[crossed]]
     for corner in (offset, offset + border):
-        close = np.abs(_cross(way, corner)) <= BORDER_M * lengths
+        close = np.abs(cross(way, corner)) <= BORDER_M * lengths
         lines.append(line[close])
         shares.append((way * corner).sum(axis=1)[close] / lengths[close] ** 2)
     line, share = np.concatenate(lines), np.concatenate(shares)

@@ -16,6 +16,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh import SceneMesh
 from sionna_partial.maps.mesh_cut import BORDER_M, clip_slab
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.planar import span_in_strip
 
 DEFAULT_BAND_M = (1.0, 1.8)
 """Height above the lowest point of a mesh in which surfaces are walls [m]: above tables, below the lintels of doors."""
@@ -267,7 +268,7 @@ def _mark_cells(
         for row in range(max(first, 0), min(last, ny - 1) + 1):
             low = -np.inf if row == first else float(row)
             high = np.inf if row == last else row + 1.0
-            left, right = _width_between(corners, low, high)
+            left, right = span_in_strip(corners, low, high)
             if left > right:
                 continue
             start, end = _reached(left, right, margin, upper)
@@ -281,21 +282,3 @@ def _reached(low: float, high: float, margin: float, upper: bool) -> tuple[int, 
     if last < first:
         return (first, first) if upper else (last, last)
     return first, last
-
-
-@njit(cache=True)
-def _width_between(
-    corners: NDArray[np.float64], low: float, high: float
-) -> tuple[float, float]:  # pragma: no cover - compiled
-    """Smallest and largest x of a convex polygon (n, 2) where low <= y <= high."""
-    left, right = np.inf, -np.inf
-    for here in range(len(corners)):
-        x, y = corners[here]
-        next_x, next_y = corners[(here + 1) % len(corners)]
-        if low <= y <= high:
-            left, right = min(left, x), max(right, x)
-        for limit in (low, high):
-            if min(y, next_y) < limit < max(y, next_y):
-                crossing = x + (limit - y) / (next_y - y) * (next_x - x)
-                left, right = min(left, crossing), max(right, crossing)
-    return left, right

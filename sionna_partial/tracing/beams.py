@@ -17,7 +17,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow, prepare_plan
+from sionna_partial.planar import span_in_strip
+from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow
 
 TOLERANCE_M = 1e-4
 """Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that
@@ -54,15 +55,12 @@ class Beams:
     pair_rx: NDArray[np.int32]
 
 
-def trace_beams(
-    walls_m: NDArray[np.float64], tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], max_depth: int
-) -> Beams:
+def trace_beams(plan: Plan, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], max_depth: int) -> Beams:
     """Find every chain of at most `max_depth` walls and the receivers it can reach, seen from above.
 
     Parameters
     ----------
-    walls_m : (S, 2, 2) array
-        End points of the wall segments [m].
+    plan : Plan
     tx_m : (2,) array
         Transmitter [m].
     rx_m : (N, 2) array
@@ -70,7 +68,7 @@ def trace_beams(
     max_depth : int
         Largest number of wall reflections.
     """
-    return trace_beams_in(prepare_plan(walls_m), bin_points(rx_m), tx_m[None], np.array([max_depth]))
+    return trace_beams_in(plan, bin_points(rx_m), tx_m[None], np.array([max_depth]))
 
 
 def trace_beams_in(
@@ -271,7 +269,7 @@ def _add_points(beam, reflected, piece, points, bins, grid, node, pair, pairs): 
     first = max(0, int(np.floor((low - y0) / edge)))
     last = min(rows - 1, int(np.floor((high - y0) / edge)))
     for row in range(first, last + 1):
-        left, right = _span(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
+        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
         start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
         stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
         if start > stop:
@@ -319,19 +317,3 @@ def _inward_edges(corner):  # type: ignore[no-untyped-def]
             normal[k, 0], normal[k, 1] = dy / length, -dx / length
             offset[k] = normal[k, 0] * corner[k, 0] + normal[k, 1] * corner[k, 1]
     return normal, offset
-
-
-@njit(cache=True)
-def _span(corner, low, high):  # type: ignore[no-untyped-def]
-    """Smallest and largest x of a convex quadrilateral within the strip low <= y <= high."""
-    left, right = np.inf, -np.inf
-    for k in range(4):
-        px, py = corner[k, 0], corner[k, 1]
-        qx, qy = corner[(k + 1) % 4, 0], corner[(k + 1) % 4, 1]
-        if low <= py <= high:
-            left, right = min(left, px), max(right, px)
-        for level in (low, high):
-            if (py - level) * (qy - level) < 0.0:
-                x = px + (level - py) / (qy - py) * (qx - px)
-                left, right = min(left, x), max(right, x)
-    return left, right

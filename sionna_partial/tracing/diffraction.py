@@ -24,7 +24,7 @@ from sionna_partial.tracing.candidates import (
     merge_heights,
     unfold,
 )
-from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow, prepare_plan
+from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow
 from sionna_partial.tracing.scene import SceneGeometry
 
 MAX_REFLECTIONS = 2
@@ -125,7 +125,7 @@ def diffraction_candidates(
     walls_m = geometry.walls_m
     flats = (geometry.floor_face >= 0, geometry.ceiling_face >= 0)
     normals = wedges.normal[: len(wedges.edge_m)].reshape(-1, 4)
-    plan, receivers = prepare_plan(walls_m), bin_points(rx_m[:, :2])
+    plan, receivers = geometry.plan, bin_points(rx_m[:, :2])
     arrivals = _arrivals(plan, walls_m, wedges.edge_m, tx_m, reflections)
     reached = np.flatnonzero(np.diff(arrivals.start))
     for first in range(0, len(reached), _EDGES_AT_ONCE):

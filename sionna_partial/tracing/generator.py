@@ -68,6 +68,7 @@ def write_scene_of(
     folder : Path
         An existing folder.
     settings : TraceSettings
+        With `diffraction` True or False: `checked_settings` puts one of them in place of None.
     scene_settings : SceneSettings
     """
     if partial.mesh is not None:
@@ -116,7 +117,7 @@ def _plan_candidates(
 ) -> Iterator[tuple[Candidates, float, str]]:
     """Exact candidates of an extruded floor plan: beams, then beams over edges."""
     part = 0.2 if settings.diffraction else 1.0
-    beams = trace_beams(geometry.walls_m, tx_m[:2], rx_m[:, :2], settings.max_depth)
+    beams = trace_beams(geometry.plan, tx_m[:2], rx_m[:, :2], settings.max_depth)
     for candidates, share in specular_candidates(beams, geometry, tx_m, rx_m, settings.max_depth):
         yield candidates, part * share, "verifying reflections"
     if not settings.diffraction:

@@ -10,6 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sionna_partial.planar import span_in_strip
+
 PLANE_TOLERANCE_M = 1e-4
 """Distance of corners from a plane [m] up to which a face lies in it. Vertices are single precision."""
 
@@ -23,8 +25,7 @@ _FACE_TOLERANCE_M = 1e-3
 class MeshPlanes(NamedTuple):
     """Faces of a mesh, grouped by plane, with the faces of each plane sorted into square bins.
 
-    A point lies in a plane where ``normal @ point == offset_m``. No other face shares a plane with
-    faces of zero area.
+    A point lies in a plane where ``normal @ point == offset_m``. A face without area has a plane of its own.
 
     Parameters
     ----------
@@ -42,6 +43,8 @@ class MeshPlanes(NamedTuple):
         Number of bins in a row, and the first bin, of each plane.
     start, face : (B + 1,) int64 and (K,) int32 arrays
         Faces that reach into each bin, one bin after the other.
+    corner_m : (F, 3, 2) float64 array
+        Corners of the faces in the coordinates of their planes [m].
     """
 
     plane: NDArray[np.int32]
@@ -178,11 +181,11 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
             items, place = np.empty(total[-1], np.int32), start.copy()
         for f in range(len(plane)):
             p, margin = plane[f], 2.0 * _FACE_TOLERANCE_M
-            x, y = corner[f, :, 0] - low[p, 0], corner[f, :, 1] - low[p, 1]
+            flat = corner[f] - low[p]
             rows = (first_bin[p + 1] - first_bin[p]) // columns[p]
-            bottom, top = int((y.min() - margin) / edge[p]), int((y.max() + margin) / edge[p])
+            bottom, top = int((flat[:, 1].min() - margin) / edge[p]), int((flat[:, 1].max() + margin) / edge[p])
             for row in range(max(0, bottom), min(rows - 1, top) + 1):
-                left, right = _span(x, y, row * edge[p] - margin, (row + 1) * edge[p] + margin)
+                left, right = span_in_strip(flat, row * edge[p] - margin, (row + 1) * edge[p] + margin)
                 begin, end = int((left - margin) / edge[p]), int((right + margin) / edge[p])
                 for column in range(max(0, begin), min(columns[p] - 1, end) + 1):
                     b = first_bin[p] + row * columns[p] + column
@@ -192,21 +195,6 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
                     else:
                         start[b] += 1
     return start, items
-
-
-@njit(cache=True)
-def _span(x, y, low, high):  # type: ignore[no-untyped-def]
-    """Smallest and largest x of a triangle within the strip low <= y <= high."""
-    left, right = np.inf, -np.inf
-    for k in range(3):
-        px, py, qx, qy = x[k], y[k], x[(k + 1) % 3], y[(k + 1) % 3]
-        if low <= py <= high:
-            left, right = min(left, px), max(right, px)
-        for level in (low, high):
-            if (py - level) * (qy - level) < 0.0:
-                at = px + (level - py) / (qy - py) * (qx - px)
-                left, right = min(left, at), max(right, at)
-    return left, right
 
 
 @njit(cache=True)

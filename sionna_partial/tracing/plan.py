@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from sionna_partial.planar import cross
+
 _WALLS_AT_ONCE = 64
 """Number of walls that are cut together, which bounds the memory."""
 
@@ -87,9 +89,9 @@ def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64]
     for first in range(0, len(walls), _WALLS_AT_ONCE):
         own = along[first : first + _WALLS_AT_ONCE, None]
         away = start - start[first : first + _WALLS_AT_ONCE, None]
-        area = _cross(own, along)
+        area = cross(own, along)
         area[np.abs(area) < 1e-12] = np.inf
-        u, v = _cross(away, along) / area, _cross(away, own) / area
+        u, v = cross(away, along) / area, cross(away, own) / area
         crossed = (u > 1e-9) & (u < 1.0 - 1e-9) & (v > 1e-9) & (v < 1.0 - 1e-9)
         owners.append(first + np.nonzero(crossed)[0])
         places.append(u[crossed])
@@ -106,10 +108,6 @@ def _line_ids(walls: NDArray[np.float64]) -> NDArray[np.int32]:
     line = np.full(len(walls), -1, np.int32)
     for i, (start, end) in enumerate(walls):
         if line[i] < 0:
-            away = _cross(end - start, walls - start) / np.hypot(*(end - start))
+            away = cross(end - start, walls - start) / np.hypot(*(end - start))
             line[(line < 0) & (np.abs(away) < 1e-6).all(axis=1)] = line.max() + 1
     return line
-
-
-def _cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])

@@ -21,6 +21,7 @@ from sionna_partial.maps.mesh_scene import exported_record
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, settings_or_default
+from sionna_partial.tracing.plan import Plan, prepare_plan
 from sionna_partial.walls.cells import row_runs
 from sionna_partial.walls.outlines import Outlines, wall_outlines
 
@@ -76,6 +77,11 @@ class SceneGeometry:
     def walls_m(self) -> NDArray[np.float64]:
         """End points (S, 2, 2) of the walls [m]."""
         return self.vertices_m[self.segments]
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The walls, cut where they cross."""
+        return prepare_plan(self.walls_m)
 
     @property
     def floor_face(self) -> int:
