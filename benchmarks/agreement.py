@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from stock import Paths, is_bent
 
 import sionna_partial as sp
 from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, find_wedges
+from sionna_partial.tracing.generator import DIFFRACTION
 from sionna_partial.tracing.scene import SceneGeometry, build_scene
-
-Paths = dict[str, NDArray[Any]]
-"""Paths of one receiver: `a` and `delay_s` (P,), `interactions` (P, D), `vertices_m` (P, D, 3), NaN where none is."""
 
 SAME_DELAY_S = 1e-11
 """Paths to one receiver whose delays differ by less are the same [s]: 3 mm."""
@@ -79,26 +78,28 @@ def link(paths: Paths) -> tuple[sp.LinkState, float]:
     return (sp.LinkState.NLOS if gain_db > -150.0 else sp.LinkState.OUTAGE), gain_db
 
 
-def meant(partial: sp.PartialMap, tx: NDArray[np.float64], place: NDArray[np.float64], paths: Paths) -> Paths:
+def meant(partial: sp.PartialMap, tx: NDArray[np.float64], rx: NDArray[np.float64], paths: list[Paths]) -> list[Paths]:
     """Leave out diffracted paths that are not traced: with many reflections, at horizontal edges, open ends, junctions.
 
     Where three walls or more meet, Sionna RT takes any two of them for a wedge. Only in a sector wider than a
     half-plane there are directions that the walls hide from each other, so both legs must lie in it.
     """
-    geometry, shift = build_scene(partial), np.array([*partial.origin_m, 0.0])
-    wedges = find_wedges(geometry, open_ends=False)
-    kept = ~(paths["interactions"] == 8).any(axis=1)
-    edges = cKDTree(wedges.edge_m) if len(wedges.edge_m) else None
-    for k in np.flatnonzero(~kept) if edges is not None else ():
-        at = int((paths["interactions"][k] == 8).argmax())
-        vertices = paths["vertices_m"][k][np.isfinite(paths["vertices_m"][k, :, 0])]
-        points = np.concatenate([tx[None], vertices, place[None]]) - shift
-        distance, index = edges.query(points[at + 1, :2])
-        legs = points[[at, at + 2], :2] - wedges.edge_m[index]
-        inside = (legs @ wedges.normal[index].T > 0.0).any(axis=1).all()
-        few = len(vertices) <= 1 + MAX_REFLECTIONS
-        kept[k] = few and distance < 0.01 and inside and 1e-3 < points[at + 1, 2] < geometry.height_m - 1e-3
-    return {name: values[kept] for name, values in paths.items()}
+    wedges, shift = find_wedges(build_scene(partial), open_ends=False), np.array([*partial.origin_m, 0.0])
+    edges = cKDTree(wedges.edge_m.reshape(-1, 2))
+    kept = []
+    for place, each in zip(rx, paths, strict=True):
+        stays = ~is_bent(each)
+        for k in np.flatnonzero(~stays) if edges.n else ():
+            at = int((each["interactions"][k] == DIFFRACTION).argmax())
+            vertices = each["vertices_m"][k][np.isfinite(each["vertices_m"][k, :, 0])]
+            points = np.concatenate([tx[None], vertices, place[None]]) - shift
+            distance, index = edges.query(points[at + 1, :2])
+            legs = points[[at, at + 2], :2] - wedges.edge_m[index]
+            inside = (legs @ wedges.normal[index].T > 0.0).any(axis=1).all()
+            few, upright = len(vertices) <= 1 + MAX_REFLECTIONS, 1e-3 < points[at + 1, 2] < wedges.height_m - 1e-3
+            stays[k] = few and distance < 0.01 and inside and upright
+        kept.append({name: values[stays] for name, values in each.items()})
+    return kept
 
 
 def pair_paths(first: Paths, second: Paths) -> NDArray[np.intp]:

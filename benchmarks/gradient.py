@@ -12,7 +12,6 @@ below 0.3 % of the slope. Run it with
 
 import argparse
 import math
-import resource
 import tempfile
 import time
 from collections.abc import Iterator
@@ -21,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from stock import peak_memory_gb
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
@@ -121,7 +121,7 @@ def cost(partial: sp.PartialMap, tx: NDArray[np.float64], rx: NDArray[np.float64
     print(
         f"{len(rx)} receivers: trace {seconds['trace']:.2f} s, gradients {seconds['gradients']:.2f} s "
         f"({seconds['gradients'] / seconds['trace']:.1f} times), peak memory of the process "
-        f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6:.2f} GB"
+        f"{peak_memory_gb():.2f} GB"
     )
 
 

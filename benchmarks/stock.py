@@ -12,8 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.tracing.diffraction import MAX_REFLECTIONS
+from sionna_partial.tracing.generator import DIFFRACTION
 from sionna_partial.tracing.sionna_rt import load_sionna
 from sionna_partial.tracing.stock import listed_before
+
+Paths = dict[str, NDArray[Any]]
+"""Paths of one receiver: `a` and `delay_s` (P,), `interactions` (P, D), `vertices_m` (P, D, 3), NaN where none is."""
 
 TRUTH_RAYS = 1_000_000
 TRUTH_TABLE = 30_000_000
@@ -42,7 +46,7 @@ def trace_stock(
     limit_cores(cores)
     rt = load_sionna()
     start = time.perf_counter()
-    paths: list[dict[str, NDArray[Any]]] = []
+    paths: list[Paths] = []
     repeats = 0
     for first in range(0, len(rx), tile):
         part = rx[first : first + tile]
@@ -65,26 +69,26 @@ def trace_stock(
 def true_paths(folder: str, tx: NDArray[np.float64], rx: NDArray[np.float64], **options: Any) -> dict:
     """Run `trace_stock` for the truth: with diffraction, each diffracted path is taken from a run of just its depth.
 
-    Sionna RT 2.2 counts the way from the last reflection twice for a path that has fewer interactions than the largest
-    depth allows, and reflections after a diffraction: it is some dB too weak.
+    Sionna RT 2.2 counts a part of the way twice where a path is reflected after its diffraction and has fewer
+    interactions than the largest depth allows: it is some dB too weak.
     """
     result = trace_stock(folder, tx, rx, **options)
     if not options["diffraction"]:
         return result
-    whole = [{name: values[~_bent(paths)] for name, values in paths.items()} for paths in result["paths"]]
+    whole = [{name: values[~is_bent(paths)] for name, values in paths.items()} for paths in result["paths"]]
     for depth in range(1, min(1 + MAX_REFLECTIONS, options["max_depth"]) + 1):
         for index, paths in enumerate(trace_stock(folder, tx, rx, **{**options, "max_depth": depth})["paths"]):
-            kept = _bent(paths) & (paths["interactions"] > 0).all(axis=1)
+            kept = is_bent(paths) & (paths["interactions"] > 0).all(axis=1)
             whole[index] = _joined(whole[index], {name: values[kept] for name, values in paths.items()})
     return result | {"paths": whole}
 
 
-def _bent(paths: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
+def is_bent(paths: Paths) -> NDArray[np.bool_]:
     """Whether each path diffracts."""
-    return (paths["interactions"] == 8).any(axis=1)
+    return (paths["interactions"] == DIFFRACTION).any(axis=1)
 
 
-def _joined(deep: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _joined(deep: Paths, other: Paths) -> Paths:
     """Paths of both, the second with no more interactions than the first."""
     missing = deep["interactions"].shape[1] - other["interactions"].shape[1]
     kinds = np.pad(other["interactions"], ((0, 0), (0, missing)))
@@ -93,7 +97,7 @@ def _joined(deep: dict[str, NDArray[Any]], other: dict[str, NDArray[Any]]) -> di
     return {name: np.concatenate([values, padded[name]]) for name, values in deep.items()}
 
 
-def receiver_paths(found: Any, index: int, receivers: int, depth: int) -> tuple[dict[str, NDArray[Any]], int]:
+def receiver_paths(found: Any, index: int, receivers: int, depth: int) -> tuple[Paths, int]:
     """Paths of one receiver, each once, and how many were listed again."""
     valid = np.flatnonzero(found.valid.numpy().reshape(receivers, -1)[index])
     real, imaginary = (part.numpy().reshape(receivers, -1)[index, valid].astype(float) for part in found.a)

@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from agreement import Paths, agreement, meant, paths_of
+from agreement import agreement, meant, paths_of
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from stock import isolated, limit_cores, peak_memory_gb, trace_stock, true_paths
+from stock import Paths, isolated, limit_cores, peak_memory_gb, trace_stock, true_paths
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
@@ -101,9 +101,7 @@ def _compare(
     tiles = isolated(true_paths, folder, tx, rx[sample], **options)
 
     def comparable(paths: list[Paths]) -> list[Paths]:
-        if not settings.diffraction:
-            return paths
-        return [meant(partial, tx, place, each) for place, each in zip(rx[sample], paths, strict=True)]
+        return meant(partial, tx, rx[sample], paths) if settings.diffraction else paths
 
     truth = comparable(tiles["paths"])
     print(f"\n{title}, {len(rx)} receivers, depth {settings.max_depth}; truth on {len(sample)} of them")

@@ -67,7 +67,7 @@ def compare(partial: sp.PartialMap, receivers: int, rays: int, *, diffraction: b
     with TemporaryDirectory() as folder:
         sp.export_scene(partial, folder + "/scene")
         stock = isolated(true_paths, folder + "/scene", tx, rx, rays=rays, max_depth=depth, diffraction=diffraction)
-    truth = [meant(partial, tx, place, paths) for place, paths in zip(rx, stock["paths"], strict=True)]
+    truth = meant(partial, tx, rx, stock["paths"])
     return agreement(partial, tx, rx, paths_of(links), truth) | {"twice": stock["repeats"]}
 
 
