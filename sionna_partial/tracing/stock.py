@@ -20,8 +20,7 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.sionna_rt import load_sionna, open_scene
 
 TABLE_SIZE = 3_000_000
-"""Entries of the table of chains, at least. With 1e6 rays and refraction in the demo home, a table of 1e6 loses 1 path
-in 70 against one of 1e7, this one 1 in 350, for 1.4 GB of memory; without refraction a table of 1e6 is enough."""
+"""Entries of the table of chains, at least: more lose fewer paths where refraction makes many, and take more memory."""
 
 SAME_POINT_M = 0.03
 """Paths of the same interactions at points closer than this are one path [m]."""
