@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         save_map,
     )
     from sionna_partial.maps.partial_map import PartialMap
-    from sionna_partial.plot import plot_coverage
+    from sionna_partial.plots.coverage_plot import plot_coverage
     from sionna_partial.settings import Material, SceneSettings, TraceSettings
     from sionna_partial.tracing.gradients import GainGradients, gain_gradients
     from sionna_partial.tracing.scene import export_scene
@@ -54,7 +54,7 @@ _PUBLIC = {
     "learning.predictor": ("LinkPrediction", "Predictor"),
     "coverage": ("predict_map",),
     "export": ("save_coverage",),
-    "plot": ("plot_coverage",),
+    "plots.coverage_plot": ("plot_coverage",),
 }
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 

@@ -16,6 +16,7 @@ import typer
 from typer.testing import CliRunner, Result
 
 from sionna_partial import __version__, cli, info
+from sionna_partial.commands import shell
 from sionna_partial.errors import BackendError, MapError, OutputError
 from sionna_partial.info import Finding
 from sionna_partial.maps.map_files import load_map, save_map
@@ -361,13 +362,13 @@ class TestHelp:
 
 def test_join_numbers_leaves_the_rest_alone() -> None:
     args = ["map.yaml", "--tx", "1", "-2", "--out", "-3", "4"]
-    assert cli.join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
-    assert cli.join_numbers(["--tx=-1", "2", "--out=x", "3"], "--tx") == ["--tx=-1 2", "--out=x", "3"]
+    assert shell.join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
+    assert shell.join_numbers(["--tx=-1", "2", "--out=x", "3"], "--tx") == ["--tx=-1 2", "--out=x", "3"]
 
 
 def test_parse_material() -> None:
-    assert cli.parse_material("") == Material()
-    assert cli.parse_material("wood") == Material(itu="wood")
-    assert cli.parse_material("2.5,0.1,0.05") == Material(2.5, 0.1, 0.05)
+    assert shell.parse_material("") == Material()
+    assert shell.parse_material("wood") == Material(itu="wood")
+    assert shell.parse_material("2.5,0.1,0.05") == Material(2.5, 0.1, 0.05)
     with pytest.raises(typer.BadParameter, match="'a,b,c' is neither an ITU name"):
-        cli.parse_material("a,b,c")
+        shell.parse_material("a,b,c")

@@ -17,7 +17,8 @@ from sionna_partial.coverage import ATTRIBUTES
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.plot import figure_png, plot_coverage
+from sionna_partial.plots.coverage_plot import plot_coverage
+from sionna_partial.plots.figures import figure_png
 
 SUFFIXES = (".nc", ".tif", ".csv", ".png", ".yaml")
 

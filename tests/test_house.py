@@ -29,7 +29,8 @@ MODULES = (
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.gradients"),
     *("learning.features", "learning.networks", "learning.fitting", "learning.predictor_files", "learning.predictor"),
-    *("coverage", "plot", "export", "demo", "info", "cli"),
+    *("coverage", "plots.figures", "plots.coverage_plot", "export", "demo", "info"),
+    *("commands.shell", "commands.prediction", "cli"),
 )
 """Reading order: a module imports only from those before it."""
 

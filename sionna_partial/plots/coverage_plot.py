@@ -1,6 +1,5 @@
-"""Every figure of the package."""
+"""Figures of coverage maps."""
 
-import io
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -20,10 +19,8 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import WALL_PARTS, require_coverage
+from sionna_partial.plots.figures import STATE_COLOURS
 from sionna_partial.settings import require
-
-STATE_COLOURS = {LinkState.LOS: "#ddaa33", LinkState.NLOS: "#bb5566", LinkState.OUTAGE: "#004488"}
-"""Paul Tol's high-contrast colours: told apart with any colour vision and in grey, the better the brighter."""
 
 _WIDTH_IN, _DPI, _MAX_PIXELS = 12.0, 150, 3000
 _STACKED_ASPECT = 1.8
@@ -144,13 +141,6 @@ def plot_comparison(coverages: Mapping[str, xr.Dataset]) -> Figure:
     figure.suptitle(_headline(first))
     _add_legend(figure, unseen_walls=True)
     return figure
-
-
-def figure_png(figure: Figure) -> bytes:
-    """Return a figure as a PNG file; equal figures give equal bytes."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
 
 
 def _aspect(coverage: xr.Dataset) -> float:

@@ -12,7 +12,8 @@ from sionna_partial.constants import LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plot import STATE_COLOURS, figure_png, mix_state_colours, plot_comparison, plot_coverage
+from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage
+from sionna_partial.plots.figures import STATE_COLOURS, figure_png
 
 LOS, NLOS, OUTAGE = (
     np.array(to_rgb(STATE_COLOURS[state])) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)
@@ -163,7 +164,7 @@ def test_maps_of_any_shape_are_drawn(coverage, shape):
 
 def test_large_maps_are_drawn_with_coarser_walls(monkeypatch, coverage):
     fine = panels(plot_coverage(coverage))[0].images[-1].get_array()
-    monkeypatch.setattr("sionna_partial.plot._MAX_PIXELS", 60)
+    monkeypatch.setattr("sionna_partial.plots.coverage_plot._MAX_PIXELS", 60)
     coarse = panels(plot_coverage(coverage))[0].images[-1].get_array()
     assert fine.shape[:2] == (96, 144)
     assert coarse.shape[:2] == (32, 48)

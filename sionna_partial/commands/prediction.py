@@ -1,0 +1,160 @@
+"""Subcommands from a map to its coverage: predict, export-scene, explore, demo, info."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sionna_partial.commands.shell import (
+    FrequencyOption,
+    HeightBandOption,
+    MapArgument,
+    MaterialOption,
+    StrictOption,
+    UpOption,
+    parse_material,
+    parse_position,
+    print_files,
+    show_progress,
+)
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
+from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.settings import SceneSettings, TraceSettings
+
+FORMATS = (".nc", ".tif", ".csv", ".png", ".yaml")
+"""Formats of a coverage map."""
+
+
+def predict(
+    map_path: MapArgument,
+    tx: Annotated[
+        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for the coverage files.", show_default=False)],
+    rx_height: Annotated[float, typer.Option(help="Height of the receivers [m].")] = DEFAULT_HEIGHT_M,
+    spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
+    frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
+    material: MaterialOption = "",
+    max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
+    predictor: Annotated[str, typer.Option(help="'paper', or a .keras file. Default: the shipped one.")] = "",
+    strict: StrictOption = False,
+    height_band: HeightBandOption = None,
+    up: UpOption = None,
+    formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
+) -> None:
+    """Predict the coverage of a transmitter on a partial map."""
+    position = parse_position(tx)
+    suffixes = [_parse_format(name) for name in formats]
+    scene_settings = SceneSettings(material=parse_material(material))
+    trace_settings = TraceSettings(frequency_hz=frequency, max_depth=max_depth)
+    from sionna_partial.maps.map_files import load_map
+
+    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "loading the predictor")
+        from sionna_partial.coverage import predict_map
+        from sionna_partial.export import save_coverage
+
+        coverage = predict_map(
+            partial,
+            position,
+            rx_height_m=rx_height,
+            spacing_m=spacing,
+            predictor=predictor or None,
+            scene_settings=scene_settings,
+            trace_settings=trace_settings,
+            progress=lambda share, message: report(0.9 * share, message),
+        )
+        names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
+        with atomic_files(out) as folder:
+            for index, name in enumerate(names):
+                report(0.9 + 0.1 * index / len(names), f"writing {name}")
+                save_coverage(coverage, folder / name)
+    print_files([out / name for name in names])
+
+
+def export_scene(
+    map_path: MapArgument,
+    out: Annotated[Path, typer.Option(help="New or empty folder for the scene.", show_default=False)],
+    material: MaterialOption = "",
+    frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
+    strict: StrictOption = False,
+    height_band: HeightBandOption = None,
+    up: UpOption = None,
+) -> None:
+    """Write a map as a scene folder that stock Sionna RT loads."""
+    settings = SceneSettings(material=parse_material(material))
+    settings.material.require_frequency(frequency)
+    from sionna_partial.maps.map_files import load_map
+    from sionna_partial.tracing.scene import export_scene as write_scene
+
+    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    scene = write_scene(partial, out, settings, frequency_hz=frequency)
+    print_files([scene])
+
+
+def explore(
+    out: Annotated[Path, typer.Option(help="Folder for the maps.", show_default=False)],
+    home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
+    steps: Annotated[list[int], typer.Option(help="Robot steps; may be repeated.")] = [50, 100, 150, 200],  # noqa: B006
+    seed: Annotated[int, typer.Option(help="Seed of the home and of the robot.")] = 0,
+    height_band: HeightBandOption = None,
+    up: UpOption = None,
+) -> None:
+    """Explore a home with a robot, and write its partial maps."""
+    from sionna_partial.maps.explore import explore as explore_home
+    from sionna_partial.maps.homes import make_home
+    from sionna_partial.maps.map_files import load_map, save_map
+
+    complete = load_map(home, height_band_m=height_band, up=up) if home else make_home(seed)
+    suffix = ".yaml" if complete.mesh is None else ".npz"
+    maps = {f"steps_{count:03d}{suffix}": partial for count, partial in _by_steps(explore_home, complete, steps, seed)}
+    maps[f"complete{suffix}"] = complete
+    for name, partial in maps.items():
+        save_map(partial, out / name)
+    print_files([out / name for name in maps])
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-output"),
+) -> None:
+    """Predict a half-explored home, and compare with the truth."""
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "loading the predictor")
+        from sionna_partial.demo import run_demo
+
+        result = run_demo(out, report)
+    typer.echo(result.table)
+    print_files(list(result.files.values()))
+
+
+def info() -> None:
+    """Say what is found, what is missing, and what to do."""
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    from sionna_partial.info import findings
+
+    table = Table("", Column("found", overflow="fold"), Column("what to do", overflow="fold"))
+    usable = True
+    for finding in findings():
+        table.add_row(finding.name, finding.value, finding.remedy or "-")
+        usable = usable and not finding.remedy
+    Console().print(table)
+    raise typer.Exit(0 if usable else 1)
+
+
+def _parse_format(name: str) -> str:
+    suffix = "." + name.lower().lstrip(".")
+    if suffix not in FORMATS:
+        raise typer.BadParameter(f"--format {name!r} is not known: choose from {', '.join(FORMATS)}.")
+    return suffix
+
+
+def _by_steps(
+    explore_home: Callable[..., list[Any]], home: Any, steps: Sequence[int], seed: int
+) -> Iterator[tuple[int, Any]]:
+    return zip(steps, explore_home(home, steps=tuple(steps), seed=seed), strict=True)

@@ -1,0 +1,120 @@
+"""What all subcommands share: options, numbers, progress, and the files that were written."""
+
+import itertools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from sionna_partial.settings import Material
+
+MapArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MAP", help="ROS map_server YAML, exported scene folder, .npz, or mesh.", show_default=False
+    ),
+]
+StrictOption = Annotated[
+    bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")
+]
+HeightBandOption = Annotated[
+    tuple[float, float] | None,
+    typer.Option(metavar="LOW HIGH", help="Of a mesh: z between which its surfaces are walls [m].", show_default=False),
+]
+UpOption = Annotated[
+    str | None, typer.Option(metavar="y|z", help="Of a mesh: the axis that points up.", show_default=False)
+]
+MaterialOption = Annotated[
+    str, typer.Option(help="ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall.")
+]
+FrequencyOption = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
+
+
+class TransmitterCommand(TyperCommand):
+    """Takes `--tx X Y` and `--tx X Y Z`: an option with two or three values."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join the numbers after --tx to one value."""
+        return super().parse_args(ctx, join_numbers(args, "--tx"))
+
+
+def join_numbers(args: Sequence[str], option: str) -> list[str]:
+    """Join the numbers that follow `option`, negative ones too, to the one value that a parser can take."""
+    joined: list[str] = []
+    rest = list(args)
+    while rest:
+        arg = rest.pop(0)
+        if arg.startswith(f"{option}="):
+            rest.insert(0, arg.removeprefix(f"{option}="))
+            arg = option
+        if arg == option:
+            words = list(itertools.takewhile(_is_number, rest)) or rest[:1]
+            del rest[: len(words)]
+            parse_position(" ".join(words))
+            arg = f"{option}={' '.join(words)}"
+        joined.append(arg)
+    return joined
+
+
+def parse_position(text: str) -> tuple[float, ...]:
+    """Transmitter position from "X Y" or "X Y Z" [m]."""
+    words = text.replace(",", " ").split()
+    if len(words) not in (2, 3) or not all(map(_is_number, words)):
+        raise typer.BadParameter(f"--tx {text!r} is not a position: give --tx X Y or --tx X Y Z in metres.")
+    return tuple(map(float, words))
+
+
+def parse_material(text: str) -> Material:
+    """Material from an ITU name or "permittivity,conductivity,thickness"; the default for ""."""
+    if not text:
+        return Material()
+    words = text.split(",")
+    if len(words) == 1:
+        return Material(itu=text)
+    if len(words) != 3 or not all(map(_is_number, words)):
+        raise typer.BadParameter(
+            f"--material {text!r} is neither an ITU name nor permittivity,conductivity,thickness: "
+            "give for example concrete, or 2.94,0.1226,0.1."
+        )
+    permittivity, conductivity_s_m, thickness_m = map(float, words)
+    return Material(permittivity, conductivity_s_m, thickness_m)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+@contextmanager
+def show_progress() -> Iterator[Callable[[float, str], None]]:
+    """Show progress on stderr: a bar on a terminal, its last state elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:3.0f} %"),
+        TimeElapsedColumn(),
+    )
+    console = Console(stderr=True)
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("starting", total=1.0)
+        try:
+            yield lambda share, message: bar.update(task, completed=share, description=message)
+        except BaseException:
+            bar.live.transient, console.quiet = True, not console.is_terminal  # the error that follows stands alone
+            raise
+        bar.update(task, completed=1.0, description="done")
+
+
+def print_files(files: Sequence[Path]) -> None:
+    """Say which files were written."""
+    for file in files:
+        typer.echo(f"wrote {file}")

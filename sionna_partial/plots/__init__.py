@@ -1,0 +1,1 @@
+"""Every figure of the package; what a figure shows is computed elsewhere."""
