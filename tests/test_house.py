@@ -29,6 +29,7 @@ MODULES = (
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.gradients"),
     *("learning.features", "learning.networks", "learning.fitting", "learning.predictor_files", "learning.predictor"),
+    *("training.link_table",),
     *("coverage", "plots.figures", "plots.coverage_plot", "export", "demo", "info"),
     *("commands.shell", "commands.prediction", "cli"),
 )
@@ -51,7 +52,7 @@ HEAVY = IN_FUNCTIONS | {
         "h5netcdf",
         "h5py",
     ),
-    *("PIL", "yaml", "pandas"),
+    *("PIL", "yaml", "pandas", "pyarrow", "dask", "distributed"),
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
 
