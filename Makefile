@@ -36,7 +36,15 @@ scenes: $(READY) ## Make the demo scenes again (scenes/)
 	@$(BIN)/python scenes/make_scenes.py
 
 predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
-	@$(BIN)/python benchmarks/train_paper_predictor.py
+	@rm -rf build/predictor
+	@$(BIN)/sionna-partial dataset build/predictor/dataset --homes 300 --first-seed 10000
+	@$(BIN)/sionna-partial train build/predictor/dataset --out build/predictor/run
+	@$(BIN)/sionna-partial evaluate build/predictor/dataset --predictor build/predictor/run/predictor.keras \
+		--out build/predictor/report > /dev/null
+	@for suffix in keras json; do \
+		cp build/predictor/run/predictor.$$suffix sionna_partial/predictors/paper.$$suffix; done
+	@cp build/predictor/run/distance.* build/predictor/run/majority.json sionna_partial/predictors/
+	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 
 wheel: $(READY) ## Build the wheel (dist/)
 	@$(BIN)/python -m build --wheel --no-isolation

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from sionna_partial.export import save_coverage
     from sionna_partial.learning.features import LinkFeatures, link_features
     from sionna_partial.learning.predictor import LinkPrediction, Predictor
-    from sionna_partial.maps.explore import explore
+    from sionna_partial.maps.explore import Exploration, explore, explore_trajectory
     from sionna_partial.maps.homes import make_home
     from sionna_partial.maps.map_files import (
         load_map,
@@ -25,17 +25,22 @@ if TYPE_CHECKING:
     )
     from sionna_partial.maps.partial_map import PartialMap
     from sionna_partial.plots.coverage_plot import plot_coverage
-    from sionna_partial.settings import Material, SceneSettings, TraceSettings
+    from sionna_partial.plots.exploration_plot import animate_exploration, plot_exploration
+    from sionna_partial.settings import DatasetSettings, Material, SceneSettings, SensorSettings, TraceSettings
     from sionna_partial.tracing.gradients import GainGradients, gain_gradients
     from sionna_partial.tracing.scene import export_scene
     from sionna_partial.tracing.trace import TracedLinks, trace_links
+    from sionna_partial.training.dataset import build_dataset
+    from sionna_partial.training.evaluate import evaluate
+    from sionna_partial.training.shards import read_dataset
+    from sionna_partial.training.train import train
 
 __version__ = "0.1.0"
 
 _PUBLIC = {
     "constants": ("CellState", "LinkState"),
     "errors": ("SionnaPartialError",),
-    "settings": ("Material", "SceneSettings", "TraceSettings"),
+    "settings": ("DatasetSettings", "Material", "SceneSettings", "SensorSettings", "TraceSettings"),
     "maps.partial_map": ("PartialMap",),
     "maps.map_files": (
         "load_map",
@@ -46,20 +51,27 @@ _PUBLIC = {
         "save_map",
     ),
     "maps.homes": ("make_home",),
-    "maps.explore": ("explore",),
+    "maps.explore": ("Exploration", "explore", "explore_trajectory"),
     "tracing.scene": ("export_scene",),
     "tracing.trace": ("TracedLinks", "trace_links"),
     "tracing.gradients": ("GainGradients", "gain_gradients"),
     "learning.features": ("LinkFeatures", "link_features"),
     "learning.predictor": ("LinkPrediction", "Predictor"),
+    "training.shards": ("read_dataset",),
+    "training.dataset": ("build_dataset",),
+    "training.evaluate": ("evaluate",),
+    "training.train": ("train",),
     "coverage": ("predict_map",),
     "export": ("save_coverage",),
     "plots.coverage_plot": ("plot_coverage",),
+    "plots.exploration_plot": ("animate_exploration", "plot_exploration"),
 }
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
     "CellState",
+    "DatasetSettings",
+    "Exploration",
     "GainGradients",
     "LinkFeatures",
     "LinkPrediction",
@@ -68,11 +80,16 @@ __all__ = [
     "PartialMap",
     "Predictor",
     "SceneSettings",
+    "SensorSettings",
     "SionnaPartialError",
     "TraceSettings",
     "TracedLinks",
     "__version__",
+    "animate_exploration",
+    "build_dataset",
+    "evaluate",
     "explore",
+    "explore_trajectory",
     "export_scene",
     "gain_gradients",
     "link_features",
@@ -83,10 +100,13 @@ __all__ = [
     "map_from_occupancy",
     "map_from_slam",
     "plot_coverage",
+    "plot_exploration",
     "predict_map",
+    "read_dataset",
     "save_coverage",
     "save_map",
     "trace_links",
+    "train",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Command line: one subcommand for each arrow from a map to its coverage."""
+"""Command line: one subcommand for each arrow from a map to its coverage, and from homes to a predictor."""
 
 import logging
 import os
@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from sionna_partial import __version__
+from sionna_partial.commands.learning import dataset, evaluate, train
 from sionna_partial.commands.prediction import demo, explore, export_scene, info, predict
 from sionna_partial.commands.shell import TransmitterCommand
 from sionna_partial.errors import SionnaPartialError
@@ -69,5 +70,8 @@ def _prepare(
 app.command(cls=TransmitterCommand)(predict)
 app.command()(export_scene)
 app.command()(explore)
+app.command()(dataset)
+app.command()(train)
+app.command()(evaluate)
 app.command()(demo)
 app.command()(info)

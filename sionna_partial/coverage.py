@@ -36,6 +36,14 @@ NO_RECEIVER = 255
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
 
+RECEIVERS = ("indoor", "anywhere")
+"""Whose probabilities and gains they are; the first is the default."""
+
+_WHOSE = {
+    "indoor": "given that the receiver is indoors",
+    "anywhere": "of a receiver that may be outside, in outage",
+}
+
 _log = logging.getLogger(__name__)
 
 _LINK_FLAGS = {
@@ -49,9 +57,9 @@ _CELL_FLAGS = {
 _YES_NO = {"flag_values": np.array([0, 1], dtype=np.int8), "flag_meanings": "no yes"}
 
 ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
-    "p_los": {"long_name": "probability of line of sight, given that the receiver is indoors", "units": "1"},
-    "p_nlos": {"long_name": "probability of paths without line of sight, given that it is indoors", "units": "1"},
-    "p_outage": {"long_name": "probability of outage, given that the receiver is indoors", "units": "1"},
+    "p_los": {"long_name": "probability of line of sight", "units": "1"},
+    "p_nlos": {"long_name": "probability of paths without line of sight", "units": "1"},
+    "p_outage": {"long_name": "probability of outage", "units": "1"},
     "link_state": {"long_name": "likeliest link state", **_LINK_FLAGS},
     "gain_mean_db": {"long_name": "mean omnidirectional path gain, an outage counting -150 dB", "units": "dB"},
     "gain_std_db": {"long_name": "standard deviation of the omnidirectional path gain", "units": "dB"},
@@ -96,6 +104,7 @@ def predict_map(
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
+    receivers: str = RECEIVERS[0],
     progress: Progress | None = None,
 ) -> xr.Dataset:
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
@@ -104,8 +113,11 @@ def predict_map(
     was not observed (paper, Section III). On a complete map the trace itself is the answer.
 
     Probabilities and gains are those of a receiver that is indoors, as in the paper; `p_indoor` says how likely
-    that is. No receiver stands inside a wall, within 1.1 cm of one, or at the transmitter (nearer than 1.1 cm, or than
-    the distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
+    that is. With ``receivers="anywhere"`` it is mixed in: outside, every link counts as an outage. On a complete map
+    a receiver is inside wherever a cell is free, and outside elsewhere.
+
+    No receiver stands inside a wall, within 1.1 cm of one, or at the transmitter (nearer than 1.1 cm, or than the
+    distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
     variables are NaN and link states 255.
 
     Parameters
@@ -122,6 +134,8 @@ def predict_map(
         None is the shipped default, a path one that you saved. On a complete map it is read, but not used.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
+    receivers : {"indoor", "anywhere"}
+        Probabilities and gains given that a receiver is indoors, or of one that may be outside, in outage.
     progress : callable, optional
         Called as ``progress(share_done, message)``.
 
@@ -137,18 +151,19 @@ def predict_map(
     PositionError
         For a transmitter where none can stand, or if no receiver can stand anywhere.
     SettingsError
-        For a height, spacing or frequency out of range.
+        For a height, spacing or frequency out of range, or another value of `receivers`.
     PredictorError
         If the predictor cannot be read.
     BackendError
         If LLVM or Sionna RT cannot be used.
     """
+    require(receivers in RECEIVERS, "receivers", receivers, f"give {' or '.join(map(repr, RECEIVERS))}.")
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
     scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
     trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     tx_m = _transmitter(partial, tx)
-    receivers = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
+    grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
     complete = partial.is_complete
     chosen = None if complete and predictor is None else _predictor(predictor)
     model = None if complete else chosen
@@ -156,7 +171,7 @@ def predict_map(
     links = trace_links(
         partial,
         tx_m,
-        receivers.rx_m,
+        grid.rx_m,
         settings=trace_settings,
         scene_settings=scene_settings,
         progress=lambda share, message: report(0.8 * share, message),
@@ -165,17 +180,18 @@ def predict_map(
         _warn_of_other_traces(model, links.settings)
     report(0.8, "measuring unobserved distances")
     phi = link_features(partial, links)
-    report(0.9, f"predicting {len(receivers.rx_m)} links")
-    variables = _variables(partial, receivers, phi, model)
-    variables["wall_parts"] = _wall_parts(partial, receivers, spacing_m)
+    report(0.9, f"predicting {len(grid.rx_m)} links")
+    variables = _variables(grid, phi, model, anywhere=receivers == "anywhere")
+    variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
         **_provenance(partial, model, scene_settings, links.settings),
         "transmitter_m": tx_m,
         "rx_height_m": float(rx_height_m),
         "spacing_m": float(spacing_m),
+        "receivers": receivers,
     }
     report(1.0, "done")
-    return _label(receivers, variables, attributes)
+    return _label(grid, variables, attributes)
 
 
 def require_coverage(coverage: xr.Dataset) -> None:
@@ -272,14 +288,17 @@ def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float6
 
 
 def _variables(
-    partial: PartialMap, receivers: _Receivers, phi: LinkFeatures, model: Predictor | None
+    receivers: _Receivers, phi: LinkFeatures, model: Predictor | None, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
     """Predict, and lay all results out on the grid."""
     prediction = LinkPrediction.of_trace(phi) if model is None else model.predict(phi)
     free = receivers.cell_state[receivers.valid] == CellState.FREE
+    p_indoor = np.where(free, 1.0, 0.0 if model is None else model.predict_indoor(phi))
+    if anywhere:
+        prediction = prediction.anywhere(p_indoor)
     values = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)}
     values |= {
-        "p_indoor": np.where(free, 1.0, 0.0 if model is None else model.predict_indoor(phi)),
+        "p_indoor": p_indoor,
         "partial_gain_db": phi.gain_db,
         "unobserved_distance_m": phi.unobserved_distance_m,
         "distance_m": phi.distance_m,
@@ -371,4 +390,6 @@ def _label(receivers: _Receivers, variables: Mapping[str, NDArray[Any]], attribu
         for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
     }
     layers = {name: (("y", "x"), variables[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    for name in (*DISTRIBUTION, "link_state"):
+        layers[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
     return xr.Dataset(layers, coords=axes, attrs=dict(attributes))

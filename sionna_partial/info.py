@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sionna_partial import __version__
 from sionna_partial.errors import SionnaPartialError
+from sionna_partial.learning.predictor import SHIPPED
 from sionna_partial.llvm import load_llvm
 from sionna_partial.resources import PREDICTORS_FOLDER, demo_homes
 from sionna_partial.tracing.contract import TESTED_VERSIONS, contract_breaches, contract_remedy, sionna_version
@@ -100,7 +101,7 @@ def _library(name: str) -> Finding:
 
 
 def _predictors() -> Finding:
-    found = ", ".join(sorted(path.stem for path in PREDICTORS_FOLDER.glob("*.keras")))
+    found = ", ".join(name for name in SHIPPED if (PREDICTORS_FOLDER / f"{name}.keras").is_file())
     remedy = "" if found else f"'{PREDICTORS_FOLDER}' holds none: install sionna-partial again."
     return Finding("predictors", found or "none", remedy)
 

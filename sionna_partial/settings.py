@@ -7,6 +7,7 @@ from typing import Literal, TypeVar
 
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
+    DEFAULT_HEIGHT_M,
     DRYWALL_CONDUCTIVITY_S_M,
     DRYWALL_PERMITTIVITY,
     WALL_THICKNESS_M,
@@ -93,6 +94,12 @@ def require_number(name: str, value: object, low: float, high: float, *, open_lo
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     inside = (low < number if open_low else low <= number) and number <= high
     require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].")
+
+
+def require_whole(name: str, value: object, low: int, high: int) -> None:
+    """Raise a SettingsError unless `value` is a whole number in [low, high]."""
+    require(isinstance(value, Integral) and not isinstance(value, bool), name, value, "give a whole number.")
+    require_number(name, value, low, high)
 
 
 def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:
@@ -236,10 +243,99 @@ class TraceSettings:
     def __post_init__(self) -> None:
         require_number("frequency_hz", self.frequency_hz, *FREQUENCIES_HZ)
         for name, low, high in (("max_depth", 0, 10), ("samples_per_tx", 1, 100_000_000), ("seed", 0, 2**31 - 1)):
-            value = getattr(self, name)
-            require(isinstance(value, Integral) and not isinstance(value, bool), name, value, "give a whole number.")
-            require_number(name, value, low, high)
+            require_whole(name, getattr(self, name), low, high)
         for name in ("diffraction", "open_ends", "refraction", "diffuse_reflection"):
             value = getattr(self, name)
             unset = name == "diffraction" and value is None
             require(unset or isinstance(value, bool), name, value, "give True or False.")
+
+
+@dataclass(frozen=True)
+class SensorSettings:
+    """Errors of the exploring robot; without them all that it maps is true.
+
+    Parameters
+    ----------
+    range_noise_m : float
+        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It blurs walls:
+        the map weighs the readings of each cell, as an occupancy grid does.
+    drift_m_per_m : float
+        Growth of the robot's error about its own place per metre of way [1], at most 1, in a direction that is drawn
+        once. What is seen later lies beside where it is, and walls that are seen again may appear twice.
+    missed_wall_share : float
+        Share of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces.
+        Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+    """
+
+    range_noise_m: float = 0.0
+    drift_m_per_m: float = 0.0
+    missed_wall_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("range_noise_m", "drift_m_per_m", "missed_wall_share"):
+            require_number(name, getattr(self, name), 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class DatasetSettings:
+    """Which links of a home a data set has.
+
+    Parameters
+    ----------
+    links_per_home : int
+        Number of links whose receivers are drawn from the free cells of the complete home, at least
+        `transmitters_per_home`. As many more have receivers drawn from the whole map area, indoors or not. All of them
+        are there at each stage.
+    transmitters_per_home : int
+        Number of transmitters, drawn from the free cells of the complete home; each has receivers of its own.
+    stages : tuple of int
+        Steps that the robot has explored, increasing.
+    seed : int
+        Seed of the places and of the robot, together with the home's name.
+    tx_height_m, rx_height_m : float
+        Heights of transmitters and receivers above the map's z = 0 [m].
+    margin_m : float
+        How far the map area reaches beyond the known cells of the complete home [m]. Maps are cut and extended to it.
+    scene : SceneSettings
+        How maps become scenes.
+    trace : TraceSettings
+        What is traced, on the complete and on the partial maps.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+    """
+
+    links_per_home: int = 400
+    transmitters_per_home: int = 4
+    stages: tuple[int, ...] = (0, 50, 100, 150, 200)
+    seed: int = 0
+    tx_height_m: float = DEFAULT_HEIGHT_M
+    rx_height_m: float = DEFAULT_HEIGHT_M
+    margin_m: float = 3.0
+    scene: SceneSettings = field(default_factory=SceneSettings)
+    trace: TraceSettings = field(default_factory=TraceSettings)
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("transmitters_per_home", 1, 1000),
+            ("links_per_home", self.transmitters_per_home, 1_000_000),
+            ("seed", 0, 2**31 - 1),
+        ):
+            require_whole(name, getattr(self, name), low, high)
+        remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200)."
+        require(isinstance(self.stages, tuple) and len(self.stages) > 0, "stages", self.stages, remedy)
+        whole = all(isinstance(steps, int) and not isinstance(steps, bool) and steps >= 0 for steps in self.stages)
+        require(whole and list(self.stages) == sorted(set(self.stages)), "stages", self.stages, remedy)
+        for name in ("tx_height_m", "rx_height_m"):
+            require_number(name, getattr(self, name), 0.0, 1000.0, open_low=True)
+        require_number("margin_m", self.margin_m, 0.0, 1000.0)
+        require(isinstance(self.scene, SceneSettings), "scene", self.scene, "give SceneSettings(...).")
+        require(isinstance(self.trace, TraceSettings), "trace", self.trace, "give TraceSettings(...).")
+        self.scene.material.require_frequency(self.trace.frequency_hz)

@@ -5,7 +5,6 @@ import os
 import subprocess
 import sys
 import warnings
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,15 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 import typer
+from PIL import Image
 from typer.testing import CliRunner, Result
 
 from sionna_partial import __version__, cli, info
 from sionna_partial.commands import shell
 from sionna_partial.errors import BackendError, MapError, OutputError
 from sionna_partial.info import Finding
+from sionna_partial.maps.explore import explore
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
 
 @pytest.fixture(autouse=True)
@@ -90,6 +91,7 @@ class TestPredict:
             "predictor": None,
             "scene_settings": SceneSettings(),
             "trace_settings": TraceSettings(),
+            "receivers": "indoor",
         }
         names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
         assert [(coverage, path.name) for coverage, path in calls[1:]] == [("coverage", name) for name in names]
@@ -97,6 +99,7 @@ class TestPredict:
 
     def test_every_option(self, map_path: Path, calls: list[Any], tmp_path: Path) -> None:
         options = "--rx-height 1 --spacing 0.3 --frequency 60e9 --max-depth 2 --predictor paper --material 4,0.1,0.2"
+        options += " --receivers anywhere"
         result = run(
             "predict",
             map_path,
@@ -121,6 +124,7 @@ class TestPredict:
             "predictor": "paper",
             "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2)),
             "trace_settings": TraceSettings(frequency_hz=60e9, max_depth=2),
+            "receivers": "anywhere",
         }
         assert [path.name for _, path in calls[1:]] == ["coverage.nc", "coverage.csv"]
 
@@ -287,29 +291,40 @@ class TestExportScene:
 
 class TestExplore:
     def test_made_home(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap) -> None:
-        asked: list[Any] = []
-
-        def explore(home: PartialMap, steps: tuple[int, ...], seed: int) -> list[PartialMap]:
-            asked.append((home, steps, seed))
-            return [room] * len(steps)
-
+        asked: list[int] = []
         monkeypatch.setattr("sionna_partial.maps.homes.make_home", lambda seed: asked.append(seed) or room)
-        monkeypatch.setattr(import_module("sionna_partial.maps.explore"), "explore", explore)
-        words = ["--seed", "7", "--steps", "20", "--steps", "100"]
-        result = run("explore", "--out", tmp_path / "maps", *words)
+        result = run("explore", "--out", tmp_path / "maps", "--seed", "7", "--steps", "6", "--steps", "2")
         assert result.exit_code == 0, result.output
-        assert asked == [7, (room, (20, 100), 7)]
-        names = ["steps_020.yaml", "steps_100.yaml", "complete.yaml"]
+        assert asked == [7]
+        names = ["steps_002.yaml", "steps_006.yaml", "complete.yaml", "exploration.png", "exploration.gif"]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'maps' / name}" for name in names]
-        assert all(load_map(tmp_path / "maps" / name) == room for name in names)
+        for name, partial in zip(names, [*explore(room, (2, 6), 7), room], strict=False):
+            assert np.array_equal(load_map(tmp_path / "maps" / name).state, partial.state)
+        with Image.open(tmp_path / "maps" / "exploration.gif") as animation:
+            assert animation.n_frames == 7
 
-    def test_own_home(self, monkeypatch: pytest.MonkeyPatch, map_path: Path, tmp_path: Path, room: PartialMap) -> None:
-        explore = lambda home, steps, seed: [home] * len(steps)  # noqa: E731
-        monkeypatch.setattr(import_module("sionna_partial.maps.explore"), "explore", explore)
-        result = run("explore", "--home", map_path, "--out", tmp_path / "maps")
+    def test_own_home_and_errors(self, map_path: Path, tmp_path: Path, room: PartialMap) -> None:
+        errors = ["--range-noise", "0.6", "--drift", "0.2", "--missed-walls", "0.5"]
+        result = run("explore", "--home", map_path, "--out", tmp_path / "maps", "--steps", "4", *errors)
         assert result.exit_code == 0, result.output
         assert load_map(tmp_path / "maps" / "complete.yaml") == room
-        assert len(list((tmp_path / "maps").glob("steps_*.yaml"))) == 4
+        (partial,) = explore(room, (4,), sensor=SensorSettings(0.6, 0.2, 0.5))
+        assert np.array_equal(load_map(tmp_path / "maps" / "steps_004.yaml").state, partial.state)
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--missed-walls", "2"], "missed_wall_share = 2.0 is not allowed: give a number in [0, 1]."),
+            (["--steps", "-4"], "steps = [-4] is not allowed: give increasing whole numbers of 0 to 100,000"),
+        ],
+    )
+    def test_wrong_numbers_leave_nothing_behind(
+        self, map_path: Path, tmp_path: Path, words: list[str], message: str
+    ) -> None:
+        result = run("explore", "--home", map_path, "--out", tmp_path / "maps", *words)
+        assert result.exit_code == 2
+        assert f"error: {message}" in result.stderr
+        assert not (tmp_path / "maps").exists()
 
 
 def test_demo_prints_table_and_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

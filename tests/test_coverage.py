@@ -112,6 +112,48 @@ def test_what_is_seen_to_be_free_is_indoors_for_certain(coverage):
     assert (coverage["p_indoor"].to_numpy()[unknown] == 0.25).all()
 
 
+class TestReceiversAnywhere:
+    def test_outside_is_mixed_in_as_outage(self, coverage):
+        anywhere = predict_map(map_of(PICTURE), TX, spacing_m=0.25, receivers="anywhere")
+        for name in ("p_los", "p_nlos"):
+            np.testing.assert_allclose(anywhere[name], coverage["p_indoor"] * coverage[name], rtol=1e-6)
+        np.testing.assert_allclose(anywhere["p_outage"], 1.0 - anywhere["p_los"] - anywhere["p_nlos"], atol=1e-6)
+        parts = zip(("p_outage", "p_los", "p_nlos"), (-150.0, *gains(anywhere)), strict=True)
+        mean_db = np.maximum(sum(anywhere[p] * gain for p, gain in parts), -150.0)
+        np.testing.assert_allclose(anywhere["gain_mean_db"], mean_db, rtol=1e-5)
+        for name in ("p_indoor", "partial_gain_db", "gain_los_mean_db", "gain_nlos_std_db"):
+            np.testing.assert_array_equal(anywhere[name], coverage[name])
+
+    def test_attributes_say_whose_probabilities_they_are(self, coverage):
+        anywhere = predict_map(map_of(PICTURE), TX, spacing_m=0.25, receivers="anywhere")
+        assert coverage.attrs["receivers"] == "indoor"
+        assert coverage["p_los"].attrs["long_name"].endswith(", given that the receiver is indoors")
+        assert anywhere.attrs["receivers"] == "anywhere"
+        assert anywhere["link_state"].attrs["long_name"].endswith(", of a receiver that may be outside, in outage")
+
+    def test_on_a_complete_map_outside_is_outage_for_certain(self, fakes):
+        indoor, anywhere = (
+            predict_map(map_of(COMPLETE), TX, spacing_m=0.25, receivers=whose) for whose in ("indoor", "anywhere")
+        )
+        valid, free = indoor["valid"].to_numpy(), (indoor["cell_state"] == CellState.FREE).to_numpy()
+        outside = valid & ~free
+        assert outside.any()
+        assert (indoor["p_outage"].to_numpy()[outside] < 1.0).any()
+        assert (anywhere["p_outage"].to_numpy()[outside] == 1.0).all()
+        assert (anywhere["gain_mean_db"].to_numpy()[outside] == -150.0).all()
+        for name in ("p_los", "p_outage", "gain_mean_db", "link_state"):
+            np.testing.assert_array_equal(anywhere[name].to_numpy()[free], indoor[name].to_numpy()[free])
+
+    def test_unknown_word(self, no_work):
+        message = r"receivers = 'outdoor' is not allowed: give 'indoor' or 'anywhere'\."
+        with pytest.raises(SettingsError, match=message):
+            predict_map(map_of(PICTURE), TX, receivers="outdoor")
+
+
+def gains(coverage):
+    return coverage["gain_los_mean_db"], coverage["gain_nlos_mean_db"]
+
+
 def test_on_a_complete_map_the_trace_is_the_answer(fakes, monkeypatch):
     monkeypatch.setattr(FakePredictor, "load", lambda name: pytest.fail("no predictor is needed"))
     partial = map_of(COMPLETE)

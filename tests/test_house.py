@@ -22,16 +22,20 @@ PACKAGE = ROOT / "sionna_partial"
 MODULES = (
     *("constants", "errors", "resources", "settings", "files", "planar", "llvm", "llvm_probe"),
     *("maps.mesh_cut", "maps.mesh", "maps.partial_map", "maps.map_turn", "maps.ros_map"),
-    *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.homes", "maps.explore"),
+    *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.furniture", "maps.homes"),
+    *("maps.camera", "maps.robot", "maps.explore"),
     *("walls.lines", "walls.cells", "walls.chains", "walls.bridges", "walls.graph", "walls.outlines"),
     *("tracing.plan", "tracing.scene", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
     *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.gradients"),
     *("learning.features", "learning.networks", "learning.fitting", "learning.predictor_files", "learning.predictor"),
-    *("training.link_table",),
-    *("coverage", "plots.figures", "plots.coverage_plot", "export", "demo", "info"),
-    *("commands.shell", "commands.prediction", "cli"),
+    *("training.link_table", "training.metrics", "training.baselines"),
+    *("coverage", "plots.figures", "plots.coverage_plot", "plots.exploration_plot", "plots.calibration_plot"),
+    *("export", "demo", "info"),
+    *("training.home_sources", "training.home_links", "training.shards", "training.home_process", "training.dataset"),
+    *("training.dataset_links", "training.evaluate", "training.train", "training.report"),
+    *("commands.shell", "commands.prediction", "commands.learning", "cli"),
 )
 """Reading order: a module imports only from those before it."""
 
@@ -57,6 +61,7 @@ HEAVY = IN_FUNCTIONS | {
 """Not loaded by `import sionna_partial`, nor by `--help`."""
 
 NOT_IMPORTED = {
+    "dask": "what distributed is the scheduler of; the cluster's commands are `dask scheduler` and `dask worker`",
     "karellen-llvm-core": "a shared library, which sionna_partial.llvm finds and loads",
     "tensorflow-cpu": "the backend that keras imports",
 }
@@ -126,7 +131,9 @@ class TestLightImports:
     def test_package(self) -> None:
         assert not loaded_by("import sionna_partial") & (HEAVY | {"typer", "rich"})
 
-    @pytest.mark.parametrize("command", ["", "predict", "export-scene", "explore", "demo", "info"])
+    @pytest.mark.parametrize(
+        "command", ["", "predict", "export-scene", "explore", "dataset", "train", "evaluate", "demo", "info"]
+    )
     def test_help(self, command: str) -> None:
         arguments = [*filter(None, [command]), "--help"]
         run = f"try:\n    app({arguments})\nexcept SystemExit as end:\n    code = end.code\nassert code == 0"

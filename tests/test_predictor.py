@@ -74,6 +74,38 @@ def test_of_trace():
         np.testing.assert_allclose(getattr(answer, name), 0.0, atol=1e-12)
 
 
+def test_anywhere_is_indoors_or_in_outage(quick):
+    indoors = quick.predict(make_links(200)[0])
+    p_indoor = np.linspace(0.0, 1.0, 200)
+    answer = indoors.anywhere(p_indoor)
+    assert_valid(answer)
+    np.testing.assert_allclose(answer.p_los, p_indoor * indoors.p_los)
+    np.testing.assert_allclose(answer.p_nlos, p_indoor * indoors.p_nlos)
+    np.testing.assert_allclose(answer.gain_mean_db, p_indoor * indoors.gain_mean_db - 150.0 * (1.0 - p_indoor))
+    second_moment = p_indoor * (indoors.gain_std_db**2 + indoors.gain_mean_db**2) + 150.0**2 * (1.0 - p_indoor)
+    np.testing.assert_allclose(answer.gain_std_db**2 + answer.gain_mean_db**2, second_moment)
+    assert answer.p_outage[0] == 1.0
+
+
+def test_certainly_indoors_changes_nothing(quick):
+    indoors = quick.predict(make_links(50)[0])
+    for name, values in arrays(indoors.anywhere(np.ones(50))).items():
+        np.testing.assert_allclose(values, getattr(indoors, name), rtol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("p_indoor", "message"),
+    [
+        ([0.5, 1.1], "p_indoor[1] = 1.1 is not allowed: it lies between 0 and 1."),
+        ([-0.1, 1.0], "p_indoor[0] = -0.1 is not allowed: it lies between 0 and 1."),
+        ([0.5], "p_indoor has shape (1,): give one number for each of the 2 links."),
+    ],
+)
+def test_bad_probability_of_being_indoors(p_indoor, message):
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        LinkPrediction.of_trace(make_links(2)[0]).anywhere(p_indoor)
+
+
 def test_save_and_load(quick, saved):
     phi, _, _ = make_links(500, seed=5)
     model = quick.fit_indoor(phi, phi.unobserved_distance_m < 4.0)

@@ -49,6 +49,11 @@ def test_stock_keras_loads_it(quick, saved):
     np.testing.assert_allclose(probabilities[:, LOS], quick.predict(phi).p_los[phi.link_state == LOS], rtol=1e-5)
 
 
+def test_same_bytes_however_many_were_made_before(quick):
+    again = Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
+    assert again.archive == quick.archive
+
+
 def _repack(archive, change):
     """Return the archive with `change` applied to its configuration."""
     packed = io.BytesIO()

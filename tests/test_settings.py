@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sionna_partial import constants
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import SettingsError
-from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, TraceSettings
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, SensorSettings, TraceSettings
 
 ITU_BANDS_OF_SIONNA = """
 from sionna_partial.llvm import load_llvm
@@ -48,7 +48,7 @@ def test_defaults_are_the_papers() -> None:
     assert SceneSettings().ceiling is True
 
 
-@pytest.mark.parametrize("settings", [Material(), SceneSettings(), TraceSettings()])
+@pytest.mark.parametrize("settings", [Material(), SceneSettings(), SensorSettings(), TraceSettings()])
 def test_settings_are_frozen(settings: object) -> None:
     name = dataclasses.fields(settings)[0].name  # type: ignore[arg-type]
     with pytest.raises(dataclasses.FrozenInstanceError):
@@ -62,6 +62,9 @@ RANGES = {
     (Material, "thickness_m"): ("(0, 10]", (1e-9, 10), (0, -0.1, 10.1)),
     (SceneSettings, "outline_tolerance_cells"): ("[0, 2]", (0, 2.0), (-0.1, 2.1)),
     (SceneSettings, "bridge_gap_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "drift_m_per_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "missed_wall_share"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28, 1e12), (0, -28e9, 28, 1.1e12)),
     (TraceSettings, "max_depth"): ("[0, 10]", (0, 10), (-1, 11)),
     (TraceSettings, "samples_per_tx"): ("[1, 1e+08]", (1, 10**8), (0, 10**8 + 1)),

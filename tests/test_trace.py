@@ -14,7 +14,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.scene import export_scene
 from sionna_partial.tracing.sionna_rt import load_sionna
-from sionna_partial.tracing.trace import TracedLinks, trace_links
+from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 NO_FLOOR = SceneSettings(floor_extent="none")
@@ -423,3 +423,24 @@ def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: Parti
         recalled.append((same & (links.interactions[ours] == kind[index, path]).all(axis=1)).any())
     assert len(recalled) > 100
     assert np.mean(recalled) > 0.999
+
+
+class TestTraceEach:
+    def test_equals_separate_traces(self) -> None:
+        partial, rng = _half_seen_room(), np.random.default_rng(0)
+        tx = [np.array([1.0, 1.5, 1.5]), np.array([2.0, 3.0, 1.2])]
+        rx = [np.column_stack([rng.uniform(0.5, 2.5, (n, 2)), np.full(n, 1.4)]) for n in (7, 3)]
+        for links, place, receivers in zip(trace_each(partial, tx, rx), tx, rx, strict=True):
+            alone = trace_links(partial, place, receivers)
+            for name in ("tx", "rx", "link_state", "gain_db", "path_rx", "delay_s", "a", "vertices_m", "interactions"):
+                np.testing.assert_array_equal(getattr(links, name), getattr(alone, name))
+            assert links.settings == alone.settings
+
+    def test_receivers_of_one_transmitter_alone(self) -> None:
+        first, second = trace_each(_room(), [(1.0, 1.0, 1.5), (2.0, 1.0, 1.5)], [np.empty((0, 3)), [(1.5, 2.0, 1.5)]])
+        assert (len(first.rx), len(first.a)) == (0, 0)
+        assert second.link_state.tolist() == [LinkState.LOS]
+
+    def test_receiver_in_a_wall(self) -> None:
+        with pytest.raises(PositionError, match="is inside a wall"):
+            trace_each(_room(), [(1.0, 1.0, 1.5)], [[(0.05, 0.05, 1.5)]])

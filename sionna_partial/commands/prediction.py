@@ -1,8 +1,7 @@
 """Subcommands from a map to its coverage: predict, export-scene, explore, demo, info."""
 
-from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -20,10 +19,13 @@ from sionna_partial.commands.shell import (
 )
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".yaml")
 """Formats of a coverage map."""
+
+FRAMES = 50
+"""About the number of frames in an animation."""
 
 
 def predict(
@@ -37,7 +39,12 @@ def predict(
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
-    predictor: Annotated[str, typer.Option(help="'paper', or a .keras file. Default: the shipped one.")] = "",
+    predictor: Annotated[
+        str, typer.Option(help="'paper', or a .keras file. Default: the shipped one.")
+    ] = "",
+    receivers: Annotated[
+        str, typer.Option(metavar="indoor|anywhere", help="Given that receivers are indoors, or outside in outage.")
+    ] = "indoor",
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
@@ -65,6 +72,7 @@ def predict(
             predictor=predictor or None,
             scene_settings=scene_settings,
             trace_settings=trace_settings,
+            receivers=receivers,
             progress=lambda share, message: report(0.9 * share, message),
         )
         names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
@@ -100,21 +108,43 @@ def explore(
     home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
     steps: Annotated[list[int], typer.Option(help="Robot steps; may be repeated.")] = [50, 100, 150, 200],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of the home and of the robot.")] = 0,
+    range_noise: Annotated[float, typer.Option(help="Standard deviation of the camera's ranges [m].")] = 0.0,
+    drift: Annotated[float, typer.Option(help="Growth of the robot's error of position [m per m of way].")] = 0.0,
+    missed_walls: Annotated[float, typer.Option(help="Share of walls that the camera misses, as glass [1].")] = 0.0,
     height_band: HeightBandOption = None,
     up: UpOption = None,
 ) -> None:
-    """Explore a home with a robot, and write its partial maps."""
-    from sionna_partial.maps.explore import explore as explore_home
-    from sionna_partial.maps.homes import make_home
-    from sionna_partial.maps.map_files import load_map, save_map
+    """Explore a home with a robot, and write its partial maps, a picture and an animation."""
+    sensor = SensorSettings(range_noise, drift, missed_walls)
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "reading the home" if home else "making a home")
+        from sionna_partial.maps.explore import explore_trajectory
+        from sionna_partial.maps.homes import make_home
+        from sionna_partial.maps.map_files import load_map, save_map
+        from sionna_partial.plots.exploration_plot import animate_exploration, plot_exploration
+        from sionna_partial.plots.figures import figure_png
 
-    complete = load_map(home, height_band_m=height_band, up=up) if home else make_home(seed)
-    suffix = ".yaml" if complete.mesh is None else ".npz"
-    maps = {f"steps_{count:03d}{suffix}": partial for count, partial in _by_steps(explore_home, complete, steps, seed)}
-    maps[f"complete{suffix}"] = complete
-    for name, partial in maps.items():
-        save_map(partial, out / name)
-    print_files([out / name for name in maps])
+        complete = load_map(home, height_band_m=height_band, up=up) if home else make_home(seed)
+        frames = range(0, max(steps) + 1, max(1, max(steps) // FRAMES))
+        exploration = explore_trajectory(
+            complete,
+            sorted({*steps, *frames}),
+            seed,
+            sensor=sensor,
+            progress=lambda share, message: report(0.1 + 0.4 * share, message),
+        )
+        asked, suffix = exploration.at(steps), ".yaml" if complete.mesh is None else ".npz"
+        maps = {f"steps_{count:03d}{suffix}": partial for count, partial in zip(asked.steps, asked.maps, strict=True)}
+        maps[f"complete{suffix}"] = complete
+        with atomic_files(out) as folder:
+            for name, partial in maps.items():
+                save_map(partial, folder / name)
+            report(0.6, "drawing exploration.png")
+            (folder / "exploration.png").write_bytes(figure_png(plot_exploration(asked)))
+            report(0.7, "drawing exploration.gif")
+            animate_exploration(exploration, folder / "exploration.gif")
+    print_files([out / name for name in (*maps, "exploration.png", "exploration.gif")])
 
 
 def demo(
@@ -152,9 +182,3 @@ def _parse_format(name: str) -> str:
     if suffix not in FORMATS:
         raise typer.BadParameter(f"--format {name!r} is not known: choose from {', '.join(FORMATS)}.")
     return suffix
-
-
-def _by_steps(
-    explore_home: Callable[..., list[Any]], home: Any, steps: Sequence[int], seed: int
-) -> Iterator[tuple[int, Any]]:
-    return zip(steps, explore_home(home, steps=tuple(steps), seed=seed), strict=True)

@@ -1,6 +1,8 @@
 """What all subcommands share: options, numbers, progress, and the files that were written."""
 
 import itertools
+import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,6 +33,10 @@ MaterialOption = Annotated[
     str, typer.Option(help="ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall.")
 ]
 FrequencyOption = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
+
+
+LINE_S = 60.0
+"""Time between two lines of progress where there is no terminal [s]."""
 
 
 class TransmitterCommand(TyperCommand):
@@ -112,6 +118,55 @@ def show_progress() -> Iterator[Callable[[float, str], None]]:
             bar.live.transient, console.quiet = True, not console.is_terminal  # the error that follows stands alone
             raise
         bar.update(task, completed=1.0, description="done")
+
+
+@contextmanager
+def show_rate(unit: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Show on stderr how many things are done, how many a minute, and the time left.
+
+    A terminal has a bar, other output a line a minute. Things that were done when it was first told do not count for
+    the rate.
+
+    Parameters
+    ----------
+    unit : str
+        What the things are, in the plural.
+
+    Yields
+    ------
+    callable
+        To be called as ``report(done, total, message)``.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (BarColumn(), MofNCompleteColumn(), TextColumn(unit), TextColumn("{task.fields[pace]}"))
+    with Progress(*columns, TextColumn("{task.description}"), console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=None, pace="")
+        first: tuple[int, float] | None = None
+        said = -math.inf
+
+        def report(done: int, total: int, message: str) -> None:
+            nonlocal first, said
+            now = time.monotonic()
+            first = first or (done, now)
+            pace = rate_and_rest(done - first[0], total - done, now - first[1])
+            bar.update(task, completed=done, total=total, pace=pace, description=message)
+            if not console.is_terminal and (now - said >= LINE_S or done == total):
+                said = now
+                typer.echo(f"{done} of {total} {unit} {pace} {message}".replace("  ", " "), err=True)
+
+        yield report
+
+
+def rate_and_rest(done: int, rest: int, elapsed_s: float) -> str:
+    """Return how many a minute were done, and how long the rest takes at that rate; "" where nothing was done."""
+    if not done or elapsed_s <= 0.0:
+        return ""
+    rest_s = round(rest * elapsed_s / done)
+    hours, minutes, seconds = rest_s // 3600, rest_s // 60 % 60, rest_s % 60
+    return f"({60.0 * done / elapsed_s:.3g}/min, {hours}:{minutes:02}:{seconds:02} left)"
 
 
 def print_files(files: Sequence[Path]) -> None:

@@ -1,7 +1,7 @@
 """Predictor: LinkFeatures -> LinkPrediction, the paper's link-state classifier, gain networks and indoor model."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,6 +34,8 @@ SHIPPED = ("paper",)
 @dataclass(frozen=True, eq=False)
 class LinkPrediction:
     """Predictive distribution of link state and path gain of N links; every array is (N,) float64.
+
+    `Predictor.predict` makes it for receivers that are indoors, `anywhere` for receivers that may be outside.
 
     Parameters
     ----------
@@ -97,6 +99,42 @@ class LinkPrediction:
         """
         probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
+
+    def take(self, index: NDArray[np.generic] | slice) -> "LinkPrediction":
+        """Return the links that an index array, a mask (N,) or a slice selects."""
+        return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
+
+    def anywhere(self, p_indoor: ArrayLike) -> "LinkPrediction":
+        """Return the distribution for receivers that may be outside, where every link is in outage.
+
+        By total probability (paper, "Indoor-Outdoor Estimation"), the probabilities of LOS and NLOS are those of a
+        receiver indoors times `p_indoor`, the rest is outage; mean and spread of the gain follow.
+
+        Parameters
+        ----------
+        p_indoor : (N,) array-like
+            Probability that each receiver is indoors.
+
+        Returns
+        -------
+        LinkPrediction
+
+        Raises
+        ------
+        PredictorError
+            For another shape, or a value outside [0, 1].
+        """
+        share = link_numbers("p_indoor", p_indoor, len(self.p_los))
+        wrong = (share < 0.0) | (share > 1.0)
+        if wrong.any():
+            index = int(np.argmax(wrong))
+            raise PredictorError(f"p_indoor[{index}] = {share[index]:g} is not allowed: it lies between 0 and 1.")
+        floor = np.full_like(share, GAIN_FLOOR_DB)
+        return LinkPrediction.of_parts(
+            np.stack([share * self.p_outage + (1.0 - share), share * self.p_los, share * self.p_nlos]),
+            np.stack([floor, self.gain_los_mean_db, self.gain_nlos_mean_db]),
+            np.stack([np.zeros_like(share), self.gain_los_std_db, self.gain_nlos_std_db]),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,10 +234,13 @@ class Predictor:
     def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> "Predictor":
         """Return this predictor with P(indoor) trained (paper, "Indoor-Outdoor Estimation").
 
+        A receiver that the map shows in a free cell is indoors for certain. `predict_map` and `evaluate` take P(indoor)
+        for the others only, and `train` fits it to the others only; the paper takes receivers from the whole map.
+
         Parameters
         ----------
         features : LinkFeatures
-            Of N links whose receivers are drawn uniformly over the map area.
+            Of N links whose receivers are drawn uniformly over the part of the map area for which it is wanted.
         inside : (N,) array-like of bool
             Whether the receiver is indoors.
 

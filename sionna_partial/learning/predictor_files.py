@@ -7,6 +7,7 @@ classes of Keras that our networks are made of, and is loaded in safe mode.
 import hashlib
 import io
 import json
+import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -29,6 +30,9 @@ _MAX_BYTES = 64_000_000
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _LAYERS = {"Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"}
 _CLASSES = _LAYERS | {"Maximum", "Log10", "DTypePolicy", "GlorotUniform", "Zeros", "Constant", "__keras_tensor__"}
+_COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
+"""Names that Keras numbers through a process; each of our networks has one of each."""
+
 _FIXED_ENTRIES = {
     "format": FORMAT,
     "features": list(FEATURES),
@@ -38,7 +42,7 @@ _FIXED_ENTRIES = {
 
 
 def pack(model: "keras.Model") -> bytes:
-    """Return the bytes of the `.keras` archive of a model, without dates and addresses that differ from run to run."""
+    """Return the `.keras` archive of a model, without dates, addresses and counters that differ from run to run."""
     with temporary_folder() as folder:
         path = folder / f"model{SUFFIX}"
         model.save(path)
@@ -48,6 +52,7 @@ def pack(model: "keras.Model") -> bytes:
                 content = source.read(name)
                 if name.endswith(".json"):
                     content = json.dumps(json.loads(content, object_hook=_without_run), sort_keys=True).encode()
+                    content = _COUNTED.sub(rb'"\1"', content)
                 target.writestr(zipfile.ZipInfo(name, _FIXED_DATE), content, zipfile.ZIP_DEFLATED)
     return packed.getvalue()
 

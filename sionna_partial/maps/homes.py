@@ -2,11 +2,12 @@
 
 A plan is drawn as polygons in metres: an outline, its division into rooms by corridors and walls, openings along a
 spanning tree of the rooms (so that every room can be reached) and a few more, then furniture where it leaves room to
-walk. Only at the end is it turned and put onto cells.
+walk. Only at the end is it turned and put onto cells, where walls and furniture swell a little, evenly or in waves, as
+they do on the maps that robots and scanners make. `docs/homes.md` compares the homes with real ones.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -18,17 +19,18 @@ from rasterio.transform import Affine
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
-from shapely import LineString, MultiPolygon, Polygon, affinity, box
+from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
 from sionna_partial.constants import CellState
+from sionna_partial.maps.furniture import GRID_M, NEAR_M, furnish, parts_of, union_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import require, require_number
 
 HomeKind = Literal["apartment", "house", "office"]
 
 WALK_M = 0.5
-"""Width that furniture leaves to walk through [m]."""
+"""Width that walls and furniture leave to walk through [m]."""
 
 DOOR_M = (0.8, 1.0)
 """Width of doors [m]."""
@@ -36,8 +38,8 @@ DOOR_M = (0.8, 1.0)
 WIDE_M = (1.2, 2.5)
 """Width of wide openings [m]."""
 
-LOCKED_SHARE = 0.15
-"""Share of the rooms at dead ends that stay locked."""
+LOCKED_SHARE = 0.25
+"""Share of the rooms at dead ends that stay locked, on average."""
 
 LEAF_SHARE = 0.2
 """Share of the doors whose leaf stands open into a room."""
@@ -45,16 +47,17 @@ LEAF_SHARE = 0.2
 _MARGIN_M = 0.3
 _JAMB_M = 0.05
 _CORRIDOR_SHAPE = 25
-_NEAR_M = 0.01
-_GRID_M = 1e-5
 _SLIVER_M = 0.1
 _WALKED_SHARE = 0.97
 _SMALLEST_ROOM_M2 = 1.0
+_SMALLEST_M2 = 3.0
+_WAVES = 12
+_WAVE_PER_M = 0.5
 
 
 @dataclass(frozen=True)
 class _Style:
-    """Ranges and probabilities of a kind of home; lengths in metres, areas in square metres."""
+    """Ranges and probabilities of a kind of home, or what one home has; lengths in metres, areas in square metres."""
 
     share: float
     area: tuple[float, float]
@@ -65,16 +68,24 @@ class _Style:
     openness: float
     more_doors: float
     pillars: float
+    locked: float = LOCKED_SHARE
     wall: float = 0.1
     clutter: float = 1.0
+    swelling: float = 0.0
+    raggedness: float = 0.0
+
+    @property
+    def walk(self) -> float:
+        """Width of ways before walls and furniture swell."""
+        return WALK_M + 2 * self.swelling
 
 
 STYLES: dict[str, _Style] = {
-    "apartment": _Style(0.45, (40, 120), (7, 20), 0.35, 0.6, (0.9, 1.4), 0.35, 0.15, 0.1),
-    "house": _Style(0.40, (60, 300), (9, 26), 0.35, 0.55, (1.0, 1.6), 0.35, 0.25, 0.15),
-    "office": _Style(0.15, (90, 600), (10, 40), 0.1, 0.95, (1.4, 2.4), 0.2, 0.15, 0.5),
+    "apartment": _Style(0.5, (30, 150), (7, 20), 0.35, 0.5, (0.9, 1.4), 0.4, 0.15, 0.1),
+    "house": _Style(0.35, (40, 230), (9, 26), 0.35, 0.5, (1.0, 1.6), 0.4, 0.25, 0.15),
+    "office": _Style(0.15, (90, 600), (10, 40), 0.1, 0.95, (1.4, 2.4), 0.2, 0.15, 0.5, 0.1, clutter=0.5),
 }
-"""The kinds of homes that can be made."""
+"""The kinds of homes that can be made; areas are those of the outline."""
 
 
 def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 0.05) -> PartialMap:
@@ -92,8 +103,8 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
     Returns
     -------
     PartialMap
-        Free inside, walls one or more cells thick around everything free, unknown elsewhere. All free cells are
-        connected, and nothing is missing (`is_complete`).
+        Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture. All
+        free cells are connected, and nothing is missing (`is_complete`). Walls meet at least at the corners of cells.
 
     Raises
     ------
@@ -109,55 +120,62 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
     plan = _draw(rng, style)
     while plan is None:
         plan = _draw(rng, style)
-    thickness_m = rng.choice([0.0, rng.uniform(0.05, 0.2)])
+    thickness_m = rng.choice([0.0, rng.uniform(0.13, 0.25)], p=[0.85, 0.15])
+    corners = bool(thickness_m > 0 or rng.random() < 0.3)
     angle_deg = float(rng.choice([0.0, rng.uniform(-45, 45)], p=[0.3, 0.7]))
-    free, lines = (affinity.rotate(shape, angle_deg, origin=(0, 0)) for shape in plan)
-    state = _cells(free, lines, resolution_m, max(1, round(thickness_m / resolution_m)))
+    free, lines = (affinity.rotate(shape, angle_deg, origin=(0, 0)) for shape in (plan.free, plan.lines))
+    state = _cells(free, lines, resolution_m, max(1, round(thickness_m / resolution_m)), corners, plan)
     return PartialMap(state, resolution_m, interior_cells=int((state == CellState.FREE).sum()))
 
 
-def _draw(rng: np.random.Generator, kind: _Style) -> tuple[Polygon, shapely.Geometry] | None:
-    """Free area and wall lines of one home; None if too much of it cannot be reached."""
+@dataclass(frozen=True)
+class _Plan:
+    """One home: free area and wall lines [m], how far walls and furniture swell [m], and the share and waves of it."""
+
+    free: Polygon
+    lines: shapely.Geometry
+    swelling_m: float
+    raggedness: float
+    waves: NDArray[np.float64]
+
+
+def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
+    """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
     outline = _outline(rng, _log_uniform(rng, style.area))
     rooms = [core for piece in _rooms(rng, outline, style) for core in _cores(piece)]
     rooms, openings = _connected(rng, rooms, style)
     leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < LEAF_SHARE]
-    gaps = _union([opening.buffer(0.05, cap_style="flat") for opening in openings])
-    lines = _union([room.boundary for room in rooms]).difference(gaps, grid_size=_GRID_M)
+    gaps = union_of([opening.buffer(0.05, cap_style="flat") for opening in openings])
+    lines = union_of([room.boundary for room in rooms]).difference(gaps, grid_size=GRID_M)
     walls = lines.buffer(style.wall / 2, cap_style="flat", join_style="mitre")
-    lines, walls = _union([lines, *leaves]), _union([walls, *shapely.buffer(leaves, _NEAR_M)])
-    things = [thing for room in rooms for thing in _things(rng, room, walls, openings, style)]
-    gaps = _union([opening.buffer(style.wall, cap_style="flat") for opening in openings])
-    free = _union([*rooms, gaps]).difference(_union([walls, *things]), grid_size=_GRID_M)
+    lines, walls = union_of([lines, *leaves]), union_of([walls, *shapely.buffer(leaves, NEAR_M)])
+    fill = {"walk_m": style.walk, "clutter": style.clutter, "pillars": style.pillars}
+    things = [thing for room in rooms for thing in furnish(rng, room, walls, openings, **fill)]
+    gaps = union_of([opening.buffer(style.wall, cap_style="flat") for opening in openings])
+    free = union_of([*rooms, gaps]).difference(union_of([walls, *things]), grid_size=GRID_M)
     free = free.buffer(-_SLIVER_M, join_style="mitre").buffer(_SLIVER_M, join_style="mitre")
-    walked = _parts(free.buffer(-WALK_M / 2))
-    if not walked or walked[0].area < _WALKED_SHARE * sum(part.area for part in walked):
+    walked = parts_of(free.buffer(-style.walk / 2))
+    if not walked or walked[0].area < max(_SMALLEST_M2, _WALKED_SHARE * sum(part.area for part in walked)):
         return None
-    return next(part for part in _parts(free) if part.intersects(walked[0])), lines
+    free = next(part for part in parts_of(free) if part.intersects(walked[0]))
+    return _Plan(free, lines, style.swelling, style.raggedness, rng.normal(size=(_WAVES, 3)))
 
 
 def _varied(rng: np.random.Generator, style: _Style) -> _Style:
     """Style of one home: larger or smaller rooms, more open, fuller, thicker walls than its kind has on average."""
-    scale = float(rng.uniform(0.6, 1.6))
+    scale = _log_uniform(rng, (0.45, 3.5))
     return replace(
         style,
         room_area=(scale * style.room_area[0], scale * style.room_area[1]),
-        openness=style.openness * rng.uniform(0, 2),
-        wall=rng.choice([rng.uniform(0.05, 0.2), rng.uniform(0.2, 0.45)]),
-        clutter=rng.choice([0.15, rng.uniform(0.3, 2.5)], p=[0.25, 0.75]),
+        openness=style.openness * 3 * rng.random() ** 2,
+        more_doors=style.more_doors * rng.uniform(0, 2),
+        locked=style.locked * rng.uniform(0, 2),
+        wall=rng.choice([rng.uniform(0.05, 0.2), rng.uniform(0.2, 0.4)], p=[0.7, 0.3]),
+        clutter=style.clutter * rng.choice([rng.uniform(0, 0.5), rng.uniform(0.5, 6.0)], p=[0.25, 0.75]),
+        swelling=rng.choice([0.0, rng.uniform(0.04, 0.14)], p=[0.15, 0.85]),
+        raggedness=rng.choice([0.0, rng.uniform(0.0, 0.7)], p=[0.3, 0.7]),
     )
-
-
-def _union(shapes: Iterable[shapely.Geometry]) -> shapely.Geometry:
-    """Union of shapes on a fine grid, where almost equal corners cannot break it."""
-    return shapely.union_all(list(shapes), grid_size=_GRID_M)
-
-
-def _parts(shape: shapely.Geometry) -> list[Polygon]:
-    """Polygons of a shape, the largest first."""
-    polygons = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
-    return sorted(polygons, key=lambda part: -part.area)
 
 
 def _log_uniform(rng: np.random.Generator, between: tuple[float, float]) -> float:
@@ -169,7 +187,7 @@ def _outline(rng: np.random.Generator, area: float) -> Polygon:
     width, height = rng.uniform(1.0, 2.0), 1.0
     outline = box(0, 0, width, height)
     corners = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0)]
-    cut_count = rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])
+    cut_count = rng.choice([0, 1, 2, 3], p=[0.2, 0.4, 0.25, 0.15])
     for x, y in rng.permutation(corners)[:cut_count]:
         across, along = rng.uniform(0.2, 0.5, 2) * (width, height)
         notch = box(x - across, y - along, x + across, y + along)
@@ -178,13 +196,13 @@ def _outline(rng: np.random.Generator, area: float) -> Polygon:
         elif rng.random() < 0.2:
             notch = affinity.rotate(notch, rng.uniform(20, 70))
         outline = outline.difference(notch)
-    if rng.random() < 0.12:
-        wing = box(0, 0, rng.uniform(0.6, 1.0), rng.uniform(0.4, 0.6))
-        wing = affinity.rotate(wing, rng.uniform(-50, 50), origin=(0, 0))
+    if rng.random() < 0.3:
+        wing = box(0, 0, rng.uniform(0.5, 1.0), rng.uniform(0.2, 0.6))
+        wing = affinity.rotate(wing, rng.choice([0, 90, rng.uniform(-50, 50)]), origin=(0, 0))
         outline = outline.union(affinity.translate(wing, 0.8 * width, 0.3 * height))
-    outline = _parts(outline)[0]
+    outline = parts_of(outline)[0]
     outline = affinity.scale(outline, *[math.sqrt(area / outline.area)] * 2, origin=(0, 0))
-    for _ in range(rng.poisson(1.0)):
+    for _ in range(rng.poisson(2.0)):
         place = outline.exterior.interpolate(rng.random(), normalized=True)
         bay = affinity.translate(box(-0.5, -0.5, 0.5, 0.5), place.x, place.y)
         outline = outline.union(affinity.scale(bay, *rng.uniform(0.9, 2.5, 2)))
@@ -205,9 +223,9 @@ def _rooms(rng: np.random.Generator, outline: Polygon, style: _Style) -> Iterato
         ]
         first = int(y1 - y0 > x1 - x0)
         corridor = strips[first].union(strips[1 - first]) if rng.random() < 0.3 else strips[first]
-        yield from _parts(outline.intersection(corridor))
+        yield from parts_of(outline.intersection(corridor))
         rest = outline.difference(corridor)
-    for part in _parts(rest):
+    for part in parts_of(rest):
         yield from _divide(rng, part, style)
 
 
@@ -227,7 +245,7 @@ def _divide(rng: np.random.Generator, part: Polygon, style: _Style) -> Iterator[
     cut = LineString([(x, y0 - 99), (x, y1 + 99)] if x1 - x0 > y1 - y0 else [(x0 - 99, y), (x1 + 99, y)])
     if big and rng.random() < 0.12:
         cut = affinity.rotate(cut, rng.uniform(-35, 35), origin=(x, y))
-    for piece in _parts(split(part, cut)):
+    for piece in parts_of(split(part, cut)):
         if big:
             yield from _divide(rng, piece, style)
         else:
@@ -238,7 +256,7 @@ def _cores(piece: Polygon) -> list[Polygon]:
     """Parts of a piece that are wide enough for a room; the rest is solid."""
     half_m = DOOR_M[0] / 2
     wide = piece.buffer(-half_m, join_style="mitre").buffer(half_m, join_style="mitre")
-    return [core for core in _parts(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
+    return [core for core in parts_of(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
 
 
 def _connected(rng: np.random.Generator, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString]]:
@@ -250,7 +268,7 @@ def _connected(rng: np.random.Generator, rooms: list[Polygon], style: _Style) ->
     tree = _tree(rng, rooms, [pairs[k] for k in wide])
     doors = [k for k in wide if pairs[k] in tree or rng.random() < style.more_doors]
     degree = np.bincount([room for k in doors for room in pairs[k]], minlength=len(rooms))
-    locked = (degree == 0) | ((degree == 1) & (rng.random(len(rooms)) < LOCKED_SHARE))
+    locked = (degree == 0) | ((degree == 1) & (rng.random(len(rooms)) < style.locked))
     if locked.all():
         return rooms[:1], []
     openings = [_opening(rng, walls[k], style, jamb_m) for k in doors if not locked[list(pairs[k])].any()]
@@ -268,9 +286,9 @@ def _tree(rng: np.random.Generator, rooms: list[Polygon], pairs: list[tuple[int,
 
 def _common_wall(room: Polygon, other: Polygon) -> LineString:
     """Longest straight wall between two rooms; empty if there is none."""
-    if room.distance(other) > _NEAR_M:
+    if room.distance(other) > NEAR_M:
         return LineString()
-    shared = shapely.line_merge(room.boundary.intersection(other.buffer(_NEAR_M)))
+    shared = shapely.line_merge(room.boundary.intersection(other.buffer(NEAR_M)))
     sides = [
         LineString(ends)
         for line in shapely.get_parts(shared)
@@ -297,50 +315,9 @@ def _leaf(rng: np.random.Generator, opening: LineString) -> LineString:
     return affinity.rotate(opening, rng.choice([-1, 1]) * rng.uniform(75, 110), origin=hinge)
 
 
-def _things(
-    rng: np.random.Generator, room: Polygon, walls: Polygon, openings: list[LineString], style: _Style
-) -> Iterator[Polygon]:
-    """Furniture and pillars of a room that leave a way through it and to its openings."""
-    near = [opening for opening in openings if opening.distance(room) < _NEAR_M]
-    doorsteps = _union([opening.buffer(WALK_M, cap_style="flat") for opening in near])
-    ways = [opening.buffer(1.5 * WALK_M, cap_style="flat") for opening in near]
-    left = MultiPolygon(_parts(_union([room, *ways]).difference(walls, grid_size=_GRID_M)))
-    things = [_furniture(rng, room) for _ in range(rng.poisson(style.clutter * room.area / 4) if room.area > 4 else 0)]
-    if room.area > 20 and rng.random() < style.pillars:
-        things += [_place(rng, room, box(-s, -s, s, s)) for s in rng.uniform(0.12, 0.3, int(room.area / 15))]
-    for thing in things:
-        thing = MultiPolygon(_parts(thing.intersection(room.difference(doorsteps), grid_size=_GRID_M)))
-        now = MultiPolygon(_parts(left.difference(thing, grid_size=_GRID_M)))
-        walkable = now.buffer(-WALK_M / 2)
-        if walkable.geom_type == "Polygon" and not walkable.is_empty:
-            left = now
-            yield thing
-
-
-def _place(rng: np.random.Generator, room: Polygon, thing: Polygon) -> Polygon:
-    """Put a thing somewhere into the bounds of a room."""
-    x0, y0, x1, y1 = room.bounds
-    return affinity.translate(thing, rng.uniform(x0, x1), rng.uniform(y0, y1))
-
-
-def _furniture(rng: np.random.Generator, room: Polygon) -> Polygon:
-    """Piece of furniture beside a wall or in the middle of a room, plain, round or with chairs around it."""
-    half_width, half_depth = rng.uniform(0.2, 1.0), rng.uniform(0.2, 0.6)
-    thing = box(-half_width, -half_depth, half_width, half_depth)
-    if rng.random() < 0.2:
-        thing = affinity.scale(shapely.Point(0, 0).buffer(1.0), half_width, half_depth)
-    if rng.random() < 0.5:
-        spots = [thing.exterior.interpolate(where, normalized=True) for where in rng.random(rng.integers(2, 6))]
-        thing = _union([thing, *(spot.buffer(rng.uniform(0.12, 0.3), quad_segs=2) for spot in spots)])
-    if rng.random() < 0.35:
-        return _place(rng, room, affinity.rotate(thing, rng.choice([0, 90, rng.uniform(0, 180)], p=[0.4, 0.4, 0.2])))
-    along = rng.uniform(0, room.exterior.length)
-    here, there = (room.exterior.interpolate(at % room.exterior.length) for at in (along, along + 0.05))
-    angle = math.atan2(there.y - here.y, there.x - here.x)
-    return affinity.translate(affinity.rotate(thing, angle, use_radians=True), here.x, here.y)
-
-
-def _cells(free: Polygon, lines: shapely.Geometry, resolution_m: float, wall_cells: int) -> NDArray[np.uint8]:
+def _cells(
+    free: Polygon, lines: shapely.Geometry, resolution_m: float, wall_cells: int, corners: bool, plan: _Plan
+) -> NDArray[np.uint8]:
     """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
     x0, y0, x1, y1 = free.bounds
     margin = _MARGIN_M + wall_cells * resolution_m
@@ -349,7 +326,23 @@ def _cells(free: Polygon, lines: shapely.Geometry, resolution_m: float, wall_cel
     grid = {"out_shape": shape, "transform": Affine(resolution_m, 0, x, 0, resolution_m, y), "dtype": np.uint8}
     inside = rasterize([free], **grid).astype(bool)
     inside &= ~rasterize([lines], all_touched=True, **grid).astype(bool)
-    labels, _ = ndimage.label(inside)
-    inside = labels == np.argmax(np.bincount(labels[inside]))
-    beside = ndimage.binary_dilation(inside, np.ones((3, 3)), iterations=wall_cells)
+    inside = _largest(inside & ~_swollen(inside, resolution_m, plan))
+    beside = ndimage.binary_dilation(inside, ndimage.generate_binary_structure(2, 1 + corners), iterations=wall_cells)
     return np.where(inside, CellState.FREE, np.where(beside, CellState.WALL, CellState.UNKNOWN)).astype(np.uint8)
+
+
+def _largest(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Largest connected part of a mask."""
+    labels, _ = ndimage.label(mask)
+    return labels == np.argmax(np.bincount(labels[mask]))
+
+
+def _swollen(inside: NDArray[np.bool_], resolution_m: float, plan: _Plan) -> NDArray[np.bool_]:
+    """Cells that walls and furniture take by swelling: as far everywhere, or farther here than there."""
+    y, x = np.indices(inside.shape) * resolution_m
+    wave = np.zeros(inside.shape)
+    for per_x, per_y, turns in plan.waves:
+        wave += np.sin(2 * math.pi * (_WAVE_PER_M * (per_x * x + per_y * y) + turns))
+    share = 1 - plan.raggedness * (0.5 + 0.5 * np.clip(wave / math.sqrt(2 * _WAVES), -1, 1))
+    distance_m = (ndimage.distance_transform_edt(inside) - 0.5) * resolution_m
+    return distance_m < plan.swelling_m * share

@@ -6,8 +6,11 @@ from matplotlib.figure import Figure
 
 from sionna_partial.constants import LinkState
 
-STATE_COLOURS = {LinkState.LOS: "#ddaa33", LinkState.NLOS: "#bb5566", LinkState.OUTAGE: "#004488"}
-"""Paul Tol's high-contrast colours: told apart with any colour vision and in grey, the better the brighter."""
+YELLOW, RED, BLUE = "#ddaa33", "#bb5566", "#004488"
+"""Paul Tol's high-contrast colours: told apart with any colour vision and in grey."""
+
+STATE_COLOURS = {LinkState.LOS: YELLOW, LinkState.NLOS: RED, LinkState.OUTAGE: BLUE}
+"""The better the link, the brighter."""
 
 
 def figure_png(figure: Figure) -> bytes:

@@ -2,9 +2,10 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from functools import partial as partial_function
 from pathlib import Path
 
@@ -142,11 +143,82 @@ def trace_links(
     tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
-    shift = np.array([*partial.origin_m, 0.0])
-    columns = PathColumns(max(1, settings.max_depth))
-    if len(rx_m):
-        with temporary_folder() as folder:
-            solve, at_once = _solver(partial, folder, settings, scene_settings)
+    with temporary_folder() as folder:
+        tracer = _Tracer(partial, folder, settings, scene_settings)
+        return tracer.links(tx_m.reshape(np.shape(tx)), rx_m, report)
+
+
+def trace_each(
+    partial: PartialMap,
+    tx: Sequence[ArrayLike],
+    rx: Sequence[ArrayLike],
+    *,
+    settings: TraceSettings | None = None,
+    scene_settings: SceneSettings | None = None,
+) -> list[TracedLinks]:
+    """Trace every path from each of T transmitters to receivers of its own, on a scene that is built once.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    tx : sequence of T (3,) array-likes
+        Transmitter positions [m].
+    rx : sequence of T (N, 3) array-likes
+        Receiver positions of each transmitter [m]; N may differ, and be 0.
+    settings : TraceSettings, optional
+    scene_settings : SceneSettings, optional
+
+    Returns
+    -------
+    list of T TracedLinks
+        Each is what `trace_links` gives for that transmitter and its receivers, whose errors are raised here too.
+    """
+    settings, scene_settings = checked_settings(partial, settings, scene_settings)
+    places = [
+        checked_positions(partial, place, receivers, settings.frequency_hz)
+        for place, receivers in zip(tx, rx, strict=True)
+    ]
+    with temporary_folder() as folder:
+        tracer = _Tracer(partial, folder, settings, scene_settings)
+        return [tracer.links(tx_m[0], rx_m, lambda share, message: None) for tx_m, rx_m in places]
+
+
+@dataclass(frozen=True)
+class _Tracer:
+    """Traces links on one scene, which is written to `folder` when the first are asked for."""
+
+    partial: PartialMap
+    folder: Path
+    settings: TraceSettings
+    scene_settings: SceneSettings
+
+    @cached_property
+    def solver(self) -> tuple[Solve, int]:
+        """How paths are found, and for how many receivers at once."""
+        return _solver(self.partial, self.folder, self.settings, self.scene_settings)
+
+    def links(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> TracedLinks:
+        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3) [m]."""
+        places = tx_m.reshape(-1, 3)
+        paths = self._paths(places, rx_m, report)
+        shape = (*tx_m.shape[:-1], len(rx_m))
+        link_state, gain_db = _summary(paths, len(places), len(rx_m))
+        return TracedLinks(
+            tx=tx_m,
+            rx=rx_m,
+            link_state=link_state.reshape(shape),
+            gain_db=gain_db.reshape(shape),
+            **{field.name: getattr(paths, field.name) for field in fields(SolvedPaths)},
+            settings=self.settings,
+            scene_settings=self.scene_settings,
+        )
+
+    def _paths(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> SolvedPaths:
+        """Find all paths between transmitters (T, 3) and receivers (N, 3) [m]."""
+        shift = np.array([*self.partial.origin_m, 0.0])
+        columns = PathColumns(max(1, self.settings.max_depth))
+        if len(rx_m):
+            solve, at_once = self.solver
             blocks = [(tx, start) for tx in range(len(tx_m)) for start in range(0, len(rx_m), at_once)]
             for number, (index, start) in enumerate(blocks):
                 parts = []
@@ -154,19 +226,9 @@ def trace_links(
                     parts.append(paths.between(index, start))
                     report(0.1 + 0.9 * (number + share) / len(blocks), message)
                 columns.append(parts)
-    paths = columns.paths()
-    paths.vertices_m[:] += shift
-    shape = (*np.shape(tx)[:-1], len(rx_m))
-    link_state, gain_db = _summary(paths, len(tx_m), len(rx_m))
-    return TracedLinks(
-        tx=tx_m.reshape(*np.shape(tx)),
-        rx=rx_m,
-        link_state=link_state.reshape(shape),
-        gain_db=gain_db.reshape(shape),
-        **{field.name: getattr(paths, field.name) for field in fields(SolvedPaths)},
-        settings=settings,
-        scene_settings=scene_settings,
-    )
+        found = columns.paths()
+        found.vertices_m[:] += shift
+        return found
 
 
 def checked_settings(

@@ -1,0 +1,139 @@
+"""Subcommands of learning: dataset, train, evaluate."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sionna_partial.commands.shell import (
+    FrequencyOption,
+    MaterialOption,
+    parse_material,
+    print_files,
+    show_progress,
+    show_rate,
+)
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ
+from sionna_partial.files import require_writable
+from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSettings
+
+DatasetArgument = Annotated[
+    Path, typer.Argument(metavar="DATASET", help="Folder that `dataset` wrote.", show_default=False)
+]
+
+DEFAULT_HOMES = 100
+"""Number of homes that are made where no map is given."""
+
+
+def dataset(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set.", show_default=False)],
+    homes: Annotated[
+        int | None, typer.Option(min=0, help=f"Homes to make. Default: {DEFAULT_HOMES}, or 0 with --map.")
+    ] = None,
+    first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 10_000,
+    maps: Annotated[
+        list[Path] | None,
+        typer.Option("--map", help="Complete map, or a folder of maps; may be repeated.", show_default=False),
+    ] = None,
+    links: Annotated[
+        int, typer.Option(help="Links of a home with receivers indoors; as many more have them anywhere.")
+    ] = DatasetSettings.links_per_home,
+    transmitters: Annotated[int, typer.Option(help="Transmitters of a home.")] = DatasetSettings.transmitters_per_home,
+    stages: Annotated[list[int], typer.Option("--stage", help="Robot steps; may be repeated.")] = list(  # noqa: B006
+        DatasetSettings.stages
+    ),
+    seed: Annotated[int, typer.Option(help="Seed of places and robots.")] = DatasetSettings.seed,
+    frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
+    material: MaterialOption = "",
+    workers: Annotated[
+        int | None, typer.Option(help="Homes at a time on this machine. Default: one for each core.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Address or scheduler file of a dask cluster, whose workers see OUT.", metavar="ADDRESS|FILE"
+        ),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Time that a home may take [s].")] = 900.0,
+) -> None:
+    """Build a data set from homes; run it again to go on after a stop, or with more homes."""
+    settings = DatasetSettings(
+        links_per_home=links,
+        transmitters_per_home=transmitters,
+        stages=tuple(sorted(set(stages))),
+        seed=seed,
+        scene=SceneSettings(material=parse_material(material)),
+        trace=TraceSettings(frequency_hz=frequency),
+    )
+    count = homes if homes is not None else 0 if maps else DEFAULT_HOMES
+    with show_rate("homes") as report:
+        from sionna_partial.training.dataset import build_dataset
+
+        result = build_dataset(
+            out,
+            [*range(first_seed, first_seed + count), *(maps or [])],
+            settings,
+            scheduler=scheduler,
+            workers=workers,
+            home_time_limit_s=time_limit,
+            progress=report,
+        )
+    _say_what_was_done(result)
+    raise typer.Exit(1 if result.failed else 0)
+
+
+def train(
+    folder: DatasetArgument,
+    out: Annotated[Path, typer.Option(metavar="RUN", help="Folder for predictor and baselines.", show_default=False)],
+    test_share: Annotated[float, typer.Option(help="Share of the homes that is kept for testing.")] = 0.3,
+    steps: Annotated[int, typer.Option(help="Gradient steps of each network.")] = 4000,
+    seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = 0,
+) -> None:
+    """Train a predictor on a data set, and measure it on homes kept for testing."""
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "reading links")
+        from sionna_partial.training.dataset_links import open_links, settings_for
+        from sionna_partial.training.report import summary
+        from sionna_partial.training.train import train as train_predictor
+
+        links, traces = open_links(folder)
+        settings = settings_for(traces, steps=steps, seed=seed)
+        run = train_predictor(links, test_share=test_share, settings=settings, progress=report)
+        files = run.save(out)
+    typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")
+    print_files(files)
+
+
+def evaluate(
+    folder: DatasetArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the report.", show_default=False)],
+    predictor: Annotated[str, typer.Option(metavar="NAME|FILE", help="'paper', or a .keras file.")] = "paper",
+) -> None:
+    """Judge a predictor beside simpler answers, on homes that it was not trained on and on others."""
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "reading links")
+        from sionna_partial.training.evaluate import evaluate as evaluate_predictor
+        from sionna_partial.training.report import save_report, summary
+
+        result = evaluate_predictor(predictor, folder, progress=report)
+        files = save_report(result, out)
+    typer.echo(summary(result))
+    print_files(files)
+
+
+def _say_what_was_done(result: Any) -> None:
+    """Print what was built, and which homes are missing and why."""
+    minutes = result.elapsed_s / 60.0
+    typer.echo(
+        f"{len(result.built)} homes built in {minutes:.1f} min, {len(result.skipped)} were there: {result.folder}"
+    )
+    for name, error in result.failed.items():
+        typer.echo(f"{name} failed: {error.strip().splitlines()[-1]}", err=True)
+    if result.failed:
+        typer.echo(
+            f"homes that failed: {len(result.failed)}; the others can be used: {result.folder / 'failed'} has all that is "
+            "known; the same command tries them again.",
+            err=True,
+        )

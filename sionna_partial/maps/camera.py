@@ -1,0 +1,223 @@
+"""The robot's camera: readings of the walls, their errors, and the map that they add up to."""
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sionna_partial.constants import CellState
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import SensorSettings
+
+FIELD_OF_VIEW_DEG = 90
+"""Horizontal field of view of the camera [degree] (Active Neural SLAM, Section 4)."""
+
+CAMERA_RANGE_M = 3.2
+"""Range of the camera [m] (the 64 cells of 0.05 m that Active Neural SLAM's mapper predicts ahead)."""
+
+MISSED_PATCH_M = 0.5
+"""Edge of the squares [m] whose walls are missed together, as a pane or a mirror is."""
+
+HIT_LOG_ODDS, MISS_LOG_ODDS = 0.85, -0.4
+"""What a look adds to the log odds of a wall where it reports one, and where it reports free space [1].
+
+Those of OctoMap (Hornung et al., Autonomous Robots 34, 2013, Section 5).
+"""
+
+LOG_ODDS_LIMITS = (-2.0, 3.5)
+"""Least and greatest log odds of a wall [1] (OctoMap, as above), so that a map can still change."""
+
+_FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
+_NO_ECHO, _WALL_ECHO, _FAR = 0, 1, 2
+
+
+class Camera:
+    """Sees a home from where the robot is, and maps it where the robot believes to be.
+
+    Parameters
+    ----------
+    truth : (ny, nx) uint8 array of CellState
+        The home, with unknown cells all around.
+    resolution_m : float
+        Edge of a cell [m].
+    sensor : SensorSettings
+    rng : numpy.random.Generator
+        Draws the errors.
+
+    Attributes
+    ----------
+    seen : (ny, nx) uint8 array of CellState
+        The map.
+    """
+
+    def __init__(
+        self, truth: NDArray[np.uint8], resolution_m: float, sensor: SensorSettings, rng: np.random.Generator
+    ) -> None:
+        self._truth = np.ascontiguousarray(truth)
+        self._missed = _missed_walls(truth, resolution_m, sensor.missed_wall_share, rng)
+        self._reach = CAMERA_RANGE_M / resolution_m
+        self._noise = sensor.range_noise_m / resolution_m
+        self._rng = rng
+        self._log_odds = np.zeros(truth.shape)
+        self.seen = np.full_like(self._truth, _UNKNOWN)
+
+    def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: NDArray[np.intp]) -> None:
+        """Add one picture to the map.
+
+        Parameters
+        ----------
+        x, y : float
+            Where the robot is, along columns and rows [cells].
+        heading_deg : float
+            Where it looks, from x towards y [degree].
+        shift : (float, float)
+            How far from there, along columns and rows, it believes to be [cells].
+        under : (N, 2) int array
+            Cells that it believes to stand on, which therefore are free: row and column.
+        """
+        angles = _ray_angles(heading_deg, self._reach)
+        noise = self._noise * self._rng.standard_normal(len(angles))
+        view = np.full_like(self._truth, _UNKNOWN)
+        _cast_rays(self._truth, self._missed, view, (x, y), shift, angles, noise, self._reach)
+        view[under[:, 0], under[:, 1]] = _FREE
+        self._log_odds[under[:, 0], under[:, 1]] = LOG_ODDS_LIMITS[0]
+        known = view != _UNKNOWN
+        change = np.where(view[known] == _WALL, HIT_LOG_ODDS, MISS_LOG_ODDS)
+        self._log_odds[known] = np.clip(self._log_odds[known] + change, *LOG_ODDS_LIMITS)
+        self.seen[known] = np.where(self._log_odds[known] > 0, _WALL, _FREE)
+
+
+def view_corners_m(home: PartialMap, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Outline what the camera has in view: as far as it reaches, and no farther than the first wall.
+
+    Parameters
+    ----------
+    home : PartialMap
+    pose : (3,) array
+        World x, y [m], and heading from x towards y [degree].
+
+    Returns
+    -------
+    (N, 2) array
+        World x and y of the corners of a polygon [m], the first of them the camera.
+    """
+    truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
+    reach = CAMERA_RANGE_M / home.resolution_m
+    x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
+    angles = _ray_angles(float(pose[2]), reach)
+    ranges_m = _ranges(truth, float(x), float(y), angles, reach) * home.resolution_m
+    ends = pose[:2] + ranges_m[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.concatenate([pose[None, :2], ends])
+
+
+def _ray_angles(heading_deg: float, reach: float) -> NDArray[np.float64]:
+    """Directions of the rays [radian], at most half a cell apart where they end."""
+    rays = int(2 * math.radians(FIELD_OF_VIEW_DEG) * reach) + 2
+    return math.radians(heading_deg) + math.radians(FIELD_OF_VIEW_DEG) * (np.arange(rays) / (rays - 1) - 0.5)
+
+
+def _missed_walls(
+    truth: NDArray[np.uint8], resolution_m: float, share: float, rng: np.random.Generator
+) -> NDArray[np.bool_]:
+    """Draw the squares of the floor plan whose walls return nothing; return them cell by cell (ny, nx)."""
+    rows, columns = (np.arange(size) * resolution_m // MISSED_PATCH_M for size in truth.shape)
+    squares = rng.random((int(rows[-1]) + 1, int(columns[-1]) + 1)) < share
+    return squares[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
+
+
+@njit(cache=True)
+def _cast_rays(
+    truth: NDArray[np.uint8],
+    missed: NDArray[np.bool_],
+    view: NDArray[np.uint8],
+    place: tuple[float, float],
+    shift: tuple[float, float],
+    angles: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    reach: float,
+) -> None:
+    """Write what one picture reports into `view`: free up to the reading, a wall there.
+
+    Where several rays disagree about a cell, a wall counts (as in OctoMap).
+    """
+    cells, entry = np.empty((_ray_cells(reach), 2), np.int64), np.empty(_ray_cells(reach) + 1)
+    for ray in range(len(angles)):
+        _walk(place[0], place[1], angles[ray], cells, entry)
+        echo, reading = _read(truth, missed, cells, entry, reach)
+        reading += noise[ray]
+        if shift[0] != 0.0 or shift[1] != 0.0:  # else it is the same walk
+            _walk(place[0] + shift[0], place[1] + shift[1], angles[ray], cells, entry)
+        for k in range(len(cells)):
+            row, column = cells[k]
+            if not (0 <= row < view.shape[0] and 0 <= column < view.shape[1]):
+                break
+            if echo != _FAR and entry[k + 1] > reading:
+                if echo == _WALL_ECHO:
+                    view[row, column] = _WALL
+                break
+            if entry[k] > reach:
+                break
+            if view[row, column] == _UNKNOWN:
+                view[row, column] = _FREE
+
+
+@njit(cache=True)
+def _ranges(
+    truth: NDArray[np.uint8], x: float, y: float, angles: NDArray[np.float64], reach: float
+) -> NDArray[np.float64]:
+    """Return how far each ray gets [cells]."""
+    cells, entry = np.empty((_ray_cells(reach), 2), np.int64), np.empty(_ray_cells(reach) + 1)
+    missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
+    for ray in range(len(angles)):
+        _walk(x, y, angles[ray], cells, entry)
+        ranges[ray] = _read(truth, missed, cells, entry, reach)[1]
+    return ranges
+
+
+@njit(cache=True)
+def _ray_cells(reach: float) -> int:
+    """Bound how many cells a ray of some length can meet."""
+    return int(2 * reach) + 4
+
+
+@njit(cache=True)
+def _read(
+    truth: NDArray[np.uint8],
+    missed: NDArray[np.bool_],
+    cells: NDArray[np.int64],
+    entry: NDArray[np.float64],
+    reach: float,
+) -> tuple[int, float]:
+    """Return what ends a ray, and a distance within that cell: a wall that is noticed, one that is not, or nothing."""
+    for k in range(len(cells)):
+        row, column = cells[k]
+        if entry[k] > reach:
+            break
+        if truth[row, column] != _FREE:
+            noticed = truth[row, column] == _WALL and not missed[row, column]
+            return (_WALL_ECHO if noticed else _NO_ECHO), (entry[k] + entry[k + 1]) / 2
+    return _FAR, reach
+
+
+@njit(cache=True)
+def _walk(x: float, y: float, angle: float, cells: NDArray[np.int64], entry: NDArray[np.float64]) -> None:
+    """List the cells along a ray, from edge to edge, and where it enters each [cells]; the last entry is an exit.
+
+    A ray through a corner takes one of the two cells beside it, so that it never slips between two walls. Each cell
+    keeps a piece of the ray to itself, a billionth of a cell at least, so that a distance names one cell.
+    """
+    along_x, along_y = math.cos(angle), math.sin(angle)
+    column, row = math.floor(x), math.floor(y)
+    step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
+    pace_x, pace_y = 1.0 / max(abs(along_x), 1e-12), 1.0 / max(abs(along_y), 1e-12)
+    next_x = pace_x * (column + 1 - x if along_x > 0 else x - column)
+    next_y = pace_y * (row + 1 - y if along_y > 0 else y - row)
+    entry[0] = 0.0
+    for k in range(len(cells)):
+        cells[k, 0], cells[k, 1] = row, column
+        entry[k + 1] = max(min(next_x, next_y), entry[k] + 1e-9)
+        if next_x < next_y:
+            column, next_x = column + step_x, next_x + pace_x
+        else:
+            row, next_y = row + step_y, next_y + pace_y

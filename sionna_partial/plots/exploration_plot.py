@@ -1,0 +1,205 @@
+"""Pictures of an exploration: what the robot has seen, the way it took, and where it looks."""
+
+import io
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon
+from matplotlib.path import Path as MarkerPath
+from numpy.typing import NDArray
+from PIL import Image
+
+from sionna_partial.constants import CellState
+from sionna_partial.files import atomic_write
+from sionna_partial.maps.camera import view_corners_m
+from sionna_partial.maps.explore import Exploration
+from sionna_partial.plots.figures import BLUE, RED, YELLOW
+from sionna_partial.settings import require
+
+FRAME_MS, LAST_FRAME_MS = 100, 2500
+"""How long an animation shows a frame, and its last one [ms]."""
+
+MAX_PANELS = 12
+"""Largest number of moments in one contact sheet."""
+
+_FREE, _WALL, _UNKNOWN, _UNSEEN_WALL = "white", "black", "0.86", "0.68"
+_VIEW_OPACITY = 0.35
+_WIDTH_IN, _SHEET_ASPECT, _DPI = 12.0, 1.5, 110
+_FRAME_IN, _FRAME_DPI = 5.6, 90
+_MIXED_COLOURS, _ALIKE = 128, 16
+_BORDER_M = 0.3
+
+
+def plot_exploration(exploration: Exploration) -> Figure:
+    """Draw what the robot had seen at each moment, with its way and its view.
+
+    Parameters
+    ----------
+    exploration : Exploration
+        From `explore_trajectory`. Each of its `steps` has a panel, or `MAX_PANELS` of them, evenly chosen.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not known to pyplot: it need not be closed.
+
+    Raises
+    ------
+    SettingsError
+        For something else than an Exploration.
+    """
+    _require_exploration(exploration)
+    count = min(len(exploration.steps), MAX_PANELS)
+    shown = np.linspace(len(exploration.steps) - 1, 0, count).astype(np.intp)[::-1]
+    x0, x1, y0, y1 = _window_m(exploration)
+    columns = _columns(count, (x1 - x0) / (y1 - y0))
+    rows = math.ceil(count / columns)
+    width = _WIDTH_IN / max(columns, 2)
+    size = (width * columns, rows * ((width - 0.4) * (y1 - y0) / (x1 - x0) + 0.3) + 0.9)
+    figure = Figure(figsize=size, dpi=_DPI, layout="compressed")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for panel in axes.flat[count:]:
+        panel.set_axis_off()
+    for index, panel in zip(shown, axes.flat[:count], strict=True):
+        _draw(panel, exploration, int(index))
+        panel.label_outer()
+    _add_legend(figure, exploration, in_one_row=columns > 1)
+    return figure
+
+
+def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) -> None:
+    """Write a GIF of an exploration, with a frame for each of its `steps`.
+
+    Parameters
+    ----------
+    exploration : Exploration
+        From `explore_trajectory`, for instance with `steps=range(0, 201, 4)`.
+    path : path-like
+        The file, with the suffix `.gif`. Equal explorations give equal bytes.
+
+    Raises
+    ------
+    SettingsError
+        For something else than an Exploration, or another suffix.
+    OutputError
+        If the file cannot be written.
+    """
+    _require_exploration(exploration)
+    require(Path(path).suffix.lower() == ".gif", "path", os.fspath(path), "give a name that ends with .gif.")
+    x0, x1, y0, y1 = _window_m(exploration)
+    longest = max(x1 - x0, y1 - y0)
+    size = _FRAME_IN * (x1 - x0) / longest + 0.6, _FRAME_IN * (y1 - y0) / longest + 0.7
+    frames = [_frame(exploration, index, size) for index in range(len(exploration.steps))]
+    palette = _palette(frames[-1])
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    times_ms = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
+    with atomic_write(path) as stream:
+        first.save(stream, format="GIF", save_all=True, append_images=others, duration=times_ms, loop=0)
+
+
+def _require_exploration(value: object) -> None:
+    remedy = "give an Exploration, as explore_trajectory returns it."
+    require(isinstance(value, Exploration), "exploration", type(value).__name__, remedy)
+
+
+def _columns(count: int, aspect: float) -> int:
+    """Choose the columns of a sheet of panels that is neither high nor wide, and has few empty places."""
+
+    def fault(columns: int) -> float:
+        rows = math.ceil(count / columns)
+        return abs(math.log(columns * aspect / rows / _SHEET_ASPECT)) + (rows * columns - count) / count
+
+    return min(range(1, count + 1), key=fault)
+
+
+def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> Image.Image:
+    figure = Figure(figsize=size, dpi=_FRAME_DPI)
+    panel = figure.add_axes((0.3 / size[0], 0.3 / size[1], 1 - 0.6 / size[0], 1 - 0.7 / size[1]))
+    _draw(panel, exploration, index)
+    panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return Image.open(buffer).convert("RGB")
+
+
+def _palette(frame: Image.Image) -> Image.Image:
+    """Choose the colours of all frames: exactly those that are drawn, and the mixtures that the last frame has."""
+    drawn = np.array([to_rgb(colour) for colour in (_FREE, _WALL, _UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
+    exact = np.rint(255 * drawn).astype(int)
+    mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
+    apart = np.abs(mixed[:, None] - exact).max(axis=2).min(axis=1) > _ALIKE
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate([exact, mixed[apart]]).ravel().tolist())
+    return palette
+
+
+def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
+    """Draw one moment: the map, the way up to then, and the view."""
+    home, step = exploration.home, exploration.steps[index]
+    x0, y0, x1, y1 = home.bounds_m
+    picture = _picture(exploration.states[index], home.state)
+    panel.imshow(picture, extent=(x0, x1, y0, y1), origin="lower", interpolation="nearest")
+    way, believed = exploration.poses[: step + 1], exploration.believed_poses[: step + 1]
+    if _drifts(exploration):
+        panel.plot(way[:, 0], way[:, 1], color=BLUE, linewidth=1.0, linestyle=":")
+    panel.plot(believed[:, 0], believed[:, 1], color=BLUE, linewidth=1.4)
+    panel.plot(*believed[0, :2], "o", color=BLUE, markersize=4)
+    x, y, heading_deg = believed[-1]
+    if step:
+        view = view_corners_m(home, way[-1]) + believed[-1, :2] - way[-1, :2]
+        panel.add_patch(Polygon(view, color=YELLOW, alpha=_VIEW_OPACITY, linewidth=0))
+    panel.plot(x, y, marker=_arrow(heading_deg), color=RED, markersize=10, markeredgecolor="white")
+    window = _window_m(exploration)
+    panel.set(xlim=window[:2], ylim=window[2:], aspect="equal", facecolor=_UNKNOWN, xlabel="x [m]", ylabel="y [m]")
+    panel.set_title(f"step {step}: {exploration.observed_fractions[index]:.0%} seen", fontsize=11)
+
+
+def _arrow(heading_deg: float) -> MarkerPath:
+    """Slender triangle that points where the robot looks."""
+    angles = np.radians(heading_deg + np.array([0.0, 140.0, 220.0, 0.0]))
+    return MarkerPath(np.stack([np.cos(angles), np.sin(angles)], axis=1), closed=True)
+
+
+def _picture(state: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Colours of the cells, (ny, nx, 3): the map, and beneath it the walls that are not on it."""
+    picture = np.array([to_rgb(colour) for colour in (_FREE, _WALL, _UNKNOWN)])[state]
+    picture[(state == CellState.UNKNOWN) & (truth == CellState.WALL)] = to_rgb(_UNSEEN_WALL)
+    return picture
+
+
+def _window_m(exploration: Exploration) -> tuple[float, float, float, float]:
+    """World x and y between which there is something to be seen: x0, x1, y0, y1 [m]."""
+    home = exploration.home
+    rows, columns = np.nonzero((home.state != CellState.UNKNOWN) | (exploration.states[-1] != CellState.UNKNOWN))
+    (x, y), cell_m = home.origin_m, home.resolution_m
+    return (
+        x + columns.min() * cell_m - _BORDER_M,
+        x + (columns.max() + 1) * cell_m + _BORDER_M,
+        y + rows.min() * cell_m - _BORDER_M,
+        y + (rows.max() + 1) * cell_m + _BORDER_M,
+    )
+
+
+def _drifts(exploration: Exploration) -> bool:
+    return not np.array_equal(exploration.poses, exploration.believed_poses)
+
+
+def _add_legend(figure: Figure, exploration: Exploration, *, in_one_row: bool) -> None:
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=BLUE, marker="o", markersize=4, markevery=[0], label="way of the robot"),
+        Line2D([], [], color=RED, marker=_arrow(0.0), markersize=10, linestyle="none", label="robot"),
+        Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="its view"),
+        Patch(color=_WALL, label="wall, seen"),
+        Patch(color=_UNSEEN_WALL, label="wall, not seen"),
+        Patch(color=_UNKNOWN, label="not seen"),
+    ]
+    if _drifts(exploration):
+        handles[0].set_label("where the robot believes to be")
+        handles.insert(1, Line2D([], [], color=BLUE, linewidth=1.0, linestyle=":", label="where it is"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) if in_one_row else 3, frameon=False)

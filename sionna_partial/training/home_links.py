@@ -1,0 +1,212 @@
+"""One home -> LinkTable: a robot explores it, and each link is traced on what was seen at every stage and in truth."""
+
+import hashlib
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.errors import MapError
+from sionna_partial.learning.features import LinkFeatures, link_features
+from sionna_partial.maps.explore import explore
+from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.settings import DatasetSettings
+from sionna_partial.tracing.trace import trace_each
+from sionna_partial.training.link_table import LinkTable
+
+NEAREST_M = 0.1
+"""Shortest distance of transmitter and receiver [m]."""
+
+FROM_BORDER_CELLS = 0.25
+"""Distance of transmitters and receivers from the borders of their cells [cells]."""
+
+MAX_DRAWS = 1000
+"""Number of times that places which cannot be used are drawn again."""
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Transmitters and receivers of a home.
+
+    Parameters
+    ----------
+    tx_m : list of T (3,) float64 arrays
+    rx_m : list of T (N, 3) float64 arrays
+    anywhere : list of T (N,) bool arrays
+    """
+
+    tx_m: list[NDArray[np.float64]]
+    rx_m: list[NDArray[np.float64]]
+    anywhere: list[NDArray[np.bool_]]
+
+
+def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = None) -> LinkTable:
+    """Trace the links of a home on what a robot has seen of it at every stage, and on the whole of it.
+
+    Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
+    cells, the second half (`anywhere`) from all cells of the map area that are not walls. The map area is the bounding
+    box of the known cells and `margin_m` around it, whatever the size of the grid: a small home in a large empty grid
+    would have receivers outside and no others. No receiver is nearer than `NEAREST_M` to its transmitter.
+
+    The truth of a receiver that is not in a free cell of the home is outage, by definition (paper, "Indoor-Outdoor
+    Estimation"); that of the others is their trace on the complete home. The places and the robot depend on `name` and
+    the settings, and not on other homes.
+
+    Parameters
+    ----------
+    home : PartialMap
+        A complete home.
+    name : str
+        Name of the home, from which its seed is made.
+    settings : DatasetSettings, optional
+
+    Returns
+    -------
+    LinkTable
+        Of 2 x `links_per_home` x number of stages links: stage by stage, in each transmitter by transmitter.
+
+    Raises
+    ------
+    MapError
+        If the home is not complete, or too small.
+    PositionError
+        If the heights are not between floor and ceiling.
+    """
+    require_map("home", home)
+    settings = settings or DatasetSettings()
+    if not home.is_complete:
+        raise MapError(
+            f"home {name!r} is not complete, a free cell touches an unknown one: give maps of whole homes, whose free "
+            "cells end at walls."
+        )
+    area = map_area(home, settings.margin_m)
+    rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
+    maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)))
+    places = _draw_places(area, name, settings, rng)
+    truth = _truth(area, places, settings)
+    seen = zip(settings.stages, maps, _features(maps, places, settings), strict=True)
+    return LinkTable.concatenate(_stage_links(name, stage, partial, phi, places, truth) for stage, partial, phi in seen)
+
+
+def map_area(home: PartialMap, margin_m: float) -> PartialMap:
+    """Cut a map, or extend it with unknown cells, to the bounding box of its known cells and a margin around it.
+
+    Parameters
+    ----------
+    home : PartialMap
+        With known cells.
+    margin_m : float
+        Width of the margin [m]; whole cells are taken, at least so many.
+
+    Returns
+    -------
+    PartialMap
+        With its cells where they were.
+    """
+    known = np.argwhere(home.state != CellState.UNKNOWN)
+    margin = math.ceil(margin_m / home.resolution_m - 1e-9)
+    (row0, column0), (row1, column1) = known.min(axis=0), known.max(axis=0) + 1
+    state = np.pad(home.state[row0:row1, column0:column1], margin, constant_values=CellState.UNKNOWN)
+    x, y = home.origin_m
+    corner = (x + (int(column0) - margin) * home.resolution_m, y + (int(row0) - margin) * home.resolution_m)
+    return replace(home, state=state, origin_m=corner)
+
+
+def _draw_places(home: PartialMap, name: str, settings: DatasetSettings, rng: np.random.Generator) -> _Places:
+    """Draw the transmitters, and for each of them receivers in free cells, and in all cells that are not walls."""
+    free, open_cells = home.state == CellState.FREE, home.state != CellState.WALL
+    count = settings.transmitters_per_home
+    tx_m = list(_points_in(free, count, home, settings.tx_height_m, rng))
+    receivers, drawn = [], []
+    for index, tx in enumerate(tx_m):
+        share = settings.links_per_home * (index + 1) // count - settings.links_per_home * index // count
+        parts = [_receivers(cells, share, home, name, tx, settings, rng) for cells in (free, open_cells)]
+        receivers.append(np.concatenate(parts))
+        drawn.append(np.arange(2 * share) >= share)
+    return _Places(tx_m, receivers, drawn)
+
+
+def _receivers(
+    cells: NDArray[np.bool_],
+    count: int,
+    home: PartialMap,
+    name: str,
+    tx_m: NDArray[np.float64],
+    settings: DatasetSettings,
+    rng: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Draw receivers (count, 3) that are not at the transmitter [m]."""
+    rx_m = _points_in(cells, count, home, settings.rx_height_m, rng)
+    for _ in range(MAX_DRAWS):
+        near = np.linalg.norm(rx_m - tx_m, axis=1) < NEAREST_M
+        if not near.any():
+            return rx_m
+        rx_m[near] = _points_in(cells, int(near.sum()), home, settings.rx_height_m, rng)
+    raise MapError(f"home {name!r} is too small, all of it is within {NEAREST_M:g} m of a transmitter: leave it out.")
+
+
+def _points_in(
+    cells: NDArray[np.bool_], count: int, home: PartialMap, height_m: float, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw points (count, 3) uniformly from cells, off their borders [m]."""
+    rows, columns = np.nonzero(cells)
+    index = rng.integers(len(rows), size=count)
+    inner = rng.uniform(FROM_BORDER_CELLS, 1.0 - FROM_BORDER_CELLS, (count, 2))
+    places = np.stack([columns[index], rows[index]], axis=1) + inner
+    return np.column_stack([home.origin_m + places * home.resolution_m, np.full(count, height_m)])
+
+
+def _truth(
+    home: PartialMap, places: _Places, settings: DatasetSettings
+) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.float64]]:
+    """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
+    inside = [home.state_at(rx) == CellState.FREE for rx in places.rx_m]
+    indoors = [rx[where] for rx, where in zip(places.rx_m, inside, strict=True)]
+    links = trace_each(home, places.tx_m, indoors, settings=settings.trace, scene_settings=settings.scene)
+    where = np.concatenate(inside)
+    link_state = np.full(len(where), LinkState.OUTAGE, dtype=np.uint8)
+    gain_db = np.full(len(where), GAIN_FLOOR_DB)
+    link_state[where] = np.concatenate([each.link_state for each in links])
+    gain_db[where] = np.concatenate([each.gain_db for each in links])
+    return where, link_state, gain_db
+
+
+def _features(maps: list[PartialMap], places: _Places, settings: DatasetSettings) -> list[LinkFeatures]:
+    """Features on each map, of all transmitters. A robot that has seen all stays: its maps are traced once."""
+    features: list[LinkFeatures] = []
+    for index, partial in enumerate(maps):
+        if index and partial == maps[index - 1]:
+            features.append(features[-1])
+            continue
+        links = trace_each(partial, places.tx_m, places.rx_m, settings=settings.trace, scene_settings=settings.scene)
+        features.append(LinkFeatures.concatenate([link_features(partial, each) for each in links]))
+    return features
+
+
+def _stage_links(
+    name: str,
+    stage: int,
+    partial: PartialMap,
+    phi: LinkFeatures,
+    places: _Places,
+    truth: tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.float64]],
+) -> LinkTable:
+    inside, link_state, gain_db = truth
+    counts = [len(rx) for rx in places.rx_m]
+    tx_m, rx_m = np.repeat(places.tx_m, counts, axis=0), np.concatenate(places.rx_m)
+    return LinkTable(
+        home=np.full(len(rx_m), name),
+        stage=np.full(len(rx_m), stage, dtype=np.int64),
+        tx_m=tx_m,
+        rx_m=rx_m,
+        phi=phi,
+        link_state=link_state,
+        gain_db=gain_db,
+        inside=inside,
+        anywhere=np.concatenate(places.anywhere),
+        tx_seen=partial.state_at(tx_m) != CellState.UNKNOWN,
+        rx_seen=partial.state_at(rx_m) != CellState.UNKNOWN,
+        observed_fraction=np.full(len(rx_m), partial.observed_fraction),
+    )

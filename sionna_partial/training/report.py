@@ -1,0 +1,191 @@
+"""Evaluations as text and files: Evaluation -> report.md, report.json, calibration.png."""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from sionna_partial.files import atomic_files
+from sionna_partial.training.evaluate import Difference, Evaluation, Row
+from sionna_partial.training.metrics import DEFINITIONS, Metrics
+
+REPORT_FILES = ("report.md", "report.json", "calibration.png")
+
+_COLUMNS = {
+    "links": ("links", "d"),
+    "accuracy": ("accuracy", ".3f"),
+    "rmse_db": ("RMSE [dB]", ".2f"),
+    "rmse_linked_db": ("RMSE without outages", ".2f"),
+    "nll_state": ("NLL state", ".3f"),
+    "nll": ("NLL", ".3f"),
+    "calibration_error": ("calibration error", ".3f"),
+    "coverage_90": ("in 90 %", ".3f"),
+}
+_MISSING = "-"
+
+
+def summary(evaluation: Evaluation) -> str:
+    """Return the main tables: test homes, the indoor model, and paired differences.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+
+    Returns
+    -------
+    str
+        Markdown with aligned columns.
+    """
+    sections = [_metrics_section(evaluation, "test", ends_seen="all")]
+    return "\n\n".join([*sections, *_anywhere(evaluation, ["test"]), *_differences(evaluation)])
+
+
+def markdown(evaluation: Evaluation) -> str:
+    """Return the whole report, definitions first.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+
+    Returns
+    -------
+    str
+    """
+    counts = " and ".join(f"{len(names)} {kind}" for kind, names in evaluation.homes.items())
+    head = [
+        f"# Evaluation of predictor `{evaluation.predictor}`",
+        f"SHA-256 {evaluation.fingerprint}. {counts} homes of the data set; test homes are those that the predictor "
+        "was not trained on.",
+        *evaluation.notes,
+        "\n".join(f"- **{_COLUMNS[name][0]}**: {text}" for name, text in DEFINITIONS.items()),
+        f"`{_MISSING}` stands where there is no finite value: a likelihood where a trace answers without spread, or a "
+        "model holds a state impossible that occurs.",
+    ]
+    sections = [_metrics_section(evaluation, "test", ends_seen="all")]
+    sections += [_metrics_section(evaluation, "test", ends_seen=ends) for ends in ("both", "one", "none")]
+    if "train" in evaluation.homes:
+        sections.append(_metrics_section(evaluation, "train", ends_seen="all"))
+    return "\n\n".join([*head, *sections, *_anywhere(evaluation, evaluation.homes), *_differences(evaluation)]) + "\n"
+
+
+def as_json(evaluation: Evaluation) -> dict[str, Any]:
+    """Return the report as JSON has it: null where there is no finite value.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+
+    Returns
+    -------
+    dict
+    """
+    return {
+        "predictor": evaluation.predictor,
+        "sha256": evaluation.fingerprint,
+        "homes": {kind: list(names) for kind, names in evaluation.homes.items()},
+        "notes": list(evaluation.notes),
+        "definitions": DEFINITIONS,
+        "rows": [{**asdict(row), "metrics": row.metrics.as_json()} for row in evaluation.rows],
+        "differences": [_finite(asdict(difference)) for difference in evaluation.differences],
+        "calibration": {
+            str(stage): {
+                "links": calibration.state.links.tolist(),
+                "confidence": calibration.state.confidence.tolist(),
+                "accuracy": calibration.state.accuracy.tolist(),
+                "gain_pit": calibration.gain_pit.tolist(),
+            }
+            for stage, calibration in evaluation.calibrations.items()
+        },
+    }
+
+
+def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
+    """Write `report.md`, `report.json` and `calibration.png`, all or none.
+
+    Parameters
+    ----------
+    evaluation : Evaluation
+    folder : pathlib.Path
+
+    Returns
+    -------
+    list of pathlib.Path
+        The files.
+
+    Raises
+    ------
+    OutputError
+        If writing fails.
+    """
+    from sionna_partial.plots.calibration_plot import plot_calibration
+    from sionna_partial.plots.figures import figure_png
+
+    contents = (
+        markdown(evaluation).encode(),
+        (json.dumps(as_json(evaluation), indent=2, allow_nan=False) + "\n").encode(),
+        figure_png(plot_calibration(evaluation.calibrations)),
+    )
+    with atomic_files(folder) as place:
+        for name, content in zip(REPORT_FILES, contents, strict=True):
+            (place / name).write_bytes(content)
+    return [folder / name for name in REPORT_FILES]
+
+
+def _metrics_section(evaluation: Evaluation, homes: str, ends_seen: str) -> str:
+    whose = {"all": "", "both": ", both ends seen", "one": ", one end seen", "none": ", no end seen"}[ends_seen]
+    rows = evaluation.select(homes=homes, receivers="indoor", ends_seen=ends_seen)
+    return _section(f"{homes.capitalize()} homes, receivers indoors{whose}", rows)
+
+
+def _anywhere(evaluation: Evaluation, kinds: Iterable[str]) -> Iterable[str]:
+    """Sections on receivers that may be outside, of "test" or "train" homes."""
+    for homes in kinds:
+        rows = evaluation.select(homes=homes, receivers="anywhere", ends_seen="all")
+        if rows:
+            yield _section(f"{homes.capitalize()} homes, receivers anywhere on the map, outside in outage", rows)
+
+
+def _differences(evaluation: Evaluation) -> Iterable[str]:
+    """Sections on paired differences."""
+    for receivers, first in (("indoor", "predictor"), ("anywhere", "with indoor model")):
+        rows = [each for each in evaluation.differences if each.receivers == receivers]
+        if rows:
+            where = "indoors" if receivers == "indoor" else "anywhere"
+            title = f"Test homes, receivers {where}: {first} minus other, mean and standard error over homes"
+            header = ["steps", "other", "homes", "accuracy", "RMSE [dB]"]
+            yield f"### {title}\n\n{_table(header, map(_difference_cells, rows))}"
+
+
+def _section(title: str, rows: Sequence[Row]) -> str:
+    header = ["steps", "answer", *(label for label, _ in _COLUMNS.values())]
+    return f"### {title}\n\n{_table(header, ([str(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links))}"
+
+
+def _cells(metrics: Metrics) -> list[str]:
+    values = {field.name: getattr(metrics, field.name) for field in fields(metrics)}
+    return [_text(values[name], form) for name, (_, form) in _COLUMNS.items()]
+
+
+def _difference_cells(each: Difference) -> list[str]:
+    pairs = ((each.accuracy, each.accuracy_error, ".3f"), (each.rmse_db, each.rmse_error_db, ".2f"))
+    texts = [f"{value:+{form}} ± {_text(error, form)}" for value, error, form in pairs]
+    return [str(each.stage), each.baseline, str(each.homes), *texts]
+
+
+def _text(value: float, form: str) -> str:
+    return _MISSING if math.isnan(value) else format(value, form)
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown table, its columns aligned for the eye."""
+    cells = [list(header), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in cells]
+    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    return "\n".join([lines[0], rule, *lines[1:]])
+
+
+def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in values.items()}

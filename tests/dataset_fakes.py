@@ -1,0 +1,98 @@
+"""Homes that take no time, die, hang or raise: they take the place of real ones in the processes of a data set.
+
+`processes_make_fakes` puts a `sitecustomize` module on the path of those processes; it calls `install` when they start.
+"""
+
+import hashlib
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.settings import DatasetSettings
+from sionna_partial.training.link_table import LinkTable
+
+KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670
+"""Seeds of homes that end their process, never end, raise, end their process at the first try, and find a full disk."""
+
+HOME_S = 0.15
+"""Time that a fake home takes [s]."""
+
+
+def processes_make_fakes(folder: Path) -> str:
+    """Write the `sitecustomize` module, and return what to put in front of the path of Python."""
+    (folder / "sitecustomize.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(Path(__file__).parent)!r})\n" + _CODE
+    )
+    return str(folder)
+
+
+_CODE = """
+if "home_process" in " ".join(sys.orig_argv):
+    import dataset_fakes
+    dataset_fakes.install()
+"""
+
+
+def install() -> None:
+    """Replace the making and the tracing of homes in this process."""
+    from sionna_partial.training import home_links, home_sources
+
+    home_sources.make_home = make_home  # type: ignore[assignment]
+    home_links.home_links = fake_links  # type: ignore[assignment]
+
+
+def make_home(seed: int) -> SimpleNamespace:
+    """Do what the seed stands for; the process number goes into a file beside `sitecustomize`."""
+    notes = Path(sys.modules["sitecustomize"].__file__ or "").parent
+    (notes / f"process-{os.getpid()}").touch()
+    if seed == KILLS or (seed == KILLS_ONCE and not (notes / "killed").exists()):
+        (notes / "killed").touch()
+        print("last words", file=sys.stderr, flush=True)
+        os.kill(os.getpid(), signal.SIGKILL)
+    if seed == HANGS:
+        time.sleep(1000.0)
+    if seed == RAISES:
+        raise ZeroDivisionError("a fault of this home")
+    if seed == UNWRITABLE:
+        raise _full_disk()
+    time.sleep(HOME_S)
+    return SimpleNamespace()
+
+
+def fake_links(home: object, name: str, settings: DatasetSettings | None = None) -> LinkTable:
+    """Make up links that depend on the name and the seed."""
+    settings = settings or DatasetSettings()
+    rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
+    count = 2 * settings.links_per_home * len(settings.stages)
+    tx_m, rx_m = rng.uniform(0.0, 9.0, (2, count, 3))
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    state = rng.integers(0, 3, count).astype(np.uint8)
+    return LinkTable(
+        home=np.full(count, name),
+        stage=np.repeat(settings.stages, 2 * settings.links_per_home).astype(np.int64),
+        tx_m=tx_m,
+        rx_m=rx_m,
+        phi=LinkFeatures(state[::-1].copy(), distance_m / 2, distance_m, rng.uniform(GAIN_FLOOR_DB, -40.0, count)),
+        link_state=state,
+        gain_db=rng.uniform(GAIN_FLOOR_DB, -40.0, count),
+        **{column: _coins(rng, count) for column in ("inside", "anywhere", "tx_seen", "rx_seen")},
+        observed_fraction=rng.uniform(0.0, 1.0, count),
+    )
+
+
+def _coins(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
+    return rng.integers(0, 2, count).astype(bool)
+
+
+def _full_disk() -> Exception:
+    from sionna_partial.errors import OutputError
+
+    return OutputError("the disk is full")

@@ -1,0 +1,163 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy import ndimage
+
+from sionna_partial.constants import CellState
+from sionna_partial.maps.camera import CAMERA_RANGE_M, FIELD_OF_VIEW_DEG, MISSED_PATCH_M, Camera, view_corners_m
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import SensorSettings
+
+NOWHERE = np.empty((0, 2), dtype=np.intp)
+EXACT = SensorSettings()
+
+
+def camera(truth, sensor=EXACT, resolution_m=0.1, seed=0):
+    return Camera(truth, resolution_m, sensor, np.random.default_rng(seed))
+
+
+def surrounded(state):
+    return np.pad(np.asarray(state, dtype=np.uint8), 1, constant_values=CellState.UNKNOWN)
+
+
+def corridor(length=30, wall_at=20):
+    """A corridor along x, three cells wide, with a wall across it."""
+    state = np.full((5, length), CellState.WALL, dtype=np.uint8)
+    state[1:4, 1:-1] = CellState.FREE
+    state[:, wall_at] = CellState.WALL
+    return surrounded(state)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    arrays(np.uint8, (14, 14), elements=st.sampled_from([0, 0, 0, 1, 2])),
+    st.tuples(st.integers(1, 14), st.integers(1, 14)),
+    st.tuples(st.sampled_from([0.5, 0.25, 0.01, 0.99]), st.sampled_from([0.5, 0.125, 0.75])),
+    st.integers(0, 35),
+)
+def test_rays_pass_no_corner_where_two_walls_meet(state, cell, part, tens):
+    """All free cells that are seen hang together by their edges, and everything seen is true."""
+    truth = surrounded(state)
+    truth[cell] = CellState.FREE
+    eye = camera(truth)
+    eye.look(cell[1] + part[0], cell[0] + part[1], 10.0 * tens, (0.0, 0.0), NOWHERE)
+    known = eye.seen != CellState.UNKNOWN
+    assert (eye.seen[known] == truth[known]).all()
+    labels, _ = ndimage.label(eye.seen == CellState.FREE)
+    assert labels[cell] > 0
+    assert (labels[eye.seen == CellState.FREE] == labels[cell]).all()
+
+
+@pytest.mark.parametrize("heading_deg", [0, 90, 180, 270])
+@pytest.mark.parametrize("cells", [1, 3])
+def test_a_ray_straight_through_the_corner_of_two_walls_is_stopped(heading_deg, cells):
+    """The outermost rays run along the diagonals, from the middle of a box whose corners are open."""
+    truth = np.zeros((21, 21), dtype=np.uint8)
+    low, high = 10 - cells, 10 + cells
+    truth[low : high + 1, [low, high]] = truth[[low, high], low : high + 1] = CellState.WALL
+    truth[[low, low, high, high], [low, high, low, high]] = CellState.FREE
+    eye = camera(surrounded(truth))
+    eye.look(11.5, 11.5, heading_deg, (0.0, 0.0), NOWHERE)
+    rows, columns = np.nonzero(eye.seen == CellState.FREE)
+    assert (np.abs(rows - 11) < cells).all()
+    assert (np.abs(columns - 11) < cells).all()
+
+
+@pytest.mark.parametrize("heading_deg", [0, 40, 90, 230])
+def test_cells_are_seen_just_as_far_and_wide_as_the_camera_reaches(heading_deg):
+    eye, middle = camera(np.zeros((121, 121), dtype=np.uint8)), 60.5
+    eye.look(middle, middle, heading_deg, (0.0, 0.0), NOWHERE)
+    rows, columns = np.indices(eye.seen.shape) + 0.5
+    distance = np.hypot(rows - middle, columns - middle)
+    bearing = np.degrees(np.arctan2(rows - middle, columns - middle)) - heading_deg
+    off_axis_deg = np.abs((bearing + 180) % 360 - 180)
+    slack_deg = np.degrees(np.arcsin(0.75 / np.maximum(distance, 0.75)))
+    reach, half_deg = CAMERA_RANGE_M / 0.1, FIELD_OF_VIEW_DEG / 2
+    seen = eye.seen == CellState.FREE
+    assert seen[(distance < reach - 1) & (off_axis_deg < half_deg - slack_deg)].all()
+    assert not seen[(distance > reach + 1) | (off_axis_deg > half_deg + slack_deg)].any()
+
+
+def test_a_wall_ends_the_view():
+    eye = camera(corridor())
+    eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
+    assert (eye.seen[2:5, 21] == CellState.WALL).all()
+    assert (eye.seen[:, 22:] == CellState.UNKNOWN).all()
+
+
+def test_belief_shifts_the_map_by_as_many_cells():
+    truth = np.pad(corridor(), 6, constant_values=CellState.UNKNOWN)
+    here, there = camera(truth), camera(truth)
+    here.look(9.5, 9.5, 0.0, (0.0, 0.0), NOWHERE)
+    there.look(9.5, 9.5, 0.0, (3.0, -2.0), NOWHERE)
+    assert np.array_equal(there.seen, np.roll(here.seen, (-2, 3), axis=(0, 1)))
+
+
+def test_readings_beyond_the_grid_are_dropped():
+    eye = camera(corridor())
+    for shift in ((100.0, 0.0), (-100.0, 0.0), (0.0, -2.6)):
+        eye.look(3.5, 3.5, 0.0, shift, NOWHERE)
+    assert (eye.seen[:3] != CellState.UNKNOWN).any()
+    assert (eye.seen[4:] == CellState.UNKNOWN).all()
+
+
+def test_many_noisy_looks_find_the_wall():
+    """The wall across the corridor is 18 cells ahead; a reading errs by two cells."""
+    single, many = (camera(corridor(40, 20), SensorSettings(range_noise_m=0.2), seed=1) for _ in range(2))
+    for eye, looks in ((single, 1), (many, 60)):
+        for _ in range(looks):
+            eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
+    assert np.ptp(np.nonzero(single.seen[3] == CellState.WALL)[0]) >= 3
+    walls = np.nonzero(many.seen[3, 4:] == CellState.WALL)[0] + 4
+    assert abs(np.median(walls) - 21) <= 3
+    assert (many.seen[3, 6:14] == CellState.FREE).all()
+
+
+def test_a_noticed_and_a_missed_wall():
+    truth = corridor()
+    eye = camera(truth, SensorSettings(missed_wall_share=1.0))
+    eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
+    assert (eye.seen != CellState.WALL).all()
+    assert (eye.seen[3, 4:21] == CellState.FREE).all()
+    assert (eye.seen[:, 21:] == CellState.UNKNOWN).all()
+
+
+def test_walls_are_missed_in_squares_and_in_the_share_asked_for():
+    size = 200
+    truth = np.zeros((size, size), dtype=np.uint8)
+    missed = camera(truth, SensorSettings(missed_wall_share=0.3))._missed
+    assert missed.mean() == pytest.approx(0.3, abs=0.06)
+    edge = round(MISSED_PATCH_M / 0.1)
+    squares = missed.reshape(size // edge, edge, size // edge, edge)
+    assert (squares == squares[:, :1, :, :1]).all()
+
+
+def test_where_the_robot_stands_is_free_whatever_was_seen():
+    eye = camera(corridor())
+    under = np.array([[3, 21]])
+    eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
+    assert eye.seen[3, 21] == CellState.WALL
+    eye.look(3.5, 3.5, 180.0, (0.0, 0.0), under)
+    assert eye.seen[3, 21] == CellState.FREE
+
+
+class TestViewCorners:
+    def test_open_space_shows_a_quarter_of_a_disc(self):
+        home = PartialMap(np.zeros((100, 100), dtype=np.uint8), 0.1, (5.0, -3.0))
+        corners = view_corners_m(home, np.array([10.0, 2.0, 30.0]))
+        assert corners[0].tolist() == [10.0, 2.0]
+        away = corners[1:] - corners[0]
+        assert np.hypot(*away.T) == pytest.approx(CAMERA_RANGE_M)
+        bearing = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
+        assert (bearing.min(), bearing.max()) == pytest.approx((-15.0, 75.0))
+
+    def test_it_ends_in_the_wall(self):
+        home = PartialMap(corridor()[1:-1, 1:-1], 0.1)
+        corners = view_corners_m(home, np.array([0.25, 0.25, 0.0]))
+        assert corners[:, 0].max() == pytest.approx(2.05, abs=0.05 + 1e-9)
+        assert (corners[:, 1].min(), corners[:, 1].max()) == pytest.approx((0.05, 0.45), abs=0.05 + 1e-9)
+        assert math.isclose(corners[len(corners) // 2, 0], 2.05, abs_tol=0.06)

@@ -1,0 +1,363 @@
+"""A data set's folder, whatever happens to the process, the workers and the homes while it is built."""
+
+import hashlib
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from dataset_fakes import HANGS, KILLS, KILLS_ONCE, RAISES, UNWRITABLE, fake_links, processes_make_fakes
+
+from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
+from sionna_partial.settings import DatasetSettings, TraceSettings
+from sionna_partial.training import dataset, home_process
+from sionna_partial.training.dataset import DatasetReport, build_dataset
+from sionna_partial.training.home_process import HomeTask, run_home
+from sionna_partial.training.home_sources import HomeSource
+from sionna_partial.training.shards import read_dataset, read_shard, shard_path, write_shard
+
+SETTINGS = DatasetSettings(links_per_home=5, transmitters_per_home=1, stages=(0, 50))
+SEEDS = range(10)
+NAMES = tuple(f"make_home({seed})" for seed in SEEDS)
+BUILD = """
+import sys
+from sionna_partial.settings import DatasetSettings
+from sionna_partial.training.dataset import build_dataset
+build_dataset(sys.argv[1], range(10), DatasetSettings(5, 1, (0, 50)), workers=2)
+"""
+
+
+@pytest.fixture
+def notes(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Let the processes make fake homes; what they note is in this folder."""
+    folder = tmp_path_factory.mktemp("fakes")
+    monkeypatch.syspath_prepend(processes_make_fakes(folder))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set built without a break."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
+        build_dataset(folder / "set", SEEDS, SETTINGS, workers=2)
+    return folder / "set"
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def shards(folder: Path) -> int:
+    return len(list(folder.glob("shards/*.parquet")))
+
+
+def wait_until(true: Callable[[], bool], limit_s: float = 30.0) -> None:
+    end = time.monotonic() + limit_s
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def is_running(process: int) -> bool:
+    """Whether a process is there, and not just waiting to be forgotten by its parent."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def processes(notes: Path) -> list[int]:
+    """Numbers of the processes that have made homes."""
+    return [int(path.name.removeprefix("process-")) for path in notes.glob("process-*")]
+
+
+@contextmanager
+def started(*command: object) -> Iterator[subprocess.Popen[str]]:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    with subprocess.Popen([*map(str, command)], env=environment, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+class TestBuild:
+    def test_all_homes_are_there(self, unbroken: Path) -> None:
+        links = read_dataset(unbroken)
+        assert tuple(dict.fromkeys(links.home.tolist())) == NAMES
+        for name in NAMES:
+            shard = read_shard(shard_path(unbroken, name))
+            assert shard.rx_m.tolist() == fake_links(None, name, SETTINGS).rx_m.tolist()
+
+    def test_folder_says_what_it_holds(self, unbroken: Path) -> None:
+        index = json.loads((unbroken / "dataset.json").read_text())
+        assert [home["name"] for home in index["homes"]] == [*NAMES]
+        assert index["settings"]["stages"] == [0, 50]
+        assert index["versions"].keys() == set(home_process.PACKAGES)
+        assert sorted(path.name for path in unbroken.iterdir()) == ["dataset.json", "shards"]
+
+    def test_real_homes(self, tmp_path: Path) -> None:
+        told: list[tuple[int, int, str]] = []
+        settings = replace(SETTINGS, stages=(0, 5))
+        report = build_dataset(
+            tmp_path / "set",
+            [2],
+            settings,
+            workers=1,
+            progress=lambda done, total, message: told.append((done, total, message)),
+        )
+        assert report.built == ("make_home(2)",)
+        assert (report.skipped, report.failed) == ((), {})
+        assert told == [(0, 1, "starting the workers"), (1, 1, "make_home(2) built")]
+        assert len(read_dataset(tmp_path / "set")) == 2 * 5 * 2
+
+    def test_second_run_makes_nothing(self, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dataset, "_connected", None)
+        before = files(unbroken)
+        report = build_dataset(unbroken, SEEDS, SETTINGS)
+        assert report.skipped == NAMES
+        assert files(unbroken) == before
+
+    def test_what_is_missing_or_damaged_or_new_is_built(self, unbroken: Path, tmp_path: Path, notes: Path) -> None:
+        folder = tmp_path / "set"
+        shutil.copytree(unbroken, folder)
+        shard_path(folder, NAMES[3]).write_bytes(shard_path(folder, NAMES[3]).read_bytes()[:100])
+        shard_path(folder, NAMES[5]).write_bytes(shard_path(folder, NAMES[6]).read_bytes())
+        shard_path(folder, NAMES[7]).unlink()
+        report = build_dataset(folder, range(11), SETTINGS, workers=1)
+        assert report.built == (NAMES[3], NAMES[5], NAMES[7], "make_home(10)")
+        rebuilt = files(folder)
+        rebuilt.pop("shards/make_home(10).parquet")
+        rebuilt["dataset.json"] = (unbroken / "dataset.json").read_bytes()
+        assert rebuilt == files(unbroken)
+
+
+class TestKilled:
+    def test_killed_runs_are_continued_to_the_same_bytes(self, unbroken: Path, tmp_path: Path, notes: Path) -> None:
+        folder = tmp_path / "set"
+        with started(sys.executable, "-c", BUILD, folder) as run:
+            wait_until(lambda: shards(folder) >= 3)
+            run.kill()
+        wait_until(lambda: not any(map(is_running, processes(notes))))
+        assert 3 <= shards(folder) < len(SEEDS)
+        for place in (folder, folder / "shards"):
+            (place / ".tmp-0123456789abcdef").mkdir()
+            (place / ".tmp-0123456789abcdef" / "half a file").touch()
+        there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
+        report = build_dataset(folder, SEEDS, SETTINGS, workers=2)
+        assert len(report.skipped) == len(there)
+        assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
+        assert files(folder) == files(unbroken)
+
+    def test_ctrl_c_ends_at_once_and_leaves_no_process(self, tmp_path: Path, notes: Path) -> None:
+        command = Path(sys.executable).parent / "sionna-partial"
+        with started(command, "dataset", tmp_path / "set", "--homes", 200, "--links", 5, "--workers", 2) as run:
+            wait_until(lambda: shards(tmp_path / "set") >= 1)
+            run.send_signal(signal.SIGINT)
+            _, errors = run.communicate(timeout=10.0)
+        assert run.returncode not in (0, None)
+        assert "Traceback" not in errors
+        assert not any(map(is_running, processes(notes)))
+
+
+POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)
+
+
+@pytest.fixture(scope="module")
+def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
+    """A data set of homes of which some cannot be made."""
+    folder = tmp_path_factory.mktemp("poisoned") / "set"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
+        return build_dataset(folder, POISONED, SETTINGS, workers=2, home_time_limit_s=4.0)
+
+
+class TestPoisonedHomes:
+    def test_they_cost_only_themselves(self, poisoned: DatasetReport) -> None:
+        assert set(poisoned.built) == {f"make_home({seed})" for seed in (0, 1, 2, KILLS_ONCE)}
+        assert poisoned.failed.keys() == {f"make_home({seed})" for seed in (KILLS, HANGS, RAISES)}
+        assert set(read_dataset(poisoned.folder).home) == set(poisoned.built)
+
+    @pytest.mark.parametrize(
+        ("seed", "words"),
+        [
+            (KILLS, ("its process died 3 times", "last words", "(SIGKILL)")),
+            (HANGS, ("took longer than 4 s, the time limit of a home", "dataset_fakes.py", "in make_home")),
+            (RAISES, ("ZeroDivisionError: a fault of this home",)),
+        ],
+    )
+    def test_they_are_listed_with_the_reason(self, poisoned: DatasetReport, seed: int, words: tuple[str, ...]) -> None:
+        name = f"make_home({seed})"
+        noted = json.loads((poisoned.folder / "failed" / f"{name}.json").read_text())
+        assert noted == {"home": {"name": name, "seed": seed}, "error": poisoned.failed[name]}
+        for word in words:
+            assert word in noted["error"]
+
+    def test_they_are_tried_again_by_the_next_run(
+        self, poisoned: DatasetReport, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        name = f"make_home({RAISES})"
+        write_shard(fake_links(None, name, SETTINGS), shard_path(poisoned.folder, name), task(name, RAISES).metadata)
+        tried: list[HomeTask] = []
+        monkeypatch.setattr(dataset._Run, "make", lambda self, client, tasks: tried.extend(tasks))
+        build_dataset(poisoned.folder, POISONED, SETTINGS, workers=1)
+        assert [each.source.origin for each in tried] == [KILLS, HANGS]
+        assert not (poisoned.folder / "failed" / f"{name}.json").exists()
+
+    def test_full_disk_ends_the_run(self, tmp_path: Path, notes: Path) -> None:
+        with pytest.raises(OutputError, match=r"the disk is full.* The homes that are built stay: run it again\."):
+            build_dataset(tmp_path / "set", [UNWRITABLE, 1], SETTINGS, workers=1)
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("homes", "settings", "message"),
+        [
+            (
+                SEEDS,
+                replace(SETTINGS, links_per_home=6),
+                r"settings\.links_per_home was 5 when '.*' was begun, and is 6:",
+            ),
+            (
+                SEEDS,
+                replace(SETTINGS, seed=1, stages=(0,)),
+                r"settings\.seed was 0 .*, and is 1 \(and 1 more\): take what",
+            ),
+            (SEEDS, replace(SETTINGS, trace=TraceSettings(max_depth=2)), r"settings\.trace\.max_depth was 6 .* is 2:"),
+            (SEEDS[1:], SETTINGS, r"home 'make_home\(0\)' was in the list of homes when .* is not in it:"),
+        ],
+    )
+    def test_other_settings_and_homes(
+        self, unbroken: Path, homes: range, settings: DatasetSettings, message: str
+    ) -> None:
+        before = files(unbroken)
+        with pytest.raises(SettingsError, match=message):
+            build_dataset(unbroken, homes, settings)
+        assert files(unbroken) == before
+
+    def test_other_versions(self, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        now = home_process.installed_versions() | {"sionna-rt": "9.9"}
+        monkeypatch.setattr(dataset, "installed_versions", lambda: now)
+        with pytest.raises(SettingsError, match=r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'):
+            build_dataset(unbroken, SEEDS, SETTINGS)
+
+    def test_home_from_another_file(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dataset._Run, "make", lambda self, client, tasks: None)
+        for place in ("a", "b"):
+            (tmp_path / place / "villa").mkdir(parents=True)
+            (tmp_path / place / "villa" / "map.yaml").touch()
+        build_dataset(tmp_path / "set", [tmp_path / "a"], SETTINGS, workers=1)
+        with pytest.raises(SettingsError, match=r"home 'villa' was \".*a/villa/map\.yaml\" when .* is \".*b/villa/map"):
+            build_dataset(tmp_path / "set", [tmp_path / "b"], SETTINGS, workers=1)
+
+    def test_folder_with_other_content(self, tmp_path: Path) -> None:
+        (tmp_path / "letter.txt").touch()
+        with pytest.raises(
+            OutputError, match=r"other content than a data set \(letter\.txt\): choose a new or an empty"
+        ):
+            build_dataset(tmp_path, SEEDS, SETTINGS)
+
+    @pytest.mark.parametrize("text", ["{", "[]", '{"homes": 3, "settings": {}, "versions": {}}'])
+    def test_damaged_index(self, tmp_path: Path, text: str) -> None:
+        (tmp_path / "dataset.json").write_text(text)
+        with pytest.raises(OutputError, match=r"dataset\.json' is damaged .*: choose a new folder\."):
+            build_dataset(tmp_path, SEEDS, SETTINGS)
+
+    def test_workers_and_scheduler(self, tmp_path: Path) -> None:
+        with pytest.raises(
+            SettingsError, match="workers = 2 is for this machine, and scheduler is given: leave one out"
+        ):
+            build_dataset(tmp_path, SEEDS, SETTINGS, workers=2, scheduler="tcp://127.0.0.1:1")
+
+    @pytest.mark.parametrize(("name", "value"), [("workers", 0), ("workers", 1.5), ("home_time_limit_s", 0.0)])
+    def test_numbers(self, tmp_path: Path, name: str, value: float) -> None:
+        with pytest.raises(SettingsError, match=f"{name} = {value} is not allowed: give a"):
+            build_dataset(tmp_path, SEEDS, SETTINGS, **{name: value})
+
+    def test_no_home(self, tmp_path: Path) -> None:
+        with pytest.raises(MapError, match="homes is empty"):
+            build_dataset(tmp_path / "set", [], SETTINGS)
+        assert not (tmp_path / "set").exists()
+
+
+def task(name: str, seed: int, folder: Path = Path("nowhere"), digest: str = "") -> HomeTask:
+    return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_process.installed_versions(), 4.0)
+
+
+class TestWorker:
+    """What a worker finds out before it makes a home."""
+
+    def test_folder_that_it_does_not_see(self, tmp_path: Path) -> None:
+        result = run_home(task("make_home(1)", 1, tmp_path / "elsewhere"))
+        assert result.outcome == "unusable"
+        assert "cannot read" in result.error
+        assert "give a folder on a file system that all workers share" in result.error
+
+    def test_other_folder_of_the_same_name(self, tmp_path: Path) -> None:
+        (tmp_path / "dataset.json").write_text("{}")
+        result = run_home(task("make_home(1)", 1, tmp_path, "0" * 64))
+        assert result.outcome == "unusable"
+        assert "sees another" in result.error
+
+    def test_other_versions(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        (tmp_path / "dataset.json").write_text("{}")
+        mine = task("make_home(1)", 1, tmp_path, hashlib.sha256(b"{}").hexdigest())
+        monkeypatch.setattr(home_process, "installed_versions", lambda: mine.versions | {"mitsuba": "1.0"})
+        result = run_home(mine)
+        assert result.outcome == "unusable"
+        assert f"has mitsuba 1.0, the data set is made with {mine.versions['mitsuba']}: install" in result.error
+
+
+class TestScheduler:
+    def test_cluster_by_file_with_a_worker_that_is_killed(self, unbroken: Path, tmp_path: Path, notes: Path) -> None:
+        dask, file, folder = Path(sys.executable).parent / "dask", tmp_path / "scheduler.json", tmp_path / "set"
+        quiet = ("--scheduler-file", file, "--no-dashboard")
+        lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--local-directory", tmp_path, "--death-timeout", 30)
+        with (
+            started(dask, "scheduler", "--port", 0, "--host", "127.0.0.1", *quiet),
+            started(dask, "worker", *quiet, *lone) as victim,
+            started(sys.executable, "-c", BUILD.replace("workers=2", f"scheduler={str(file)!r}"), folder) as run,
+        ):
+            wait_until(lambda: shards(folder) >= 2)
+            victim.kill()
+            with started(dask, "worker", *quiet, *lone):
+                _, errors = run.communicate(timeout=60.0)
+        assert run.returncode == 0, errors
+        assert files(folder) == files(unbroken)
+
+    def test_slurm_example_without_slurm(self, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        script = Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch"
+        subprocess.run(["bash", "-n", script], check=True)
+        monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+        monkeypatch.setenv("SLURM_SUBMIT_DIR", str(tmp_path))
+        monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+        with started("bash", script, tmp_path / "set", "--homes", 3, "--links", 5) as run:
+            _, errors = run.communicate(timeout=60.0)
+        assert run.returncode == 0, errors
+        assert shards(tmp_path / "set") == 3
+        assert [path.name for path in tmp_path.iterdir()] == ["set"]
+
+    def test_file_that_is_not_there(self, tmp_path: Path) -> None:
+        with pytest.raises(BackendError, match=r"scheduler = 'nothing\.json' is not there: give the file that dask"):
+            build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="nothing.json")
+
+    def test_address_where_nothing_answers(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
+        with pytest.raises(
+            BackendError, match=r"scheduler = 'tcp://127\.0\.0\.1:9' does not answer .*: give the address"
+        ):
+            build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="tcp://127.0.0.1:9")
+
+    def test_no_address(self, tmp_path: Path) -> None:
+        with pytest.raises(BackendError, match=r"scheduler = 'smoke://signal' does not answer .*: give the address"):
+            build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="smoke://signal")

@@ -1,0 +1,74 @@
+import json
+import re
+
+import pytest
+from link_tables import make_dataset, make_table
+
+from sionna_partial.errors import PredictorError
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
+
+
+class TestOpenLinks:
+    def test_table_does_not_say_how_it_was_traced(self):
+        table = make_table(homes=1)
+        assert open_links(table) == (table, None)
+
+    @pytest.mark.parametrize(("noted", "found"), [(None, True), (True, True), (False, False)])
+    def test_folder_says_how_it_was_traced(self, noted, found, tmp_path):
+        table = make_table(homes=2)
+        links, traces = open_links(make_dataset(tmp_path, table, frequency_hz=60e9, diffraction=noted))
+        assert len(links) == len(table)
+        assert traces == LinkTraces(60e9, found)
+
+    def test_no_links_with_receivers_indoors(self):
+        table = make_table(homes=1)
+        for part in (table.take(table.anywhere), table.take(slice(0))):
+            with pytest.raises(PredictorError, match="dataset has no links with receivers drawn indoors: build one"):
+                open_links(part)
+
+    def test_something_else(self):
+        message = "dataset is of type int: give a LinkTable, or a folder that `sionna-partial dataset` wrote."
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            open_links(3)
+
+    def test_no_data_set_there(self, tmp_path):
+        with pytest.raises(PredictorError, match="is no data set"):
+            open_links(tmp_path)
+
+    def test_index_without_settings(self, tmp_path):
+        folder = make_dataset(tmp_path, make_table(homes=1))
+        index = json.loads((folder / "dataset.json").read_text())
+        (folder / "dataset.json").write_text(json.dumps({"homes": index["homes"]}))
+        with pytest.raises(PredictorError, match=r"dataset\.json' is damaged \(KeyError\('settings'\)\): build"):
+            open_links(folder)
+
+
+class TestSettingsFor:
+    def test_those_of_the_data_set(self):
+        assert settings_for(LinkTraces(60e9, False), steps=7, seed=8) == PredictorSettings(60e9, False, steps=7, seed=8)
+
+    def test_defaults(self):
+        assert settings_for(None) == PredictorSettings()
+
+
+class TestRequireLike:
+    TRACES = LinkTraces(28e9, True)
+
+    @pytest.mark.parametrize("found", [None, LinkTraces(28e9, True), LinkTraces(28e9 + 1.0, True)])
+    def test_the_same(self, found):
+        require_like(found, self.TRACES, "predictor 'x' was trained", "choose another.")
+
+    @pytest.mark.parametrize(
+        ("found", "words"),
+        [
+            (LinkTraces(60e9, True), "at 60 GHz with diffraction"),
+            (LinkTraces(28e9, False), "at 28 GHz without diffraction"),
+        ],
+    )
+    def test_others(self, found, words):
+        message = f"dataset was traced {words}, predictor 'x' was trained at 28 GHz with diffraction: choose another."
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            require_like(
+                found, LinkTraces.of_settings(PredictorSettings()), "predictor 'x' was trained", "choose another."
+            )

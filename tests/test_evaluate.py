@@ -1,0 +1,204 @@
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+from link_tables import fitted_baselines, make_dataset, make_table
+from predictor_links import LOS, OUTAGE, QUIET, quick_predictor
+
+from sionna_partial.errors import PredictorError
+from sionna_partial.learning.predictor import Predictor
+from sionna_partial.training import evaluate as evaluate_module
+from sionna_partial.training.baselines import Baselines
+from sionna_partial.training.evaluate import ALWAYS_OUTAGE, WITH_INDOOR, WITHOUT_INDOOR, evaluate
+from sionna_partial.training.metrics import measure
+
+pytestmark = QUIET
+
+ANSWERS = [
+    *("predictor", "paper", "distance only", "majority", "partial trace"),
+    *("TR 38.901 mixed office", "TR 38.901 open office"),
+]
+
+
+def trained_on(*homes):
+    return dataclasses.replace(quick_predictor(), homes=homes)
+
+
+@pytest.fixture(scope="module")
+def table():
+    return make_table(homes=4)
+
+
+@pytest.fixture(scope="module")
+def evaluation(table):
+    unsure = table.take(table.anywhere & ~table.rx_seen)
+    predictor = trained_on("home 1", "elsewhere").fit_indoor(unsure.phi, unsure.inside)
+    return evaluate(predictor, table, baselines=fitted_baselines())
+
+
+class TestEvaluate:
+    def test_homes_of_the_card_are_training_homes(self, evaluation):
+        assert evaluation.homes == {"test": ("home 0", "home 2", "home 3"), "train": ("home 1",)}
+
+    def test_every_answer_at_every_stage_for_all_and_by_ends_seen(self, evaluation):
+        for homes, stage in (("test", 0), ("test", 100), ("train", 0), ("train", 100)):
+            rows = evaluation.select(homes=homes, receivers="indoor", stage=stage)
+            assert [(row.ends_seen, row.answer) for row in rows] == [
+                (ends, answer) for ends in ("all", "both", "one", "none") for answer in ANSWERS
+            ]
+
+    def test_links_are_split_by_ends_seen(self, evaluation):
+        for receivers, answer in (("indoor", "majority"), ("anywhere", WITH_INDOOR)):
+            rows = evaluation.select(homes="test", receivers=receivers, stage=0, answer=answer)
+            total, *parts = (row.metrics.links for row in rows)
+            assert total == sum(parts) == 3 * 300
+            assert min(parts) > 0
+
+    def test_figures_are_those_of_the_links(self, table, evaluation):
+        chosen = np.isin(table.home, ["home 0", "home 2", "home 3"]) & ~table.anywhere & (table.stage == 100)
+        links = table.take(chosen & table.tx_seen & table.rx_seen)
+        (row,) = evaluation.select(homes="test", receivers="indoor", stage=100, ends_seen="both", answer="predictor")
+        expected = measure(quick_predictor().predict(links.phi), links.link_state, links.gain_db).as_json()
+        assert row.metrics.as_json() == pytest.approx(expected)
+
+    def test_the_indoor_model_helps_where_receivers_may_be_outside(self, evaluation):
+        for homes in ("test", "train"):
+            for stage in (0, 100):
+                rows = evaluation.select(homes=homes, receivers="anywhere", stage=stage, ends_seen="all")
+                found = {row.answer: row.metrics for row in rows}
+                with_it, without = found[WITH_INDOOR], found[WITHOUT_INDOOR]
+                assert with_it.accuracy > without.accuracy + 0.05
+                for name in ("rmse_db", "nll_state", "calibration_error"):
+                    assert getattr(with_it, name) < getattr(without, name), name
+
+    def test_always_outage_is_right_as_often_as_there_is_one(self, table, evaluation):
+        (row,) = evaluation.select(homes="train", receivers="anywhere", stage=0, ends_seen="all", answer=ALWAYS_OUTAGE)
+        truth = table.link_state[(table.home == "home 1") & table.anywhere & (table.stage == 0)]
+        assert row.metrics.accuracy == np.mean(truth == OUTAGE)
+        assert row.metrics.rmse_db > 0.0
+
+    def test_a_receiver_that_is_seen_is_indoors_for_certain(self, table):
+        doubtful = quick_predictor().fit_indoor(table.phi, np.zeros(len(table)))
+        rows = evaluate(doubtful, table, baselines=fitted_baselines()).select(receivers="anywhere", ends_seen="both")
+        one, other = (row.metrics.as_json() for row in rows[:2])
+        assert one == pytest.approx(other)
+
+    def test_differences_are_paired_by_home(self, table, evaluation):
+        (found,) = (each for each in evaluation.differences if each.baseline == "partial trace" and each.stage == 100)
+        accuracies, errors_db = [], []
+        for name in ("home 0", "home 2", "home 3"):
+            links = table.take((table.home == name) & ~table.anywhere & (table.stage == 100))
+            answer = quick_predictor().predict(links.phi)
+            one, other = answer.link_state == links.link_state, links.phi.link_state == links.link_state
+            accuracies.append(one.mean() - other.mean())
+            rmse_db = (
+                np.sqrt(np.mean((gain_db - links.gain_db) ** 2)) for gain_db in (answer.gain_mean_db, links.phi.gain_db)
+            )
+            errors_db.append(next(rmse_db) - next(rmse_db))
+        assert found.homes == 3
+        assert found.accuracy == pytest.approx(np.mean(accuracies))
+        assert found.accuracy_error == pytest.approx(np.std(accuracies, ddof=1) / math.sqrt(3))
+        assert found.rmse_db == pytest.approx(np.mean(errors_db))
+        assert found.rmse_error_db == pytest.approx(np.std(errors_db, ddof=1) / math.sqrt(3))
+
+    def test_one_home_has_no_standard_error(self, table):
+        found = evaluate(trained_on("home 1", "home 2", "home 3"), table, baselines=fitted_baselines()).differences
+        assert all(each.homes == 1 and math.isnan(each.accuracy_error) for each in found)
+
+    def test_calibration_is_that_of_test_homes(self, evaluation):
+        assert list(evaluation.calibrations) == [0, 100]
+        for calibration in evaluation.calibrations.values():
+            assert calibration.state.links.sum() == 900
+
+    def test_only_links_indoors(self, table):
+        found = evaluate(quick_predictor(), table.take(~table.anywhere), baselines=fitted_baselines())
+        assert {row.receivers for row in found.rows} == {"indoor"}
+
+    def test_complete_maps_are_answered_by_their_trace(self, table):
+        known = table.phi.link_state == table.link_state
+        right = dataclasses.replace(table, gain_db=table.phi.gain_db).take(known & ~table.anywhere)
+        rows = evaluate(quick_predictor(), right, baselines=fitted_baselines()).select(answer="partial trace")
+        assert {(row.metrics.accuracy, row.metrics.rmse_db, row.metrics.nll_state) for row in rows} == {(1.0, 0.0, 0.0)}
+        assert set(right.link_state) >= {LOS, OUTAGE}
+
+    def test_progress(self, table):
+        calls = []
+        evaluate(trained_on("home 0"), table, baselines=fitted_baselines(), progress=lambda *call: calls.append(call))
+        assert calls[0] == (0.0, "measuring on test homes after 0 steps, receivers indoor")
+        assert calls[-1] == (0.875, "measuring on train homes after 100 steps, receivers anywhere")
+
+
+class TestPaper:
+    def test_the_papers_is_not_compared_with_itself(self, table):
+        found = evaluate("paper", table, baselines=fitted_baselines())
+        assert {row.answer for row in found.select(receivers="indoor")} == {*ANSWERS} - {"paper"}
+
+    def test_the_papers_is_left_out_at_another_frequency(self, table):
+        settings = dataclasses.replace(quick_predictor().settings, frequency_hz=60e9)
+        found = evaluate(dataclasses.replace(quick_predictor(), settings=settings), table, baselines=fitted_baselines())
+        assert "paper" not in {row.answer for row in found.rows}
+
+    def test_a_note_says_which_test_homes_it_was_trained_on(self, table):
+        name = Predictor.load("paper").homes[0]
+        known = dataclasses.replace(table, home=np.where(table.home == "home 2", name, table.home))
+        found = evaluate(quick_predictor(), known, baselines=fitted_baselines())
+        assert found.notes[1:] == ("The shipped paper's predictor was trained on 1 of the 4 test homes.",)
+
+    def test_notes_say_what_the_baselines_were_fitted_to(self, table):
+        for homes, whose in ((("a", "b"), "those"), (("home 1",), "others than those")):
+            notes = evaluate(trained_on(*homes), table, baselines=fitted_baselines()).notes
+            assert notes == (f"Majority and distance only were fitted to 2 homes, {whose} of the predictor.",)
+
+    def test_a_note_says_which_test_homes_the_baselines_know(self, table):
+        fitted = Baselines(fitted_baselines().majority, trained_on("home 2", "home 3"))
+        notes = evaluate(trained_on("home 0"), table, baselines=fitted).notes
+        assert notes[1:] == ("Distance only was trained on 2 of the 3 test homes.",)
+
+
+class TestBaselinesFolder:
+    def test_beside_the_predictor(self, table, tmp_path, monkeypatch):
+        quick_predictor().save(tmp_path / "mine.keras")
+        fitted_baselines().save(tmp_path)
+        monkeypatch.setattr(evaluate_module, "PREDICTORS_FOLDER", tmp_path / "none")
+        found = evaluate(tmp_path / "mine.keras", table)
+        (row, *_) = found.select(answer="majority", receivers="indoor")
+        truth = table.link_state[~table.anywhere & (table.stage == 0)]
+        assert row.metrics.accuracy == np.mean(truth == 2)
+
+    def test_else_the_shipped_ones(self, table, tmp_path, monkeypatch):
+        fitted_baselines().save(tmp_path)
+        monkeypatch.setattr(evaluate_module, "PREDICTORS_FOLDER", tmp_path)
+        (tmp_path / "alone").mkdir()
+        quick_predictor().save(tmp_path / "alone" / "mine.keras")
+        for predictor in (quick_predictor(), tmp_path / "alone" / "mine.keras"):
+            assert evaluate(predictor, table).select(answer="distance only")
+
+
+class TestErrors:
+    def test_trained_on_all_homes(self, table):
+        names = [f"home {index}" for index in range(4)]
+        message = (
+            "predictor 'fitted' was trained on all 4 homes of the data set: give a data set of other homes, such "
+            "as other seeds, or train with test_share above 0."
+        )
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            evaluate(trained_on(*names), table, baselines=fitted_baselines())
+
+    def test_other_traces(self, table, tmp_path):
+        folder = make_dataset(tmp_path, table, frequency_hz=60e9)
+        message = (
+            "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
+            "diffraction: choose another predictor"
+        )
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            evaluate(quick_predictor(), folder, baselines=fitted_baselines())
+
+    def test_unknown_predictor(self, table):
+        with pytest.raises(PredictorError, match="path = 'nobody'"):
+            evaluate("nobody", table)
+
+    def test_empty(self, table):
+        with pytest.raises(PredictorError, match="dataset has no links"):
+            evaluate(quick_predictor(), table.take(slice(0)), baselines=fitted_baselines())

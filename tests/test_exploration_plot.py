@@ -1,0 +1,152 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from PIL import Image
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.maps.explore import Exploration, explore_trajectory
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.exploration_plot import MAX_PANELS, animate_exploration, plot_exploration
+from sionna_partial.plots.figures import BLUE, RED, YELLOW, figure_png
+from sionna_partial.settings import SensorSettings
+
+
+@pytest.fixture(scope="module")
+def home() -> PartialMap:
+    """Two rooms and a door, in the middle of a larger grid."""
+    state = np.full((90, 140), CellState.UNKNOWN, dtype=np.uint8)
+    state[20:70, 20:120] = CellState.WALL
+    state[21:69, 21:119] = CellState.FREE
+    state[21:55, 70] = CellState.WALL
+    return PartialMap(state, 0.05, (-3.0, 8.0))
+
+
+@pytest.fixture(scope="module")
+def exploration(home: PartialMap) -> Exploration:
+    return explore_trajectory(home, range(0, 61, 10), 2)
+
+
+def panels(figure: Figure) -> list:
+    return [axis for axis in figure.axes if axis.images]
+
+
+class TestPlotExploration:
+    def test_each_moment_has_a_panel_that_says_what_it_shows(self, exploration):
+        titles = [panel.get_title() for panel in panels(plot_exploration(exploration.at((10, 60))))]
+        shares = exploration.at((10, 60)).observed_fractions
+        assert titles == [f"step 10: {shares[0]:.0%} seen", f"step 60: {shares[1]:.0%} seen"]
+
+    def test_cells_have_their_colours(self, home, exploration):
+        image = panels(plot_exploration(exploration.at((30,))))[0].images[0]
+        state, picture = exploration.at((30,)).states[0], image.get_array()
+        assert image.get_extent() == pytest.approx((-3.0, 4.0, 8.0, 12.5))
+        assert image.origin == "lower"
+        assert (picture[state == CellState.FREE] == 1.0).all()
+        assert (picture[state == CellState.WALL] == 0.0).all()
+        unknown = state == CellState.UNKNOWN
+        hidden = unknown & (home.state == CellState.WALL)
+        assert len(np.unique(picture[hidden])) == len(np.unique(picture[unknown & ~hidden])) == 1
+        assert 0 < picture[hidden][0, 0] < picture[unknown & ~hidden][0, 0] < 1
+
+    def test_the_way_ends_at_the_robot(self, exploration):
+        panel = panels(plot_exploration(exploration.at((60,))))[0]
+        way = next(line for line in panel.lines if len(line.get_xdata()) == 61)
+        assert np.array_equal(np.stack(way.get_data(), axis=1), exploration.poses[:, :2])
+        robot = panel.lines[-1]
+        assert (robot.get_xdata()[0], robot.get_ydata()[0]) == tuple(exploration.poses[-1, :2])
+        tip = robot.get_marker().vertices[0]
+        assert np.degrees(np.arctan2(tip[1], tip[0])) % 360 == pytest.approx(exploration.poses[-1, 2])
+
+    def test_the_view_stays_in_the_room(self, home, exploration):
+        (view,) = panels(plot_exploration(exploration.at((60,))))[0].patches
+        corners = view.get_xy()
+        assert tuple(corners[0]) == tuple(exploration.poses[-1, :2])
+        assert (home.state_at(corners) != CellState.UNKNOWN).all()
+
+    def test_nothing_is_in_view_before_the_first_step(self, exploration):
+        assert len(panels(plot_exploration(exploration.at((0,))))[0].patches) == 0
+
+    def test_a_map_that_drifts_shows_both_ways(self, home):
+        drifting = explore_trajectory(home, (40,), 2, sensor=SensorSettings(drift_m_per_m=0.05))
+        figure = plot_exploration(drifting)
+        ways = [line for line in panels(figure)[0].lines if len(line.get_xdata()) == 41]
+        assert np.array_equal(ways[0].get_xdata(), drifting.poses[:, 0])
+        assert np.array_equal(ways[1].get_xdata(), drifting.believed_poses[:, 0])
+        (view,) = panels(figure)[0].patches
+        assert view.get_xy()[0] == pytest.approx(drifting.believed_poses[-1, :2])
+        assert [text.get_text() for text in figure.legends[0].texts][:2] == [
+            "where the robot believes to be",
+            "where it is",
+        ]
+
+    def test_many_moments_are_thinned(self, home):
+        many = explore_trajectory(home, range(0, 40), 2)
+        titles = [panel.get_title() for panel in panels(plot_exploration(many))]
+        assert len(titles) == MAX_PANELS
+        assert titles[-1].startswith("step 39:")
+
+    def test_equal_explorations_give_equal_bytes(self, exploration):
+        first, again = (figure_png(plot_exploration(exploration.at((60,)))) for _ in range(2))
+        assert first == again
+
+    def test_it_needs_an_exploration(self, home):
+        with pytest.raises(
+            SettingsError, match="exploration = 'PartialMap' is not allowed: give an Exploration, as explore_trajectory"
+        ):
+            plot_exploration(home)
+
+
+class TestAnimateExploration:
+    def test_frames(self, exploration, tmp_path):
+        animate_exploration(exploration, tmp_path / "way.gif")
+        with Image.open(tmp_path / "way.gif") as animation:
+            assert animation.n_frames == len(exploration.steps)
+            assert animation.info["loop"] == 0
+            shares = []
+            for index in range(animation.n_frames):
+                animation.seek(index)
+                pixels = np.asarray(animation.convert("RGB"))
+                shares.append((pixels == 255).all(axis=2).mean())
+            assert animation.info["duration"] > 1000
+        assert shares[0] < shares[1] < shares[-1]
+        assert (tmp_path / "way.gif").stat().st_size < 200_000
+
+    def test_its_colours_are_those_that_are_drawn(self, exploration, tmp_path):
+        animate_exploration(exploration, tmp_path / "way.gif")
+        with Image.open(tmp_path / "way.gif") as animation:
+            animation.seek(animation.n_frames - 1)
+            found = {colour for _, colour in animation.convert("RGB").getcolors(1 << 20)}
+        assert {tuple(round(255 * value) for value in to_rgb(colour)) for colour in (BLUE, RED)} <= found
+        view = 0.65 + 0.35 * np.array(to_rgb(YELLOW))
+        assert min(np.abs(np.array(list(found)) - 255 * view).max(axis=1)) <= 2
+
+    def test_equal_explorations_give_equal_bytes(self, exploration, tmp_path):
+        names = [tmp_path / "first.gif", tmp_path / "again.gif"]
+        for name in names:
+            animate_exploration(exploration.at((0, 60)), name)
+        assert names[0].read_bytes() == names[1].read_bytes()
+
+    def test_one_frame(self, exploration, tmp_path):
+        animate_exploration(exploration.at((60,)), tmp_path / "way.GIF")
+        with Image.open(tmp_path / "way.GIF") as animation:
+            assert (animation.format, animation.n_frames) == ("GIF", 1)
+
+    def test_another_suffix(self, exploration, tmp_path):
+        with pytest.raises(
+            SettingsError, match=r"path = '.*way\.mp4' is not allowed: give a name that ends with \.gif\."
+        ):
+            animate_exploration(exploration, tmp_path / "way.mp4")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_a_folder_that_cannot_be(self, exploration, tmp_path):
+        (tmp_path / "file").touch()
+        with pytest.raises(OutputError, match="could not be written"):
+            animate_exploration(exploration.at((60,)), tmp_path / "file" / "way.gif")
+
+    def test_it_needs_an_exploration(self):
+        with pytest.raises(SettingsError, match="exploration = 'str' is not allowed: give an Exploration"):
+            animate_exploration("exploration", Path("way.gif"))

@@ -1,0 +1,205 @@
+"""Links of one home: places, truth, features, and what does not depend on what."""
+
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.errors import MapError, PositionError
+from sionna_partial.learning.features import link_features
+from sionna_partial.maps.explore import explore
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import DatasetSettings, TraceSettings
+from sionna_partial.tracing.trace import trace_links
+from sionna_partial.training import home_links as module
+from sionna_partial.training.home_links import NEAREST_M, home_links, map_area
+from sionna_partial.training.link_table import COLUMNS, LinkTable
+
+SETTINGS = DatasetSettings(
+    links_per_home=31, transmitters_per_home=3, stages=(0, 3, 40), trace=TraceSettings(max_depth=2)
+)
+
+
+def two_rooms(grid: tuple[int, int] = (50, 70), corner: tuple[int, int] = (2, 3)) -> PartialMap:
+    """6 m x 4 m of free cells in walls, parted by a wall with a door of 1 m, somewhere in a grid."""
+    state = np.full(grid, CellState.UNKNOWN, dtype=np.uint8)
+    room = np.full((42, 62), CellState.WALL, dtype=np.uint8)
+    room[1:-1, 1:-1] = CellState.FREE
+    room[1:15, 30] = room[25:-1, 30] = CellState.WALL
+    state[corner[0] : corner[0] + 42, corner[1] : corner[1] + 62] = room
+    return PartialMap(state, 0.1, (-7.0, 11.0))
+
+
+@pytest.fixture(scope="module")
+def home() -> PartialMap:
+    return two_rooms()
+
+
+@pytest.fixture(scope="module")
+def table(home: PartialMap) -> LinkTable:
+    return home_links(home, "two rooms", SETTINGS)
+
+
+def same(first: LinkTable, second: LinkTable) -> bool:
+    pairs = [(getattr(first, name), getattr(second, name)) for name in COLUMNS]
+    pairs += [(getattr(first.phi, field.name), getattr(second.phi, field.name)) for field in fields(first.phi)]
+    return all(np.array_equal(one, other) for one, other in pairs)
+
+
+class TestPlaces:
+    def test_counts(self, table: LinkTable) -> None:
+        assert len(table) == 2 * 31 * 3
+        assert set(table.home) == {"two rooms"}
+        for stage in SETTINGS.stages:
+            here = table.take(table.stage == stage)
+            assert (here.anywhere.sum(), (~here.anywhere).sum()) == (31, 31)
+            _, counts = np.unique(here.tx_m, axis=0, return_counts=True)
+            assert sorted(counts) == [20, 20, 22]
+
+    def test_every_stage_has_the_same_links_and_truth(self, table: LinkTable) -> None:
+        first, *others = (table.take(table.stage == stage) for stage in SETTINGS.stages)
+        for other in others:
+            for name in ("tx_m", "rx_m", "link_state", "gain_db", "inside", "anywhere"):
+                np.testing.assert_array_equal(getattr(other, name), getattr(first, name))
+
+    def test_where_they_are(self, home: PartialMap, table: LinkTable) -> None:
+        state = home.state_at(table.rx_m)
+        assert (home.state_at(table.tx_m) == CellState.FREE).all()
+        assert (state[~table.anywhere] == CellState.FREE).all()
+        assert not (state == CellState.WALL).any()
+        np.testing.assert_array_equal(table.inside, state == CellState.FREE)
+        x0, y0, x1, y1 = map_area(home, SETTINGS.margin_m).bounds_m
+        assert (table.rx_m[:, :2] >= (x0, y0)).all()
+        assert (table.rx_m[:, :2] <= (x1, y1)).all()
+        assert {*table.tx_m[:, 2], *table.rx_m[:, 2]} == {1.5}
+        assert 0.1 < table.inside[table.anywhere].mean() < 0.6
+
+    def test_none_is_at_its_transmitter(self) -> None:
+        state = np.full((5, 5), CellState.WALL, dtype=np.uint8)
+        state[1:4, 1:4] = CellState.FREE
+        settings = DatasetSettings(links_per_home=300, transmitters_per_home=1, stages=(0,), margin_m=0.0)
+        table = home_links(PartialMap(state, 0.1), "closet", settings)
+        assert table.phi.distance_m.min() >= NEAREST_M
+        assert table.phi.distance_m.min() < NEAREST_M + 0.02
+
+    def test_too_small(self) -> None:
+        state = np.full((3, 3), CellState.WALL, dtype=np.uint8)
+        state[1, 1] = CellState.FREE
+        with pytest.raises(
+            MapError, match=r"home 'shaft' is too small, all of it is within 0\.1 m of a transmitter: leave"
+        ):
+            home_links(PartialMap(state, 0.1), "shaft", DatasetSettings())
+
+
+class TestTruthAndFeatures:
+    def test_truth_is_the_trace_on_the_complete_home(self, home: PartialMap, table: LinkTable) -> None:
+        here = table.take((table.stage == 40) & table.inside)
+        for tx in np.unique(here.tx_m, axis=0):
+            mine = here.take((here.tx_m == tx).all(axis=1))
+            links = trace_links(home, tx, mine.rx_m, settings=SETTINGS.trace)
+            np.testing.assert_array_equal(mine.link_state, links.link_state)
+            np.testing.assert_allclose(mine.gain_db, links.gain_db, atol=1e-3)
+
+    def test_outside_is_outage(self, table: LinkTable) -> None:
+        outside = table.take(~table.inside)
+        assert len(outside)
+        assert (outside.link_state == LinkState.OUTAGE).all()
+        assert (outside.gain_db == GAIN_FLOOR_DB).all()
+
+    def test_nothing_is_seen_at_stage_0(self, table: LinkTable) -> None:
+        here = table.take(table.stage == 0)
+        assert not here.tx_seen.any()
+        assert not here.rx_seen.any()
+        assert not here.observed_fraction.any()
+        assert (here.phi.link_state == LinkState.LOS).all()
+        np.testing.assert_allclose(here.phi.unobserved_distance_m, here.phi.distance_m)
+
+    def test_features_are_those_of_the_partial_map(self, home: PartialMap, table: LinkTable, monkeypatch: Any) -> None:
+        maps: list[PartialMap] = []
+
+        def noted(*args: Any, **options: Any) -> list[PartialMap]:
+            maps.extend(explore(*args, **options))
+            return maps
+
+        monkeypatch.setattr(module, "explore", noted)
+        assert same(home_links(home, "two rooms", SETTINGS), table)
+        partial = maps[1]
+        here = table.take(table.stage == 3)
+        assert here.observed_fraction == pytest.approx(partial.observed_fraction)
+        np.testing.assert_array_equal(here.tx_seen, partial.state_at(here.tx_m) != CellState.UNKNOWN)
+        np.testing.assert_array_equal(here.rx_seen, partial.state_at(here.rx_m) != CellState.UNKNOWN)
+        tx = here.tx_m[0]
+        mine = here.take((here.tx_m == tx).all(axis=1))
+        phi = link_features(partial, trace_links(partial, tx, mine.rx_m, settings=SETTINGS.trace))
+        np.testing.assert_array_equal(mine.phi.link_state, phi.link_state)
+        np.testing.assert_array_equal(mine.phi.unobserved_distance_m, phi.unobserved_distance_m)
+        np.testing.assert_array_equal(mine.phi.gain_db, phi.gain_db)
+
+    def test_a_map_that_stays_is_traced_once(self, home: PartialMap, monkeypatch: Any) -> None:
+        traced: list[PartialMap] = []
+        trace = module.trace_each
+
+        def noted(partial: PartialMap, *args: Any, **options: Any) -> Any:
+            traced.append(partial)
+            return trace(partial, *args, **options)
+
+        monkeypatch.setattr(module, "trace_each", noted)
+        table = home_links(home, "two rooms", replace(SETTINGS, stages=(5000, 5001, 5002)))
+        assert len(traced) == 2
+        last = table.take(table.stage == 5002)
+        np.testing.assert_array_equal(last.phi.gain_db, table.phi.gain_db[: len(last)])
+
+
+class TestSeeds:
+    @pytest.mark.parametrize(
+        "change", [lambda settings: (settings, "other"), lambda settings: (replace(settings, seed=1), "two rooms")]
+    )
+    def test_places_depend_on_name_and_seed(
+        self, home: PartialMap, table: LinkTable, change: Callable[[DatasetSettings], tuple[DatasetSettings, str]]
+    ) -> None:
+        settings, name = change(replace(SETTINGS, stages=(0,)))
+        assert not np.isin(home_links(home, name, settings).rx_m[:, 0], table.rx_m[:, 0]).any()
+
+    def test_size_of_the_grid_is_of_no_account(self, table: LinkTable) -> None:
+        moved = two_rooms((200, 300), (120, 44))
+        shift = (np.array([44, 120]) - [3, 2]) * 0.1
+        moved = replace(moved, origin_m=tuple(np.array(moved.origin_m) - shift))
+        other = home_links(moved, "two rooms", SETTINGS)
+        np.testing.assert_allclose(other.rx_m, table.rx_m, atol=1e-9)
+        np.testing.assert_array_equal(other.link_state, table.link_state)
+        np.testing.assert_array_equal(other.rx_seen, table.rx_seen)
+
+
+class TestMapArea:
+    @pytest.mark.parametrize("margin_m", [0.0, 0.25, 3.0])
+    def test_known_cells_and_a_margin(self, margin_m: float) -> None:
+        home = two_rooms()
+        area = map_area(home, margin_m)
+        cells = round(np.ceil(margin_m / 0.1))
+        assert area.shape == (42 + 2 * cells, 62 + 2 * cells)
+        known = np.argwhere(area.state != CellState.UNKNOWN)
+        assert known.min() == cells
+        rows, columns = np.indices(area.shape)
+        centres = np.stack([columns, rows], axis=-1) * 0.1 + 0.05 + area.origin_m
+        np.testing.assert_array_equal(home.state_at(centres), area.state)
+
+
+class TestRefused:
+    def test_home_with_a_gap(self, home: PartialMap) -> None:
+        state = home.state.copy()
+        state[2, 20] = CellState.FREE
+        with pytest.raises(
+            MapError, match=r"home 'ruin' is not complete, a free cell touches an unknown one: give maps of"
+        ):
+            home_links(replace(home, state=state), "ruin", SETTINGS)
+
+    def test_no_map(self) -> None:
+        with pytest.raises(MapError, match="home is of type str: give a PartialMap"):
+            home_links("home", "home", SETTINGS)  # type: ignore[arg-type]
+
+    def test_height_above_the_ceiling(self, home: PartialMap) -> None:
+        with pytest.raises(PositionError, match="is not between floor and ceiling"):
+            home_links(home, "two rooms", replace(SETTINGS, rx_height_m=9.0))

@@ -1,0 +1,107 @@
+import dataclasses
+import json
+import re
+
+import pytest
+from link_tables import fitted_baselines, make_table
+from predictor_links import QUIET, quick_predictor
+
+from sionna_partial.errors import OutputError
+from sionna_partial.training.evaluate import WITH_INDOOR, evaluate
+from sionna_partial.training.metrics import DEFINITIONS
+from sionna_partial.training.report import REPORT_FILES, as_json, markdown, save_report, summary
+
+pytestmark = QUIET
+
+
+@pytest.fixture(scope="module")
+def evaluation():
+    predictor = dataclasses.replace(quick_predictor(), homes=("home 1",))
+    return evaluate(predictor, make_table(homes=3), baselines=fitted_baselines())
+
+
+def tables(text):
+    """Tables of a Markdown text by their titles, as lists of rows of cells."""
+    sections = re.findall(r"### (.+)\n\n((?:\|.*\|\n?)+)", text)
+    return {
+        title: [[cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines()]
+        for title, lines in sections
+    }
+
+
+class TestSummary:
+    def test_figures_stand_where_they_belong(self, evaluation):
+        rows = tables(summary(evaluation))["Test homes, receivers indoors"]
+        (row,) = (cells for cells in rows if cells[:2] == ["100", "predictor"])
+        (found,) = evaluation.select(homes="test", stage=100, answer="predictor", ends_seen="all")
+        assert rows[0][2:5] == ["links", "accuracy", "RMSE [dB]"]
+        assert row[2:5] == ["600", f"{found.metrics.accuracy:.3f}", f"{found.metrics.rmse_db:.2f}"]
+
+    def test_what_has_no_finite_value_is_a_dash(self, evaluation):
+        rows = tables(summary(evaluation))["Test homes, receivers indoors"]
+        (row,) = (cells for cells in rows if cells[:2] == ["0", "partial trace"])
+        assert row[6:8] == ["-", "-"]
+        assert row[9] == "-"
+        assert "nan" not in summary(evaluation)
+
+    def test_columns_are_aligned(self, evaluation):
+        for block in re.findall(r"(?:\|.*\|\n?)+", summary(evaluation)):
+            assert len({len(line) for line in block.splitlines()}) == 1
+
+    def test_differences_have_signs_and_errors(self, evaluation):
+        found = tables(summary(evaluation))
+        titles = [title for title in found if "standard error" in title]
+        assert len(titles) == 2
+        for title in titles:
+            for cells in found[title][2:]:
+                assert re.fullmatch(r"[+-]\d\.\d{3} ± \d\.\d{3}", cells[3])
+                assert re.fullmatch(r"[+-]\d+\.\d{2} ± \d+\.\d{2}", cells[4])
+
+
+class TestMarkdown:
+    def test_every_definition_and_every_part_is_there(self, evaluation):
+        text = markdown(evaluation)
+        assert all(definition in text for definition in DEFINITIONS.values())
+        assert evaluation.fingerprint in text
+        assert "2 test and 1 train homes" in text
+        assert [title for title in tables(text) if "standard error" not in title] == [
+            "Test homes, receivers indoors",
+            "Test homes, receivers indoors, both ends seen",
+            "Test homes, receivers indoors, one end seen",
+            "Test homes, receivers indoors, no end seen",
+            "Train homes, receivers indoors",
+            "Test homes, receivers anywhere on the map, outside in outage",
+            "Train homes, receivers anywhere on the map, outside in outage",
+        ]
+
+    def test_no_row_without_links(self, evaluation):
+        bare = dataclasses.replace(evaluation.rows[0].metrics, links=0)
+        rows = (dataclasses.replace(evaluation.rows[0], metrics=bare), *evaluation.rows[1:])
+        whole, less = (tables(markdown(each)) for each in (evaluation, dataclasses.replace(evaluation, rows=rows)))
+        title = "Test homes, receivers indoors"
+        assert len(less[title]) == len(whole[title]) - 1
+
+
+class TestAsJson:
+    def test_it_is_json_without_nan(self, evaluation):
+        content = json.loads(json.dumps(as_json(evaluation), allow_nan=False))
+        assert content["homes"] == {"test": ["home 0", "home 2"], "train": ["home 1"]}
+        assert len(content["rows"]) == len(evaluation.rows)
+        assert {row["metrics"]["nll"] for row in content["rows"] if row["answer"] == "partial trace"} == {None}
+        assert content["differences"][-1]["baseline"] == "always outage"
+        assert sum(content["calibration"]["0"]["links"]) == 600
+        assert WITH_INDOOR in {row["answer"] for row in content["rows"]}
+
+
+class TestSaveReport:
+    def test_files_are_equal_every_time(self, evaluation, tmp_path):
+        files = save_report(evaluation, tmp_path / "one")
+        assert [file.name for file in files] == list(REPORT_FILES)
+        assert files[2].read_bytes().startswith(b"\x89PNG")
+        for file, again in zip(files, save_report(evaluation, tmp_path / "two"), strict=True):
+            assert file.read_bytes() == again.read_bytes()
+
+    def test_nothing_is_left_where_it_cannot_be_written(self, evaluation, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(OutputError, match="could not be written"):
+            save_report(evaluation, tmp_path / "file")

@@ -1,0 +1,167 @@
+"""Links through Parquet files: nothing is lost, equal links give equal bytes, and damage is told from emptiness."""
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from dataset_fakes import fake_links
+
+from sionna_partial.errors import OutputError, PredictorError
+from sionna_partial.settings import DatasetSettings
+from sionna_partial.training.link_table import COLUMNS, LinkTable
+from sionna_partial.training.shards import (
+    FORMAT,
+    read_dataset,
+    read_shard,
+    shard_metadata,
+    shard_path,
+    write_shard,
+)
+
+NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}
+
+
+@pytest.fixture
+def links() -> LinkTable:
+    return fake_links(None, "villa (north)", DatasetSettings(links_per_home=7, stages=(0, 50)))
+
+
+@pytest.fixture
+def shard(links: LinkTable, tmp_path: Path) -> Path:
+    write_shard(links, tmp_path / "villa.parquet", NOTES)
+    return tmp_path / "villa.parquet"
+
+
+def assert_same(first: LinkTable, second: LinkTable) -> None:
+    for name in COLUMNS:
+        one, other = getattr(first, name), getattr(second, name)
+        np.testing.assert_array_equal(one, other)
+        assert one.dtype == other.dtype, name
+    for field in fields(first.phi):
+        np.testing.assert_array_equal(getattr(first.phi, field.name), getattr(second.phi, field.name))
+
+
+class TestShard:
+    def test_round_trip(self, links: LinkTable, shard: Path) -> None:
+        assert_same(read_shard(shard), links)
+
+    def test_every_column_of_the_table_is_in_the_file_with_its_unit(self, shard: Path) -> None:
+        names = set(pq.read_schema(shard).names)
+        positions = {f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"}
+        phi = {"partial_link_state", "partial_gain_db", "unobserved_distance_m", "distance_m"}
+        assert names == {*COLUMNS} - {"tx_m", "rx_m"} | positions | phi
+
+    def test_columns_hold_what_they_say(self, links: LinkTable, shard: Path) -> None:
+        columns = pq.read_table(shard)
+        np.testing.assert_array_equal(columns["rx_y_m"], links.rx_m[:, 1])
+        np.testing.assert_array_equal(columns["partial_gain_db"], links.phi.gain_db)
+        np.testing.assert_array_equal(columns["gain_db"], links.gain_db)
+        np.testing.assert_array_equal(columns["partial_link_state"], links.phi.link_state)
+
+    def test_notes(self, shard: Path) -> None:
+        assert shard_metadata(shard) == {"format": FORMAT, **NOTES}
+
+    def test_equal_links_give_equal_bytes(self, links: LinkTable, shard: Path, tmp_path: Path) -> None:
+        write_shard(links, tmp_path / "again.parquet", dict(reversed(NOTES.items())))
+        assert (tmp_path / "again.parquet").read_bytes() == shard.read_bytes()
+        write_shard(replace(links, gain_db=links.gain_db + 1e-9), tmp_path / "other.parquet", NOTES)
+        assert (tmp_path / "other.parquet").read_bytes() != shard.read_bytes()
+
+    def test_nothing_else_is_left(self, shard: Path) -> None:
+        assert [path.name for path in shard.parent.iterdir()] == ["villa.parquet"]
+
+    def test_unwritable(self, links: LinkTable, shard: Path) -> None:
+        with pytest.raises(OutputError, match="could not be written"):
+            write_shard(links, shard / "inner.parquet", NOTES)
+
+
+class TestDamaged:
+    def test_missing(self, tmp_path: Path) -> None:
+        with pytest.raises(PredictorError, match=r"no\.parquet' is not there: give a shard"):
+            read_shard(tmp_path / "no.parquet")
+
+    @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
+    def test_truncated(self, shard: Path, share: float) -> None:
+        content = shard.read_bytes()
+        shard.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(
+            PredictorError, match=r"villa\.parquet' is damaged, or no Parquet file .*: delete it and run"
+        ):
+            read_shard(shard)
+
+    def test_one_byte_of_a_column(self, shard: Path) -> None:
+        content = bytearray(shard.read_bytes())
+        content[len(content) // 4] ^= 0xFF
+        shard.write_bytes(content)
+        with pytest.raises(PredictorError, match=r"villa\.parquet' is damaged"):
+            read_shard(shard)
+
+    def test_foreign(self, tmp_path: Path) -> None:
+        pq.write_table(pa.table({"a": [1]}), tmp_path / "foreign.parquet")
+        with pytest.raises(
+            PredictorError, match=r"foreign\.parquet' is no shard of this version .* build the data set"
+        ):
+            read_shard(tmp_path / "foreign.parquet")
+
+    def test_column_of_another_type(self, shard: Path) -> None:
+        table = pq.read_table(shard)
+        column = table.column_names.index("inside")
+        other = table.set_column(column, "inside", pa.array(np.ones(len(table)))).replace_schema_metadata(
+            table.schema.metadata
+        )
+        pq.write_table(other, shard)
+        with pytest.raises(PredictorError, match="is no shard of this version"):
+            read_shard(shard)
+
+    def test_values_that_no_link_has(self, shard: Path) -> None:
+        table = pq.read_table(shard)
+        column = table.column_names.index("distance_m")
+        field = table.schema.field("distance_m")
+        pq.write_table(table.set_column(column, field, pa.array(-np.ones(len(table)))), shard)
+        with pytest.raises(PredictorError, match=r"is damaged, or no Parquet file \(distance_m\[0\] = -1"):
+            read_shard(shard)
+
+
+class TestDataset:
+    @pytest.fixture
+    def folder(self, tmp_path: Path) -> Path:
+        names = ("b", "a", "missing", "c")
+        (tmp_path / "dataset.json").write_text(json.dumps({"homes": [{"name": name} for name in names]}))
+        for name in ("a", "b", "c"):
+            write_shard(fake_links(None, name, DatasetSettings(links_per_home=4)), shard_path(tmp_path, name), {})
+        return tmp_path
+
+    def test_all_homes_in_the_order_of_the_list(self, folder: Path) -> None:
+        links = read_dataset(folder)
+        assert list(dict.fromkeys(links.home.tolist())) == ["b", "a", "c"]
+        assert_same(links.take(links.home == "a"), read_shard(shard_path(folder, "a")))
+
+    def test_some_homes(self, folder: Path) -> None:
+        assert list(dict.fromkeys(read_dataset(folder, ["c", "b"]).home.tolist())) == ["c", "b"]
+
+    @pytest.mark.parametrize("name", ["missing", "d"])
+    def test_home_that_is_not_there(self, folder: Path, name: str) -> None:
+        with pytest.raises(PredictorError, match=rf"home '{name}' is not in '.*': choose from 'b', 'a', 'c'\."):
+            read_dataset(folder, [name])
+
+    def test_nothing_built(self, folder: Path) -> None:
+        for name in ("a", "b", "c"):
+            shard_path(folder, name).unlink()
+        with pytest.raises(PredictorError, match="has no home yet: run `sionna-partial dataset` again"):
+            read_dataset(folder)
+
+    def test_no_dataset(self, tmp_path: Path) -> None:
+        with pytest.raises(PredictorError, match=r"is no data set, it has no dataset\.json: give a folder that"):
+            read_dataset(tmp_path)
+
+    @pytest.mark.parametrize("text", ["", "[]", '{"homes": [3]}'])
+    def test_damaged_list(self, tmp_path: Path, text: str) -> None:
+        (tmp_path / "dataset.json").write_text(text)
+        with pytest.raises(
+            PredictorError, match=r"dataset\.json' is damaged .*: build the data set again in a new folder"
+        ):
+            read_dataset(tmp_path)

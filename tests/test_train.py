@@ -1,0 +1,159 @@
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+from link_tables import make_dataset, make_table
+from predictor_links import QUICK, QUIET
+
+from sionna_partial.errors import OutputError, PredictorError, SettingsError
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.predictor import Predictor
+from sionna_partial.training.baselines import Baselines
+from sionna_partial.training.evaluate import evaluate
+from sionna_partial.training.train import split_homes, train
+
+pytestmark = QUIET
+
+UNTRAINED = PredictorSettings(minimum_links=1_000_000)
+"""Every network says mean and spread of its links: quick, and as deterministic as the links."""
+
+HOMES = [f"home {index}" for index in range(10)]
+
+
+@pytest.fixture(scope="module")
+def table():
+    return make_table(homes=5)
+
+
+@pytest.fixture(scope="module")
+def run(table):
+    return train(table, test_share=0.4, settings=QUICK)
+
+
+class TestSplitHomes:
+    @pytest.mark.parametrize("share", [0.01, 0.3, 0.5, 0.99])
+    @pytest.mark.parametrize("seed", range(5))
+    def test_no_home_is_on_both_sides_and_none_is_lost(self, share, seed):
+        train_homes, test_homes = split_homes(HOMES, share, seed)
+        assert not set(train_homes) & set(test_homes)
+        assert sorted([*train_homes, *test_homes]) == HOMES
+        assert len(test_homes) == min(max(round(share * 10), 1), 9)
+
+    def test_the_order_of_the_names_does_not_matter(self):
+        assert split_homes(HOMES[::-1], 0.3, 1) == split_homes(HOMES, 0.3, 1)
+
+    def test_seeds_differ(self):
+        assert len({split_homes(HOMES, 0.3, seed) for seed in range(10)}) > 5
+
+    def test_none_to_test(self):
+        assert split_homes(HOMES, 0.0, 0) == (tuple(HOMES), ())
+
+    @pytest.mark.parametrize(("homes", "share"), [([], 0.3), (["a"], 0.3), ([], 0.0)])
+    def test_too_few(self, homes, share):
+        message = f"dataset has {len(homes)} homes: give at least 2 to train on some and test on others, or test_share"
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            split_homes(homes, share, 0)
+
+    @pytest.mark.parametrize("share", [-0.1, 1.0, np.nan, "a"])
+    def test_bad_share(self, share):
+        with pytest.raises(SettingsError, match=r"test_share = .* is not allowed: give a number in \[0, 0.99\]"):
+            split_homes(HOMES, share, 0)
+
+
+class TestTrain:
+    def test_training_and_test_homes_are_disjoint(self, run):
+        assert not set(run.train_homes) & set(run.test_homes)
+        assert len(run.test_homes) == 2
+        assert run.predictor.homes == run.baselines.distance.homes == run.train_homes
+        assert run.predictor.metrics["held_out_homes"] == list(run.test_homes)
+
+    def test_links_of_test_homes_are_not_learned(self, table):
+        spoiled = np.isin(table.home, split_homes(sorted(set(table.home)), 0.4, 0)[1])
+        other = dataclasses.replace(table, gain_db=np.where(spoiled, -77.0, table.gain_db))
+        one, again = (train(links, test_share=0.4, settings=UNTRAINED) for links in (table, other))
+        assert again.predictor.fingerprint == one.predictor.fingerprint
+        assert again.baselines.distance.fingerprint == one.baselines.distance.fingerprint
+        assert again.baselines.majority == one.baselines.majority
+        assert again.predictor.metrics != one.predictor.metrics
+
+    def test_links_indoors_make_the_predictor_and_those_anywhere_the_indoor_model(self, table, run):
+        links = table.take(np.isin(table.home, run.train_homes))
+        assert sum(run.predictor.links.values()) == (~links.anywhere).sum()
+        hidden = links.take(links.anywhere & ~links.rx_seen)
+        p_indoor = run.predictor.predict_indoor(hidden.phi)
+        assert p_indoor[hidden.inside].mean() > p_indoor[~hidden.inside].mean() + 0.3
+        assert p_indoor.mean() == pytest.approx(hidden.inside.mean(), abs=0.02)
+
+    def test_the_card_says_what_was_measured_on_test_homes(self, run):
+        (row,) = run.evaluation.select(homes="test", stage=100, answer="majority", ends_seen="all")
+        assert run.predictor.metrics["exploration_steps"]["100"]["majority"] == row.metrics.as_json()
+        anywhere = run.predictor.metrics["exploration_steps_receivers_anywhere"]["0"]
+        assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
+        assert "paper" not in run.predictor.metrics["exploration_steps"]["0"]
+
+    def test_no_test_homes(self, table):
+        alone = train(table, test_share=0.0, settings=UNTRAINED)
+        assert alone.evaluation is None
+        assert alone.test_homes == ()
+        assert alone.predictor.metrics == {}
+
+    def test_without_receivers_anywhere_all_are_indoors(self, table):
+        alone = train(table.take(~table.anywhere), test_share=0.0, settings=UNTRAINED)
+        assert alone.predictor.predict_indoor(table.phi).min() > 0.999
+
+    def test_settings_of_a_data_set_are_its_own(self, table, tmp_path):
+        folder = make_dataset(tmp_path, table, frequency_hz=60e9, diffraction=False)
+        message = (
+            "dataset was traced at 60 GHz without diffraction, settings are for links at 28 GHz with diffraction: give "
+            "PredictorSettings with the frequency and diffraction of the data set."
+        )
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            train(folder, settings=UNTRAINED)
+        settings = dataclasses.replace(UNTRAINED, frequency_hz=60e9, diffraction=False)
+        assert train(folder, test_share=0.0, settings=settings).predictor.settings == settings
+
+    def test_progress(self, table):
+        calls = []
+        train(table, settings=UNTRAINED, progress=lambda *call: calls.append(call))
+        assert calls[0] == (0.0, "training on 1800 links in 3 homes")
+        assert [share for share, _ in calls] == sorted(share for share, _ in calls)
+
+    def test_wrong_settings(self, table):
+        with pytest.raises(SettingsError, match=r"settings = 3 is not allowed: give PredictorSettings\(\.\.\.\)"):
+            train(table, settings=3)
+
+
+class TestSave:
+    def test_same_links_and_seed_give_the_same_bytes(self, table, tmp_path):
+        files, again = (
+            train(table, test_share=0.4, settings=UNTRAINED).save(tmp_path / name) for name in ("one", "two")
+        )
+        assert [file.name for file in files] == [
+            *("distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json")
+        ]
+        for one, two in zip(files, again, strict=True):
+            assert one.read_bytes() == two.read_bytes(), one.name
+
+    def test_what_is_saved_can_be_evaluated(self, table, run, tmp_path):
+        run.save(tmp_path)
+        found = evaluate(tmp_path / "predictor.keras", table)
+        assert found.homes == {"test": tuple(sorted(run.test_homes)), "train": tuple(sorted(run.train_homes))}
+        assert [row.metrics.as_json() for row in found.rows] == [row.metrics.as_json() for row in run.evaluation.rows]
+        assert Predictor.load(tmp_path / "predictor.keras").metrics == run.predictor.metrics
+        assert Baselines.load(tmp_path).majority == run.baselines.majority
+
+    def test_split_is_recorded(self, run, tmp_path):
+        run.save(tmp_path)
+        split = json.loads((tmp_path / "split.json").read_text())
+        assert split == {"test_share": 0.4, "seed": 0, "train": [*run.train_homes], "test": [*run.test_homes]}
+
+    def test_nothing_half_written(self, run, tmp_path, monkeypatch):
+        def fail(self, folder):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(Baselines, "save", fail)
+        with pytest.raises(OutputError, match="the disk is full"):
+            run.save(tmp_path / "run")
+        assert list(tmp_path.iterdir()) == []
