@@ -14,7 +14,14 @@ from hypothesis import strategies as st
 from sionna_partial import constants
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import SettingsError
-from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import (
+    ITU_BANDS_GHZ,
+    DatasetSettings,
+    Material,
+    SceneSettings,
+    SensorSettings,
+    TraceSettings,
+)
 
 ITU_BANDS_OF_SIONNA = """
 from sionna_partial.llvm import load_llvm
@@ -185,3 +192,39 @@ def test_itu_bands_are_those_of_sionna() -> None:
     """In a process of its own, since Sionna starts Dr.Jit."""
     done = subprocess.run([sys.executable, "-c", ITU_BANDS_OF_SIONNA], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+class TestDatasetSettings:
+    def test_defaults_are_the_papers(self) -> None:
+        settings = DatasetSettings()
+        assert (settings.links_per_home, settings.stages) == (400, (0, 50, 100, 150, 200))
+        assert (settings.tx_height_m, settings.rx_height_m) == (1.5, 1.5)
+        assert (settings.scene, settings.trace) == (SceneSettings(), TraceSettings())
+
+    @pytest.mark.parametrize(
+        ("name", "value", "remedy"),
+        [
+            ("links_per_home", 3, "give a number in [4, 1e+06]."),
+            ("links_per_home", 400.0, "give a whole number."),
+            ("transmitters_per_home", 0, "give a number in [1, 1000]."),
+            ("seed", -1, "give a number in [0, "),
+            ("stages", (), "give increasing whole numbers of 0 or more"),
+            ("stages", [0, 50], "give increasing whole numbers of 0 or more"),
+            ("stages", (50, 0), "give increasing whole numbers of 0 or more"),
+            ("stages", (0, 0), "give increasing whole numbers of 0 or more"),
+            ("stages", (0, 2.5), "give increasing whole numbers of 0 or more"),
+            ("stages", (-1, 2), "give increasing whole numbers of 0 or more"),
+            ("tx_height_m", 0.0, "give a number in (0, 1000]."),
+            ("rx_height_m", math.nan, "give a number in (0, 1000]."),
+            ("margin_m", -0.1, "give a number in [0, 1000]."),
+            ("scene", None, "give SceneSettings(...)."),
+            ("trace", SceneSettings(), "give TraceSettings(...)."),
+        ],
+    )
+    def test_refused(self, name: str, value: object, remedy: str) -> None:
+        with pytest.raises(SettingsError, match=re.escape(f"{name} = {value!r} is not allowed: {remedy}")):
+            DatasetSettings(**{name: value})
+
+    def test_material_that_the_frequency_does_not_suit(self) -> None:
+        with pytest.raises(SettingsError, match=r"ITU material 'carpet_tile' is defined for 1-40 GHz"):
+            DatasetSettings(scene=SceneSettings(Material(itu="carpet_tile")), trace=TraceSettings(frequency_hz=60e9))

@@ -133,7 +133,7 @@ def _say_what_was_done(result: Any) -> None:
         typer.echo(f"{name} failed: {error.strip().splitlines()[-1]}", err=True)
     if result.failed:
         typer.echo(
-            f"homes that failed: {len(result.failed)}; the others can be used: {result.folder / 'failed'} has all that is "
-            "known; the same command tries them again.",
+            f"homes that failed: {len(result.failed)}; the others can be used: {result.folder / 'failed'} says why; "
+            "the same command tries them again.",
             err=True,
         )

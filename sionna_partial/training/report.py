@@ -160,7 +160,8 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
 
 def _section(title: str, rows: Sequence[Row]) -> str:
     header = ["steps", "answer", *(label for label, _ in _COLUMNS.values())]
-    return f"### {title}\n\n{_table(header, ([str(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links))}"
+    cells = ([str(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links)
+    return f"### {title}\n\n{_table(header, cells)}"
 
 
 def _cells(metrics: Metrics) -> list[str]:
