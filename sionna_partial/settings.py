@@ -215,6 +215,8 @@ class TraceSettings:
         One diffraction at a vertical edge, with at most two reflections around it. On floor plans it is found by exact
         beams, as line of sight and specular reflections are; on meshes by shooting rays, which is slow. None is True
         on floor plans and False on meshes.
+    diffraction_walls : int
+        Largest number of walls of a floor plan that mirror a path before its diffraction, and after it: 0, 1 or 2.
     open_ends : bool
         Whether a wall of a floor plan diffracts also where it ends because observation did.
     refraction, diffuse_reflection : bool
@@ -234,6 +236,7 @@ class TraceSettings:
     frequency_hz: float = CARRIER_FREQUENCY_HZ
     max_depth: int = 6
     diffraction: bool | None = None
+    diffraction_walls: int = 2
     open_ends: bool = False
     refraction: bool = False
     diffuse_reflection: bool = False
@@ -242,7 +245,12 @@ class TraceSettings:
 
     def __post_init__(self) -> None:
         require_number("frequency_hz", self.frequency_hz, *FREQUENCIES_HZ)
-        for name, low, high in (("max_depth", 0, 10), ("samples_per_tx", 1, 100_000_000), ("seed", 0, 2**31 - 1)):
+        for name, low, high in (
+            ("max_depth", 0, 10),
+            ("diffraction_walls", 0, 2),
+            ("samples_per_tx", 1, 100_000_000),
+            ("seed", 0, 2**31 - 1),
+        ):
             require_whole(name, getattr(self, name), low, high)
         for name in ("diffraction", "open_ends", "refraction", "diffuse_reflection"):
             value = getattr(self, name)

@@ -1,5 +1,6 @@
 """The subcommands of learning: what they pass on, and what they say."""
 
+import json
 import logging
 import warnings
 from pathlib import Path
@@ -10,6 +11,7 @@ from typer.testing import CliRunner, Result
 
 from sionna_partial import cli
 from sionna_partial.commands.shell import rate_and_rest, show_rate
+from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import DatasetSettings, Material
 from sionna_partial.training.dataset import DatasetReport
 
@@ -49,8 +51,8 @@ class TestDataset:
         assert result.exit_code == 0
         (call,) = calls
         options = {"scheduler": None, "workers": None, "home_time_limit_s": 900.0}
-        assert call == (Path("out"), [*range(10_000, 10_100)], DatasetSettings(), options)
-        assert "2 homes built in 1.5 min, 1 were there: out" in result.stdout
+        assert call == (Path("out"), [*range(20_000, 20_100)], DatasetSettings(), options)
+        assert "homes in out: 2 built in 1.5 min, 1 already there" in result.stdout
 
     def test_options(self, calls: list[Any]) -> None:
         settings = (
@@ -84,9 +86,15 @@ class TestDataset:
         assert "homes that failed: 2; the others can be used" in result.stderr
         assert "the same command tries them again" in result.stderr
 
+    def test_default_homes_are_new_to_the_shipped_predictor(self, calls: list[Any]) -> None:
+        run("dataset", "out")
+        known = json.loads((PREDICTORS_FOLDER / "paper.json").read_text(encoding="utf-8"))["homes"]
+        assert known
+        assert not {f"make_home({seed})" for seed in calls[0][1]} & set(known)
+
     def test_maps_and_seeds(self, calls: list[Any]) -> None:
         run("dataset", "out", "--map", "one.yaml", "--homes", 1)
-        assert calls[0][1] == [10_000, Path("one.yaml")]
+        assert calls[0][1] == [20_000, Path("one.yaml")]
 
     def test_bad_setting(self, calls: list[Any]) -> None:
         result = run("dataset", "out", "--links", 2)

@@ -122,4 +122,4 @@ def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
     paths = SolvedPaths.of_vertices(
         zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
     )
-    assert bends_at(scene.wedges, paths).tolist() == [True, False, False, False, True, True]
+    assert bends_at(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]

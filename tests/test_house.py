@@ -34,7 +34,7 @@ MODULES = (
     *("coverage", "plots.figures", "plots.coverage_plot", "plots.exploration_plot", "plots.calibration_plot"),
     *("export", "demo", "info"),
     *("training.home_sources", "training.home_links", "training.shards", "training.home_process", "training.dataset"),
-    *("training.dataset_links", "training.evaluate", "training.train", "training.report"),
+    *("training.dataset_links", "training.evaluate", "plots.evaluation_plot", "training.train", "training.report"),
     *("commands.shell", "commands.prediction", "commands.learning", "cli"),
 )
 """Reading order: a module imports only from those before it."""

@@ -54,8 +54,10 @@ class TestTrain:
         assert result.exit_code == 0, result.output
         names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
         assert sorted(path.name for path in out.iterdir()) == names
-        assert result.stdout.splitlines()[-6:] == [f"wrote {out / name}" for name in names]
-        assert "### Test homes, receivers indoors" in result.stdout
+        *lines, hint = result.stdout.splitlines()
+        assert lines[-6:] == [f"wrote {out / name}" for name in names]
+        assert hint.endswith(f"sionna-partial evaluate {dataset} --predictor {out / 'predictor.keras'} --out REPORT")
+        assert "### Test homes (2), receivers indoors" in result.stdout
         card = Predictor.load(out / "predictor.keras")
         assert (card.settings.steps, card.settings.seed, card.settings.frequency_hz) == (2, 3, 28e9)
         split = json.loads((out / "split.json").read_text())
@@ -104,9 +106,9 @@ class TestEvaluate:
         out = tmp_path / "report"
         result = run("evaluate", dataset, "--predictor", predictor, "--out", out)
         assert result.exit_code == 0, result.output
-        names = ["report.md", "report.json", "calibration.png"]
-        assert result.stdout.splitlines()[-3:] == [f"wrote {out / name}" for name in names]
-        assert "| 100   | with indoor model    |" in result.stdout
+        names = ["report.md", "report.json", "stages.png", "calibration.png"]
+        assert result.stdout.splitlines()[-4:] == [f"wrote {out / name}" for name in names]
+        assert "| with indoor model    |" in result.stdout
         assert json.loads((out / "report.json").read_text())["predictor"] == str(predictor)
         assert f"# Evaluation of predictor `{predictor}`" in (out / "report.md").read_text()
 

@@ -31,25 +31,52 @@ def tables(text):
 
 class TestSummary:
     def test_figures_stand_where_they_belong(self, evaluation):
-        rows = tables(summary(evaluation))["Test homes, receivers indoors"]
+        found = tables(summary(evaluation))
+        for receivers, where in (("indoor", "indoors"), ("anywhere", "anywhere on the map, outside in outage")):
+            rows = found[f"Test homes (2), receivers {where}"]
+            assert rows[0] == ["accuracy, RMSE", "0 steps", "100 steps"]
+            measured = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
+            assert len(rows) - 2 == len({row.answer for row in measured})
+            for row in measured:
+                (cells,) = (cells for cells in rows if cells[0] == row.answer)
+                cell = cells[rows[0].index(f"{row.stage} steps")]
+                assert cell.split() == [f"{row.metrics.accuracy:.3f}", f"{row.metrics.rmse_db:.2f}", "dB"]
+
+    def test_what_is_shown_is_defined_and_notes_are_not_lost(self, evaluation):
+        text = summary(dataclasses.replace(evaluation, notes=("one note", "another")))
+        assert DEFINITIONS["accuracy"] in text
+        assert DEFINITIONS["rmse_db"] in text
+        assert text.endswith("one note\n\nanother")
+
+    def test_it_fits_a_terminal_and_columns_are_aligned(self, evaluation):
+        blocks = re.findall(r"(?:\|.*\|\n?)+", summary(evaluation))
+        assert len(blocks) == 2
+        for block in blocks:
+            (width,) = {len(line) for line in block.splitlines()}
+            assert width < 80
+
+
+class TestMarkdown:
+    def test_figures_stand_where_they_belong(self, evaluation):
+        rows = tables(markdown(evaluation))["Test homes, receivers indoors"]
         (row,) = (cells for cells in rows if cells[:2] == ["100", "predictor"])
         (found,) = evaluation.select(homes="test", stage=100, answer="predictor", ends_seen="all")
         assert rows[0][2:5] == ["links", "accuracy", "RMSE [dB]"]
         assert row[2:5] == ["600", f"{found.metrics.accuracy:.3f}", f"{found.metrics.rmse_db:.2f}"]
 
     def test_what_has_no_finite_value_is_a_dash(self, evaluation):
-        rows = tables(summary(evaluation))["Test homes, receivers indoors"]
+        rows = tables(markdown(evaluation))["Test homes, receivers indoors"]
         (row,) = (cells for cells in rows if cells[:2] == ["0", "partial trace"])
         assert row[6:8] == ["-", "-"]
         assert row[9] == "-"
-        assert "nan" not in summary(evaluation)
+        assert "| nan" not in markdown(evaluation)
 
     def test_columns_are_aligned(self, evaluation):
-        for block in re.findall(r"(?:\|.*\|\n?)+", summary(evaluation)):
+        for block in re.findall(r"(?:\|.*\|\n?)+", markdown(evaluation)):
             assert len({len(line) for line in block.splitlines()}) == 1
 
     def test_differences_have_signs_and_errors(self, evaluation):
-        found = tables(summary(evaluation))
+        found = tables(markdown(evaluation))
         titles = [title for title in found if "standard error" in title]
         assert len(titles) == 2
         for title in titles:
@@ -57,8 +84,6 @@ class TestSummary:
                 assert re.fullmatch(r"[+-]\d\.\d{3} ± \d\.\d{3}", cells[3])
                 assert re.fullmatch(r"[+-]\d+\.\d{2} ± \d+\.\d{2}", cells[4])
 
-
-class TestMarkdown:
     def test_every_definition_and_every_part_is_there(self, evaluation):
         text = markdown(evaluation)
         assert all(definition in text for definition in DEFINITIONS.values())
@@ -97,7 +122,7 @@ class TestSaveReport:
     def test_files_are_equal_every_time(self, evaluation, tmp_path):
         files = save_report(evaluation, tmp_path / "one")
         assert [file.name for file in files] == list(REPORT_FILES)
-        assert files[2].read_bytes().startswith(b"\x89PNG")
+        assert all(file.read_bytes().startswith(b"\x89PNG") for file in files[2:])
         for file, again in zip(files, save_report(evaluation, tmp_path / "two"), strict=True):
             assert file.read_bytes() == again.read_bytes()
 

@@ -24,13 +24,16 @@ DatasetArgument = Annotated[
 DEFAULT_HOMES = 100
 """Number of homes that are made where no map is given."""
 
+FIRST_SEED = 20_000
+"""Seed of the first of them: not one of those that the shipped predictor was trained on (`make predictor`)."""
+
 
 def dataset(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set.", show_default=False)],
     homes: Annotated[
         int | None, typer.Option(min=0, help=f"Homes to make. Default: {DEFAULT_HOMES}, or 0 with --map.")
     ] = None,
-    first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = 10_000,
+    first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = FIRST_SEED,
     maps: Annotated[
         list[Path] | None,
         typer.Option("--map", help="Complete map, or a folder of maps; may be repeated.", show_default=False),
@@ -56,7 +59,10 @@ def dataset(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Time that a home may take [s].")] = 900.0,
 ) -> None:
-    """Build a data set from homes; run it again to go on after a stop, or with more homes."""
+    """Build a data set from homes, or go on with it.
+
+    OUT gets the links of each home. Stop it at any time, and give the same command, or one with more homes, again.
+    """
     settings = DatasetSettings(
         links_per_home=links,
         transmitters_per_home=transmitters,
@@ -89,12 +95,17 @@ def train(
     steps: Annotated[int, typer.Option(help="Gradient steps of each network.")] = 4000,
     seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = 0,
 ) -> None:
-    """Train a predictor on a data set, and measure it on homes kept for testing."""
+    """Train a predictor, and test it on other homes.
+
+    RUN gets predictor.keras, which `predict --predictor` takes, simpler answers fitted to the same links, and the split
+    of the homes.
+    """
     require_writable(out)
     with show_progress() as report:
         report(0.0, "reading links")
         from sionna_partial.training.dataset_links import open_links, settings_for
         from sionna_partial.training.report import summary
+        from sionna_partial.training.train import PREDICTOR_FILE
         from sionna_partial.training.train import train as train_predictor
 
         links, traces = open_links(folder)
@@ -103,14 +114,22 @@ def train(
         files = run.save(out)
     typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")
     print_files(files)
+    if run.evaluation:
+        typer.echo(
+            f"all figures of merit: sionna-partial evaluate {folder} --predictor {out / PREDICTOR_FILE} --out REPORT"
+        )
 
 
 def evaluate(
     folder: DatasetArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the report.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="REPORT", help="Folder for the report.", show_default=False)],
     predictor: Annotated[str, typer.Option(metavar="NAME|FILE", help="'paper', or a .keras file.")] = "paper",
 ) -> None:
-    """Judge a predictor beside simpler answers, on homes that it was not trained on and on others."""
+    """Judge a predictor beside simpler answers.
+
+    REPORT gets all figures of merit with their definitions (report.md, report.json), and pictures. Homes of the data
+    set that the predictor was not trained on are test homes.
+    """
     require_writable(out)
     with show_progress() as report:
         report(0.0, "reading links")
@@ -127,7 +146,7 @@ def _say_what_was_done(result: Any) -> None:
     """Print what was built, and which homes are missing and why."""
     minutes = result.elapsed_s / 60.0
     typer.echo(
-        f"{len(result.built)} homes built in {minutes:.1f} min, {len(result.skipped)} were there: {result.folder}"
+        f"homes in {result.folder}: {len(result.built)} built in {minutes:.1f} min, {len(result.skipped)} already there"
     )
     for name, error in result.failed.items():
         typer.echo(f"{name} failed: {error.strip().splitlines()[-1]}", err=True)

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.beams import Beams, trace_beams_in
+from sionna_partial.tracing.beams import trace_beams_in
 from sionna_partial.tracing.candidates import (
     BEND,
     CEILING,
@@ -24,11 +24,11 @@ from sionna_partial.tracing.candidates import (
     merge_heights,
     unfold,
 )
-from sionna_partial.tracing.plan import Plan, PointBins, bin_points, grow
+from sionna_partial.tracing.plan import Plan, bin_points, grow
 from sionna_partial.tracing.scene import SceneGeometry
 
 MAX_REFLECTIONS = 2
-"""Largest number of reflections around the diffraction."""
+"""Largest number of reflections around the diffraction, those off floor and ceiling included."""
 
 _EXTERIOR_M = 1e-5
 """Distance from the plane of a face [m] at which the path solver counts a point as outside a wedge."""
@@ -98,6 +98,7 @@ def diffraction_candidates(
     rx_m: NDArray[np.float64],
     max_depth: int,
     *,
+    walls_a_side: int = MAX_REFLECTIONS,
     candidates_per_block: int = 100_000,
 ) -> Iterator[tuple[Candidates, float]]:
     """Find every way over one vertical edge with at most two reflections, block by block.
@@ -110,6 +111,8 @@ def diffraction_candidates(
         Transmitter and receivers in the local frame [m], between floor (z = 0) and ceiling.
     max_depth : int
         Largest number of interactions of a path, the diffraction included.
+    walls_a_side : int
+        Largest number of walls that mirror a path before its diffraction, and after it.
     candidates_per_block : int
         Number of candidates in a block, which bounds the memory.
 
@@ -126,11 +129,13 @@ def diffraction_candidates(
     flats = (geometry.floor_face >= 0, geometry.ceiling_face >= 0)
     normals = wedges.normal[: len(wedges.edge_m)].reshape(-1, 4)
     plan, receivers = geometry.plan, bin_points(rx_m[:, :2])
-    arrivals = _arrivals(plan, walls_m, wedges.edge_m, tx_m, reflections)
+    arrivals = _arrivals(plan, walls_m, wedges.edge_m, tx_m, min(walls_a_side, reflections))
     reached = np.flatnonzero(np.diff(arrivals.start))
     for first in range(0, len(reached), _EDGES_AT_ONCE):
         group = reached[first : first + _EDGES_AT_ONCE]
-        beams = _departures(plan, receivers, wedges.edge_m[group], arrivals, group, reflections)
+        fewest = np.minimum.reduceat(arrivals.count, arrivals.start[group])
+        onward = np.minimum(walls_a_side, reflections - fewest)
+        beams = trace_beams_in(plan, receivers, wedges.edge_m[group], onward)
         common = (beams.parent, beams.segment, beams.source, beams.pair_node, beams.pair_rx, walls_m, rx_m)
         ways = (group, wedges.edge_m, arrivals.start, arrivals.count, arrivals.length_m, arrivals.wall, arrivals.place)
         rows = _combine(*common, *ways, normals, tx_m, reflections, *flats)
@@ -157,19 +162,6 @@ def _arrivals(
     )
     start = np.searchsorted(edge[good], np.arange(len(edges_m) + 1))
     return _Arrivals(start, count[good], length_m[good], wall[good], place[good])
-
-
-def _departures(
-    plan: Plan,
-    receivers: PointBins,
-    sources_m: NDArray[np.float64],
-    arrivals: _Arrivals,
-    group: NDArray[np.int64],
-    reflections: int,
-) -> Beams:
-    """Trace beams from edges to receivers, as deep as the shortest arrival leaves reflections."""
-    fewest = np.minimum.reduceat(arrivals.count, arrivals.start[group])
-    return trace_beams_in(plan, receivers, sources_m, reflections - fewest)
 
 
 @njit(cache=True)

@@ -90,7 +90,7 @@ def write_scene_of(
     return WrittenScene(xml, SHAPES, wedges, partial_function(_plan_candidates, geometry, wedges, settings))
 
 
-def bends_at(wedges: Wedges, paths: SolvedPaths) -> NDArray[np.bool_]:
+def bends_at(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> NDArray[np.bool_]:
     """Whether each path (P,) diffracts as exact candidates do, if it does at all.
 
     Sionna RT's rays diffract at the rims of floor and ceiling and at junctions of walls as well, and with any number of
@@ -102,7 +102,12 @@ def bends_at(wedges: Wedges, paths: SolvedPaths) -> NDArray[np.bool_]:
         which = (paths.interactions == DIFFRACTION).argmax(axis=1)
         x, y, z = paths.vertices_m[np.arange(len(bent)), which][bent].T
         beside = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))[0] < SAME_EDGE_M
-        few = (paths.interactions[bent] == REFLECTION).sum(axis=1) <= MAX_REFLECTIONS
+        reflected = paths.interactions[bent] == REFLECTION
+        height_m = paths.vertices_m[bent, :, 2]
+        mirrored = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m - SAME_EDGE_M)
+        before = np.arange(reflected.shape[1]) < which[bent, None]
+        few = reflected.sum(axis=1) <= MAX_REFLECTIONS
+        few &= ((mirrored & before).sum(axis=1) <= walls_a_side) & ((mirrored & ~before).sum(axis=1) <= walls_a_side)
         kept[bent] = few & beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
     return kept
 
@@ -122,7 +127,9 @@ def _plan_candidates(
         yield candidates, part * share, "verifying reflections"
     if not settings.diffraction:
         return
-    for candidates, share in diffraction_candidates(geometry, wedges, tx_m, rx_m, settings.max_depth):
+    sides = settings.diffraction_walls
+    bent = diffraction_candidates(geometry, wedges, tx_m, rx_m, settings.max_depth, walls_a_side=sides)
+    for candidates, share in bent:
         yield candidates, part + (1.0 - part) * share, "verifying diffractions"
 
 

@@ -311,7 +311,7 @@ def _shoot(
 ) -> Iterator[tuple[SolvedPaths, float, str]]:
     """Let Sionna RT's public path solver shoot rays."""
     for paths, share in stock_paths(scene.xml, settings, tx_m, rx_m):
-        kept = paths if scene.wedges is None else paths.take(bends_at(scene.wedges, paths))
+        kept = paths if scene.wedges is None else paths.take(bends_at(scene.wedges, paths, settings.diffraction_walls))
         yield kept, share, f"shooting rays to {len(rx_m)} receivers"
 
 

@@ -1,4 +1,4 @@
-"""Evaluations as text and files: Evaluation -> report.md, report.json, calibration.png."""
+"""Evaluations as text and files: Evaluation -> report.md, report.json, stages.png, calibration.png."""
 
 import json
 import math
@@ -11,7 +11,7 @@ from sionna_partial.files import atomic_files
 from sionna_partial.training.evaluate import Difference, Evaluation, Row
 from sionna_partial.training.metrics import DEFINITIONS, Metrics
 
-REPORT_FILES = ("report.md", "report.json", "calibration.png")
+REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")
 
 _COLUMNS = {
     "links": ("links", "d"),
@@ -23,11 +23,12 @@ _COLUMNS = {
     "calibration_error": ("calibration error", ".3f"),
     "coverage_90": ("in 90 %", ".3f"),
 }
+_WHERE = {"indoor": "receivers indoors", "anywhere": "receivers anywhere on the map, outside in outage"}
 _MISSING = "-"
 
 
 def summary(evaluation: Evaluation) -> str:
-    """Return the main tables: test homes, the indoor model, and paired differences.
+    """Return accuracy and gain error on test homes, a column for each stage: what fits a terminal.
 
     Parameters
     ----------
@@ -38,8 +39,13 @@ def summary(evaluation: Evaluation) -> str:
     str
         Markdown with aligned columns.
     """
-    sections = [_metrics_section(evaluation, "test", ends_seen="all")]
-    return "\n\n".join([*sections, *_anywhere(evaluation, ["test"]), *_differences(evaluation)])
+    tables = []
+    for receivers, title in _WHERE.items():
+        rows = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
+        if rows:
+            tables.append(f"### Test homes ({len(evaluation.homes['test'])}), {title}\n\n{_by_stage(rows)}")
+    shown = "\n".join(f"{_COLUMNS[name][0]}: {DEFINITIONS[name]}" for name in ("accuracy", "rmse_db"))
+    return "\n\n".join([*tables, shown, *evaluation.notes])
 
 
 def markdown(evaluation: Evaluation) -> str:
@@ -102,7 +108,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """Write `report.md`, `report.json` and `calibration.png`, all or none.
+    """Write `report.md`, `report.json`, `stages.png` and `calibration.png`, all or none.
 
     Parameters
     ----------
@@ -120,11 +126,13 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
         If writing fails.
     """
     from sionna_partial.plots.calibration_plot import plot_calibration
+    from sionna_partial.plots.evaluation_plot import plot_stages
     from sionna_partial.plots.figures import figure_png
 
     contents = (
         markdown(evaluation).encode(),
         (json.dumps(as_json(evaluation), indent=2, allow_nan=False) + "\n").encode(),
+        figure_png(plot_stages(evaluation)),
         figure_png(plot_calibration(evaluation.calibrations)),
     )
     with atomic_files(folder) as place:
@@ -136,7 +144,7 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
 def _metrics_section(evaluation: Evaluation, homes: str, ends_seen: str) -> str:
     whose = {"all": "", "both": ", both ends seen", "one": ", one end seen", "none": ", no end seen"}[ends_seen]
     rows = evaluation.select(homes=homes, receivers="indoor", ends_seen=ends_seen)
-    return _section(f"{homes.capitalize()} homes, receivers indoors{whose}", rows)
+    return _section(f"{homes.capitalize()} homes, {_WHERE['indoor']}{whose}", rows)
 
 
 def _anywhere(evaluation: Evaluation, kinds: Iterable[str]) -> Iterable[str]:
@@ -144,7 +152,7 @@ def _anywhere(evaluation: Evaluation, kinds: Iterable[str]) -> Iterable[str]:
     for homes in kinds:
         rows = evaluation.select(homes=homes, receivers="anywhere", ends_seen="all")
         if rows:
-            yield _section(f"{homes.capitalize()} homes, receivers anywhere on the map, outside in outage", rows)
+            yield _section(f"{homes.capitalize()} homes, {_WHERE['anywhere']}", rows)
 
 
 def _differences(evaluation: Evaluation) -> Iterable[str]:
@@ -156,6 +164,14 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
             title = f"Test homes, receivers {where}: {first} minus other, mean and standard error over homes"
             header = ["steps", "other", "homes", "accuracy", "RMSE [dB]"]
             yield f"### {title}\n\n{_table(header, map(_difference_cells, rows))}"
+
+
+def _by_stage(rows: Sequence[Row]) -> str:
+    """Tabulate accuracy and gain error, a line for each answer and a column for each stage."""
+    stages, answers = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "answer"))
+    found = {(row.answer, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
+    header = ["accuracy, RMSE", *(f"{stage} steps" for stage in stages)]
+    return _table(header, ([answer, *(found.get((answer, stage), _MISSING) for stage in stages)] for answer in answers))
 
 
 def _section(title: str, rows: Sequence[Row]) -> str:
