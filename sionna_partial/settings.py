@@ -179,6 +179,9 @@ class SceneSettings:
         What floor and ceiling span: the observed area (nothing comes from unknown cells), the whole map, or nothing.
     ceiling : bool
         Whether there is a ceiling above the floor.
+    outline : {"lines", "cells"}
+        Where walls stand: on few straight lines fitted to the wall cells, or on the staircase through the centres of
+        the wall cells as they are, for which neither `outline_tolerance_cells` nor `bridge_gap_m` counts.
 
     Raises
     ------
@@ -191,6 +194,7 @@ class SceneSettings:
     bridge_gap_m: float = 0.2
     floor_extent: Literal["observed", "map", "none"] = "observed"
     ceiling: bool = True
+    outline: Literal["lines", "cells"] = "lines"
 
     def __post_init__(self) -> None:
         require(isinstance(self.material, Material), "material", self.material, "give a Material.")
@@ -199,6 +203,8 @@ class SceneSettings:
         extents = ("observed", "map", "none")
         require(self.floor_extent in extents, "floor_extent", self.floor_extent, f"choose one of {extents}.")
         require(isinstance(self.ceiling, bool), "ceiling", self.ceiling, "give True or False.")
+        kinds = ("lines", "cells")
+        require(self.outline in kinds, "outline", self.outline, f"choose one of {kinds}.")
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, settings_or_default
 from sionna_partial.tracing.plan import Plan, prepare_plan
 from sionna_partial.walls.cells import row_runs
+from sionna_partial.walls.lattice import lattice_outlines
 from sionna_partial.walls.outlines import Outlines, wall_outlines
 
 SHAPES = ("walls", "floor", "ceiling")
@@ -114,9 +115,7 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     """
     require_map("partial", partial)
     settings = settings_or_default("settings", settings, SceneSettings)
-    outlines = wall_outlines(
-        partial, tolerance_cells=settings.outline_tolerance_cells, bridge_gap_m=settings.bridge_gap_m
-    )
+    outlines = _outlines(partial, settings)
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
@@ -350,6 +349,12 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDA
     floor = np.column_stack([corners, np.zeros(len(corners))])
     meshes = {"walls": (np.concatenate([low, low + up]), walls), "floor": (floor, triangles)}
     return meshes | ({"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {})
+
+
+def _outlines(partial: PartialMap, settings: SceneSettings) -> Outlines:
+    if settings.outline == "cells":
+        return lattice_outlines(partial)
+    return wall_outlines(partial, tolerance_cells=settings.outline_tolerance_cells, bridge_gap_m=settings.bridge_gap_m)
 
 
 def _open_ends(partial: PartialMap, outlines: Outlines) -> NDArray[np.bool_]:

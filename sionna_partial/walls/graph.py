@@ -39,6 +39,23 @@ def wall_graph(partial: PartialMap, wall: NDArray[np.bool_], bridge_gap_m: float
     return _index(np.concatenate([ends, _squares(lone)]), np.zeros((0, 2), dtype=np.int64))
 
 
+def lattice_graph(wall: NDArray[np.bool_]) -> WallGraph:
+    """Connect the centres of boundary wall cells as they are: no gap is bridged, no spur cut off.
+
+    Edges are those of `wall_graph`; cells that touch no other become squares.
+
+    Parameters
+    ----------
+    wall : (ny, nx) bool array
+
+    Returns
+    -------
+    WallGraph
+    """
+    ends = np.concatenate([_lattice_edges(wall), _squares(_lone_cells(wall))])
+    return _index(ends, np.zeros((0, 2), dtype=np.int64))
+
+
 def _lattice_edges(wall: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Edges (E, 2, 2) of the outline, from x, y to x, y in half cells."""
     w = np.pad(wall, 1)

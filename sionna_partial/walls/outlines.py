@@ -75,7 +75,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     while True:
         lines, runs = _polylines(graph, places, chains, fits, plain)
         if not _keep_crossing(lines, runs, plain):
-            return _assemble([line + corner for line in lines], partial.resolution_m)
+            return assemble([line + corner for line in lines], partial.resolution_m)
 
 
 def _crop(partial: PartialMap) -> tuple[PartialMap, NDArray[np.float64]]:
@@ -229,7 +229,8 @@ def _keep_crossing(
     return found
 
 
-def _assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines:
+def assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines:
+    """Join polylines (n, 2) [cells] whose segments meet only at equal vertices."""
     if not lines:
         return Outlines(np.zeros((0, 2)), np.zeros((0, 2), dtype=np.int64))
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
