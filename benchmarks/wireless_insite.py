@@ -2,10 +2,12 @@
 
 Each home is a folder with a ROS map, `tx.csv` (tx, x, y, z) and `links.csv.gz` (tx, x, y, link_state, snr_db), whose
 link states are 0 outage, 1 LOS, 2 and 3 NLOS; the places name pixels, whose centres lie half a cell to the right and
-below. Traced three times: with the package's defaults at the written places, with them at the pixels' centres, and there
-with the settings that come closest to what the reference did. Run it with
+below. Links are traced three times: with the package's defaults at the written places, with the same at the pixels'
+centres, and there with the settings that come closest to what the reference did. Run it with
 
-    python benchmarks/wireless_insite.py --homes ../shared/gibson --orders
+    python benchmarks/wireless_insite.py --homes ../shared/gibson
+
+With `--orders` it prints instead which links Wireless InSite reaches, by the kinds of their simplest paths.
 """
 
 import argparse
@@ -42,9 +44,9 @@ TRIALS = {
 
 @dataclass(frozen=True)
 class Reference:
-    """A home, and for each of its T transmitters, places (3,) [m], the drawn receivers (N, 3) [m] and their states (N,).
+    """A home with its transmitters (3,) and, for each, drawn receivers (N, 3) and their states (N,).
 
-    Places are as written.
+    Places are as written [m].
     """
 
     name: str
@@ -56,7 +58,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Trial:
-    """What a home's trace gave: the links of both, states (L,), and how many transmitters and receivers were left out."""
+    """States (L,) of a home's links in the reference and in ours, our paths, and how many places were left out."""
 
     truth: NDArray[np.uint8]
     found: NDArray[np.uint8]
@@ -78,17 +80,18 @@ def main() -> None:
     parser.add_argument("--receivers", type=int, default=100, help="for each transmitter (default: %(default)s)")
     parser.add_argument("--transmitters", type=int, default=10, help="of each home, at most (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the receivers that are drawn (default: %(default)s)")
-    parser.add_argument("--orders", action="store_true", help="tell which kinds of paths the reference has")
+    parser.add_argument("--orders", action="store_true", help="tell instead which kinds of paths it has")
     arguments = parser.parse_args()
     folders = sorted(path.parent for path in arguments.homes.glob("*/links.csv.gz"))
     if not folders:
         sys.exit(f"--homes {arguments.homes}: no folder there holds links.csv.gz; give the folder of the Gibson homes.")
     homes = [read(folder, arguments.transmitters, arguments.receivers, arguments.seed) for folder in folders]
-    trials = print_agreement(homes)
-    print_left_out(trials)
-    print_states(trials["cells, at centres"])
     if arguments.orders:
         print_orders(homes)
+    else:
+        trials = print_agreement(homes)
+        print_left_out(trials)
+        print_states(trials["cells, at centres"])
 
 
 def read(folder: Path, transmitters: int, receivers: int, seed: int) -> Reference:
@@ -183,9 +186,7 @@ def print_orders(homes: Sequence[Reference]) -> None:
             if found != sp.LinkState.LOS:
                 links[kind] += 1
                 reached[kind] += int(state != sp.LinkState.OUTAGE)
-    print(
-        "\nlinks without line of sight, by their simplest paths (R reflection, D diffraction, from the transmitter on)"
-    )
+    print("links without line of sight, by their simplest paths (R reflection, D diffraction, in order)")
     print(f"{'simplest paths':>24}{'links':>8}{'reached by Wireless InSite':>30}")
     for kind, count in links.most_common():
         print(f"{kind:>24}{count:>8}{reached[kind] / count:>30.3f}")
@@ -200,14 +201,8 @@ def simplest(links: TracedLinks) -> list[str]:
     names = []
     for each in kinds:
         fewest = min((len(word) for word in each), default=0)
-        shortest = sorted(word for word in each if len(word) == fewest)
-        specular = [word for word in shortest if "D" not in word]
-        both = "reflections, and " + ", ".join(word for word in shortest if "D" in word)
-        names.append(
-            (both if len(specular) < len(shortest) else "reflections alone")
-            if specular
-            else ", ".join(shortest) or "none"
-        )
+        shortest = {word if "D" in word else "reflections" for word in each if len(word) == fewest}
+        names.append(", ".join(sorted(shortest)) or "none")
     return names
 
 

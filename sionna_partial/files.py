@@ -1,9 +1,11 @@
-"""Output that is written whole or not at all."""
+"""Output that is written whole or not at all, and by one run at a time."""
 
 import errno
+import fcntl
 import os
 import secrets
 import shutil
+import socket
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -14,6 +16,9 @@ from sionna_partial.errors import OutputError, SionnaPartialError
 
 SCENE_FILES = ("scene.xml", "map.yaml")
 """Files that tell an exported scene folder from any other."""
+
+LOCK_FILE = ".lock"
+"""File in a locked folder that says which process writes there."""
 
 _REMEDIES = {
     errno.EACCES: "choose a folder that you may write to, or change its permissions.",
@@ -27,6 +32,9 @@ _REMEDIES = {
     errno.ENOENT: "nothing can be made there; choose another folder.",
     errno.ENAMETOOLONG: "choose a shorter name.",
 }
+
+
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 def output_path(path: object) -> Path:
@@ -204,6 +212,63 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
     target = output_path(folder)
     with suppress(_TriedError), _workplace(target, target):
         raise _TriedError
+
+
+@contextmanager
+def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
+    """Keep other runs from writing to a folder, which is made if it is not there.
+
+    The system gives the lock back when the process ends, however that is: a lock file that a killed run left locks
+    nothing. On a file system without locks, nothing is locked.
+
+    Parameters
+    ----------
+    folder : path-like
+
+    Raises
+    ------
+    OutputError
+        If another process, or another run in this one, holds the lock, or the folder cannot be written.
+    """
+    target = output_path(folder)
+    require_writable(target)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        descriptor = _lock(target / LOCK_FILE)
+    except OSError as error:
+        if isinstance(error, SionnaPartialError):
+            raise
+        raise _output_error(target, error) from error
+    try:
+        yield
+    finally:
+        (target / LOCK_FILE).unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _lock(file: Path) -> int:
+    """Open and lock a file, and note there who did."""
+    while True:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            holder = os.read(descriptor, 1000).decode(errors="replace") or "another process"
+            os.close(descriptor)
+            raise OutputError(
+                f"folder = '{file.parent}' is being written by {holder}: wait until that has ended, or choose another "
+                "folder."
+            ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                os.close(descriptor)
+                raise
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), os.stat(file)):
+                os.truncate(descriptor, 0)
+                os.write(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode())
+                return descriptor
+        os.close(descriptor)  # its last holder has just removed it
 
 
 class _TriedError(Exception):

@@ -98,8 +98,8 @@ def require_number(name: str, value: object, low: float, high: float, *, open_lo
 
 def require_whole(name: str, value: object, low: int, high: int) -> None:
     """Raise a SettingsError unless `value` is a whole number in [low, high]."""
-    require(isinstance(value, Integral) and not isinstance(value, bool), name, value, "give a whole number.")
-    require_number(name, value, low, high)
+    inside = isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
+    require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
 
 def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:
@@ -339,13 +339,16 @@ class DatasetSettings:
     def __post_init__(self) -> None:
         for name, low, high in (
             ("transmitters_per_home", 1, 1000),
-            ("links_per_home", self.transmitters_per_home, 1_000_000),
+            ("links_per_home", 1, 1_000_000),
             ("seed", 0, 2**31 - 1),
         ):
             require_whole(name, getattr(self, name), low, high)
+        enough = self.links_per_home >= self.transmitters_per_home
+        remedy = f"give at least {self.transmitters_per_home}, one for each of the transmitters_per_home."
+        require(enough, "links_per_home", self.links_per_home, remedy)
         remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200)."
         require(isinstance(self.stages, tuple) and len(self.stages) > 0, "stages", self.stages, remedy)
-        whole = all(isinstance(steps, int) and not isinstance(steps, bool) and steps >= 0 for steps in self.stages)
+        whole = all(isinstance(steps, Integral) and not isinstance(steps, bool) and steps >= 0 for steps in self.stages)
         require(whole and list(self.stages) == sorted(set(self.stages)), "stages", self.stages, remedy)
         for name in ("tx_height_m", "rx_height_m"):
             require_number(name, getattr(self, name), 0.0, 1000.0, open_low=True)

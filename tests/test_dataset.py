@@ -13,10 +13,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from dataset_fakes import HANGS, KILLS, KILLS_ONCE, RAISES, UNWRITABLE, fake_links, processes_make_fakes
 
 from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
+from sionna_partial.files import locked_folder
 from sionna_partial.settings import DatasetSettings, TraceSettings
 from sionna_partial.training import dataset, home_process
 from sionna_partial.training.dataset import DatasetReport, build_dataset
@@ -153,21 +155,29 @@ class TestKilled:
         for place in (folder, folder / "shards"):
             (place / ".tmp-0123456789abcdef").mkdir()
             (place / ".tmp-0123456789abcdef" / "half a file").touch()
+        (folder / ".lock").write_text("process 1 on another host")
         there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
         report = build_dataset(folder, SEEDS, SETTINGS, workers=2)
         assert len(report.skipped) == len(there)
         assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
         assert files(folder) == files(unbroken)
 
-    def test_ctrl_c_ends_at_once_and_leaves_no_process(self, tmp_path: Path, notes: Path) -> None:
+    def test_ctrl_c_ends_at_once_and_leaves_no_process_or_file(
+        self, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        temporary = tmp_path / "temporary"
+        temporary.mkdir()
+        monkeypatch.setenv("TMPDIR", str(temporary))
         command = Path(sys.executable).parent / "sionna-partial"
         with started(command, "dataset", tmp_path / "set", "--homes", 200, "--links", 5, "--workers", 2) as run:
             wait_until(lambda: shards(tmp_path / "set") >= 1)
+            assert list(temporary.glob("sionna_partial_*"))
             run.send_signal(signal.SIGINT)
             _, errors = run.communicate(timeout=10.0)
         assert run.returncode not in (0, None)
         assert "Traceback" not in errors
         assert not any(map(is_running, processes(notes)))
+        assert not list(temporary.glob("sionna_partial_*"))
 
 
 POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)
@@ -191,15 +201,16 @@ class TestPoisonedHomes:
     @pytest.mark.parametrize(
         ("seed", "words"),
         [
-            (KILLS, ("its process died 3 times", "last words", "(SIGKILL)")),
-            (HANGS, ("took longer than 4 s, the time limit of a home", "dataset_fakes.py", "in make_home")),
-            (RAISES, ("ZeroDivisionError: a fault of this home",)),
+            (KILLS, ("its process died 3 times (SIGKILL)\n", "last words")),
+            (HANGS, ("took longer than 4 s, the time limit of a home\n", "dataset_fakes.py", "in make_home")),
+            (RAISES, ("ZeroDivisionError: a fault of this home\nTraceback",)),
         ],
     )
     def test_they_are_listed_with_the_reason(self, poisoned: DatasetReport, seed: int, words: tuple[str, ...]) -> None:
         name = f"make_home({seed})"
         noted = json.loads((poisoned.folder / "failed" / f"{name}.json").read_text())
         assert noted == {"home": {"name": name, "seed": seed}, "error": poisoned.failed[name]}
+        assert noted["error"].startswith(words[0])
         for word in words:
             assert word in noted["error"]
 
@@ -267,6 +278,15 @@ class TestRefused:
         ):
             build_dataset(tmp_path, SEEDS, SETTINGS)
 
+    def test_two_runs_at_once(self, unbroken: Path) -> None:
+        before = files(unbroken)
+        with (
+            locked_folder(unbroken),
+            pytest.raises(OutputError, match=rf"is being written by process {os.getpid()} on .*: wait until"),
+        ):
+            build_dataset(unbroken, SEEDS, SETTINGS)
+        assert files(unbroken) == before
+
     @pytest.mark.parametrize("text", ["{", "[]", '{"homes": 3, "settings": {}, "versions": {}}'])
     def test_damaged_index(self, tmp_path: Path, text: str) -> None:
         (tmp_path / "dataset.json").write_text(text)
@@ -288,6 +308,13 @@ class TestRefused:
         with pytest.raises(MapError, match="homes is empty"):
             build_dataset(tmp_path / "set", [], SETTINGS)
         assert not (tmp_path / "set").exists()
+
+
+def test_numbers_of_numpy_are_noted_as_numbers() -> None:
+    settings = replace(SETTINGS, seed=np.int64(3), margin_m=np.float32(2.5), stages=(np.int64(0), np.int64(50)))
+    plain = replace(SETTINGS, seed=3, margin_m=2.5)
+    notes, expected = (replace(task("a", 1), settings=each).metadata for each in (settings, plain))
+    assert json.dumps(notes) == json.dumps(expected)
 
 
 def task(name: str, seed: int, folder: Path = Path("nowhere"), digest: str = "") -> HomeTask:

@@ -40,7 +40,7 @@ class TestDataset:
         def build(folder: Path, homes: list[int | Path], settings: DatasetSettings, **options: Any) -> DatasetReport:
             options.pop("progress")(1, len(homes), "half way")
             calls.append((folder, homes, settings, options))
-            failed = {str(home): "Traceback\nthe roof fell in" for home in homes if isinstance(home, Path)}
+            failed = {str(home): "the roof fell in\nTraceback" for home in homes if isinstance(home, Path)}
             return DatasetReport(folder, ("a", "b"), ("c",), failed, 90.0)
 
         monkeypatch.setattr("sionna_partial.training.dataset.build_dataset", build)
@@ -99,7 +99,7 @@ class TestDataset:
     def test_bad_setting(self, calls: list[Any]) -> None:
         result = run("dataset", "out", "--links", 2)
         assert result.exit_code == 2
-        assert result.stderr.startswith("error: links_per_home = 2 is not allowed: give a number in [4, ")
+        assert result.stderr.startswith("error: links_per_home = 2 is not allowed: give at least 4, one for each of")
         assert calls == []
 
 

@@ -16,13 +16,32 @@ CORNER = np.array([[(3.0, 2.0), (5.0, 2.0)], [(3.0, 2.0), (3.0, 4.0)]])
 """An L: the sector inside, of 90 degrees, is up and to the right of (3, 2)."""
 
 
-def _join(geometry: SceneGeometry, rx: NDArray[np.float64], tx: NDArray[np.float64] = TX, max_depth: int = 3):
+def _join(
+    geometry: SceneGeometry,
+    rx: NDArray[np.float64],
+    tx: NDArray[np.float64] = TX,
+    max_depth: int = 3,
+    walls_a_side: int = MAX_REFLECTIONS,
+) -> Candidates:
     """Candidates of all blocks, of which there are several."""
     wedges = find_wedges(geometry, open_ends=False)
-    blocks = diffraction_candidates(geometry, wedges, tx, rx, max_depth, candidates_per_block=50)
+    blocks = diffraction_candidates(
+        geometry, wedges, tx, rx, max_depth, walls_a_side=walls_a_side, candidates_per_block=50
+    )
     parts = [part for part, _ in blocks]
     names = ("rx", "face", "vertices_m", "wedge")
     return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), wedges)
+
+
+def _ways(found: Candidates, floor_face: int) -> list[tuple[tuple[float, ...], int, int]]:
+    """All numbers of each candidate, and how many walls mirror it before and after its edge; sorted."""
+    ways = []
+    for rx, face, vertices, wedge in zip(found.rx, found.face, found.vertices_m, found.wedge, strict=True):
+        at, wall = int(np.flatnonzero(face == EDGE)[0]), (face >= 0) & (face < floor_face)
+        used = face != -1
+        row = (float(rx), float(wedge), *face[used].tolist(), *vertices[used].ravel().tolist())
+        ways.append((row, int(wall[:at].sum()), int(wall[at + 1 :].sum())))
+    return sorted(ways)
 
 
 def _star(*degrees: float) -> NDArray[np.float64]:
@@ -171,6 +190,15 @@ class TestDiffractionCandidates:
         found = list(diffraction_candidates(geometry, find_wedges(geometry, open_ends=False), TX, rx, max_depth))
         depth = max((int((block.face != -1).sum(axis=1).max()) for block, _ in found), default=0)
         assert depth == min(max_depth, MAX_REFLECTIONS + 1)
+
+    @pytest.mark.parametrize("walls_a_side", [0, 1, 2])
+    def test_walls_on_each_side_are_limited_and_nothing_else_is(self, walls_a_side: int) -> None:
+        geometry, rx = extrude(ROOM), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4]])
+        limited = _ways(_join(geometry, rx, walls_a_side=walls_a_side), geometry.floor_face)
+        every = _ways(_join(geometry, rx), geometry.floor_face)
+        assert {before for _, before, _ in every} == {after for _, _, after in every} == {0, 1, 2}
+        assert limited == [way for way in every if max(way[1:]) <= walls_a_side]
+        assert max(max(way[1:]) for way in limited) == walls_a_side
 
     @pytest.mark.parametrize(
         ("tx", "wall"),

@@ -1,8 +1,12 @@
 """Output is written whole or not at all."""
 
 import errno
+import fcntl
 import os
 import re
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +17,7 @@ from sionna_partial.files import (
     atomic_folder,
     atomic_path,
     atomic_write,
+    locked_folder,
     require_writable,
     temporary_folder,
 )
@@ -304,3 +309,65 @@ def test_full_temporary_folder_is_named() -> None:
 def test_other_errors_pass_through_a_temporary_folder() -> None:
     with pytest.raises(ConnectionResetError), temporary_folder():
         raise ConnectionResetError(errno.ECONNRESET, "reset")
+
+
+LOCK = """
+import sys
+from sionna_partial.files import locked_folder
+with locked_folder(sys.argv[1]):
+    print("locked", flush=True)
+    sys.stdin.read()
+"""
+
+
+class TestLockedFolder:
+    def test_another_process_is_named_until_it_dies(self, tmp_path: Path) -> None:
+        command = [sys.executable, "-c", LOCK, str(tmp_path)]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+            assert holder.stdout is not None
+            holder.stdout.readline()
+            words = f"is being written by process {holder.pid} on {socket.gethostname()}: wait until that has ended"
+            with pytest.raises(OutputError, match=re.escape(words)), locked_folder(tmp_path):
+                pass
+            holder.kill()
+        assert list(tree(tmp_path)) == [".lock"]
+        with locked_folder(tmp_path):
+            assert tree(tmp_path) == {".lock": f"process {os.getpid()} on {socket.gethostname()}".encode()}
+        assert tree(tmp_path) == {}
+
+    def test_folder_is_made_and_unlocked_after_an_error(self, tmp_path: Path) -> None:
+        for _ in range(2):
+            with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "new" / "deep"):
+                raise ZeroDivisionError
+        assert tree(tmp_path) == {"new": None, "new/deep": None}
+
+    def test_lock_that_its_holder_removes_in_between_is_taken_anew(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        lock, removed = fcntl.flock, list[Path]()
+
+        def remove_once(descriptor: int, operation: int) -> None:
+            if not removed:
+                removed.append(tmp_path / ".lock")
+                removed[0].unlink()
+            lock(descriptor, operation)
+
+        monkeypatch.setattr(fcntl, "flock", remove_once)
+        with locked_folder(tmp_path):
+            assert (tmp_path / ".lock").is_file()
+
+    def test_file_system_without_locks(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refuse(number: int) -> None:
+            monkeypatch.setattr(fcntl, "flock", lambda *_: (_ for _ in ()).throw(OSError(number, os.strerror(number))))
+
+        refuse(errno.ENOLCK)
+        with locked_folder(tmp_path), locked_folder(tmp_path):
+            pass
+        refuse(errno.EACCES)
+        with pytest.raises(OutputError, match=r"could not be written \(Permission denied\): choose a folder"):
+            locked_folder(tmp_path).__enter__()
+
+    def test_file_in_the_way(self, tmp_path: Path) -> None:
+        (tmp_path / "a").touch()
+        with pytest.raises(OutputError, match="a part of the path is a file"):
+            locked_folder(tmp_path / "a").__enter__()

@@ -123,3 +123,37 @@ def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
         zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
     )
     assert bends_at(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("walls_a_side", "expected"),
+    [(0, (True, False, False, False, True, False)), (1, (True, True, True, False, True, True)), (2, (True,) * 6)],
+)
+def test_bends_count_with_so_many_walls_on_each_side(
+    tmp_path: Path, walls_a_side: int, expected: tuple[bool, ...]
+) -> None:
+    """Floor and ceiling are no walls."""
+    scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(), sp.SceneSettings())
+    assert scene.wedges is not None
+    kinds = np.array([[8, 0, 0], [1, 8, 0], [8, 1, 0], [1, 1, 8], [1, 8, 1], [1, 8, 1]], np.uint8)
+    vertices = np.full((6, 3, 3), 1.0)
+    vertices[4, [0, 2], 2] = 0.0, scene.wedges.height_m
+    for path, at in enumerate((kinds == 8).argmax(axis=1)):
+        vertices[path, at, :2] = scene.wedges.edge_m[0]
+    zeros = np.zeros(6)
+    paths = SolvedPaths.of_vertices(
+        zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
+    )
+    assert tuple(bends_at(scene.wedges, paths, walls_a_side).tolist()) == expected
+
+
+def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:
+    """Bends over one edge with no wall, with one before or after, and with up to two."""
+    words = []
+    for walls in (0, 1, 2):
+        settings = sp.TraceSettings(max_depth=3, diffraction_walls=walls)
+        links = sp.trace_links(_plan(), TX, RX, settings=settings, scene_settings=sp.SceneSettings(floor_extent="none"))
+        words.append({"".join("D" if kind == 8 else "R" for kind in row if kind) for row in links.interactions})
+    assert {word for word in words[0] if "D" in word} == {"D"}
+    assert {word for word in words[1] if "D" in word} == {"D", "DR", "RD", "RDR"}
+    assert {word for word in words[2] if "D" in word} == {"D", "DR", "RD", "RDR", "DRR", "RRD"}

@@ -22,6 +22,7 @@ from sionna_partial.settings import (
     SensorSettings,
     TraceSettings,
 )
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS
 
 ITU_BANDS_OF_SIONNA = """
 from sionna_partial.llvm import load_llvm
@@ -51,6 +52,8 @@ def test_defaults_are_the_papers() -> None:
     assert TraceSettings() == TraceSettings(
         frequency_hz=28e9, max_depth=6, diffraction=None, open_ends=False, refraction=False, diffuse_reflection=False
     )
+    assert TraceSettings().diffraction_walls == MAX_REFLECTIONS
+    assert SceneSettings().outline == "lines"
     assert SceneSettings().material == Material()
     assert SceneSettings().ceiling is True
 
@@ -74,9 +77,11 @@ RANGES = {
     (SensorSettings, "missed_wall_share"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28, 1e12), (0, -28e9, 28, 1.1e12)),
     (TraceSettings, "max_depth"): ("[0, 10]", (0, 10), (-1, 11)),
-    (TraceSettings, "samples_per_tx"): ("[1, 1e+08]", (1, 10**8), (0, 10**8 + 1)),
-    (TraceSettings, "seed"): ("[0, 2.14748e+09]", (0, 2**31 - 1), (-1, 2**31)),
+    (TraceSettings, "diffraction_walls"): ("[0, 2]", (0, 2), (-1, 3)),
+    (TraceSettings, "samples_per_tx"): ("[1, 100000000]", (1, 10**8), (0, 10**8 + 1)),
+    (TraceSettings, "seed"): ("[0, 2147483647]", (0, 2**31 - 1), (-1, 2**31)),
 }
+WHOLE = ("max_depth", "diffraction_walls", "samples_per_tx", "seed")
 
 
 @pytest.mark.parametrize(("kind", "name"), RANGES)
@@ -87,7 +92,8 @@ def test_ranges(kind: type, name: str) -> None:
         if (name, value) != ("frequency_hz", 28):
             assert getattr(kind(**{name: value}), name) == value
     for value in refused:
-        expected = f"{name} = {value!r} is not allowed: give a number in {span}."
+        number = "whole number" if name in WHOLE else "number"
+        expected = f"{name} = {value!r} is not allowed: give a {number} in {span}."
         with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
             kind(**{name: value})
 
@@ -99,7 +105,7 @@ def test_no_numbers(kind: type, name: str, value: object) -> None:
         kind(**{name: value})
 
 
-@pytest.mark.parametrize("name", ["max_depth", "samples_per_tx", "seed"])
+@pytest.mark.parametrize("name", WHOLE)
 def test_whole_numbers(name: str) -> None:
     with pytest.raises(SettingsError, match=f"{name} = 3.0 is not allowed: give a whole number"):
         TraceSettings(**{name: 3.0})  # type: ignore[arg-type]
@@ -134,6 +140,11 @@ def test_scene_choices() -> None:
     expected = "floor_extent = 'all' is not allowed: choose one of ('observed', 'map', 'none')."
     with pytest.raises(SettingsError, match=re.escape(expected)):
         SceneSettings(floor_extent="all")  # type: ignore[arg-type]
+    for outline in ("lines", "cells"):
+        assert SceneSettings(outline=outline).outline == outline  # type: ignore[arg-type]
+    expected = "outline = 'walls' is not allowed: choose one of ('lines', 'cells')."
+    with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
+        SceneSettings(outline="walls")  # type: ignore[arg-type]
 
 
 def test_itu_names() -> None:
@@ -204,10 +215,11 @@ class TestDatasetSettings:
     @pytest.mark.parametrize(
         ("name", "value", "remedy"),
         [
-            ("links_per_home", 3, "give a number in [4, 1e+06]."),
-            ("links_per_home", 400.0, "give a whole number."),
-            ("transmitters_per_home", 0, "give a number in [1, 1000]."),
-            ("seed", -1, "give a number in [0, "),
+            ("links_per_home", 0, "give a whole number in [1, 1000000]."),
+            ("links_per_home", 3, "give at least 4, one for each of the transmitters_per_home."),
+            ("links_per_home", 400.0, "give a whole number in [1, 1000000]."),
+            ("transmitters_per_home", 0, "give a whole number in [1, 1000]."),
+            ("seed", -1, "give a whole number in [0, 2147483647]."),
             ("stages", (), "give increasing whole numbers of 0 or more"),
             ("stages", [0, 50], "give increasing whole numbers of 0 or more"),
             ("stages", (50, 0), "give increasing whole numbers of 0 or more"),

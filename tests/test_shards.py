@@ -1,6 +1,7 @@
 """Links through Parquet files: nothing is lost, equal links give equal bytes, and damage is told from emptiness."""
 
 import json
+import re
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -99,6 +100,19 @@ class TestDamaged:
         shard.write_bytes(content)
         with pytest.raises(PredictorError, match=r"villa\.parquet' is damaged"):
             read_shard(shard)
+
+    @pytest.mark.parametrize("start", [b"rx_x_m", b"ARROW:schema"])
+    def test_one_byte_of_the_names_or_notes(self, shard: Path, start: bytes) -> None:
+        content = shard.read_bytes()
+        first, refused = content.rindex(start), list[str]()
+        for offset in range(first, min(first + 1000, len(content)), 3):
+            shard.write_bytes(content[:offset] + bytes([content[offset] ^ 0x80]) + content[offset + 1 :])
+            try:
+                shard_metadata(shard)
+            except PredictorError as error:
+                refused.append(str(error))
+        assert len(refused) > 100
+        assert all(re.search("is damaged|is no shard", message) for message in refused)
 
     def test_foreign(self, tmp_path: Path) -> None:
         pq.write_table(pa.table({"a": [1]}), tmp_path / "foreign.parquet")

@@ -50,9 +50,11 @@ class TestSplitHomes:
     def test_none_to_test(self):
         assert split_homes(HOMES, 0.0, 0) == (tuple(HOMES), ())
 
-    @pytest.mark.parametrize(("homes", "share"), [([], 0.3), (["a"], 0.3), ([], 0.0)])
-    def test_too_few(self, homes, share):
-        message = f"dataset has {len(homes)} homes: give at least 2 to train on some and test on others, or test_share"
+    @pytest.mark.parametrize(
+        ("homes", "share", "count"), [([], 0.3, "0 homes"), (["a"], 0.3, "1 home"), ([], 0.0, "0 homes")]
+    )
+    def test_too_few(self, homes, share, count):
+        message = f"dataset has {count}: give at least 2 to train on some and test on others, or test_share"
         with pytest.raises(PredictorError, match=re.escape(message)):
             split_homes(homes, share, 0)
 

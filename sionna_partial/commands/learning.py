@@ -42,7 +42,7 @@ def dataset(
         int, typer.Option(help="Links of a home with receivers indoors; as many more have them anywhere.")
     ] = DatasetSettings.links_per_home,
     transmitters: Annotated[int, typer.Option(help="Transmitters of a home.")] = DatasetSettings.transmitters_per_home,
-    stages: Annotated[list[int], typer.Option("--stage", help="Robot steps; may be repeated.")] = list(  # noqa: B006
+    stages: Annotated[list[int], typer.Option("--stage", help="Steps, such as --stage 0 --stage 50.")] = list(  # noqa: B006
         DatasetSettings.stages
     ),
     seed: Annotated[int, typer.Option(help="Seed of places and robots.")] = DatasetSettings.seed,
@@ -149,7 +149,7 @@ def _say_what_was_done(result: Any) -> None:
         f"homes in {result.folder}: {len(result.built)} built in {minutes:.1f} min, {len(result.skipped)} already there"
     )
     for name, error in result.failed.items():
-        typer.echo(f"{name} failed: {error.strip().splitlines()[-1]}", err=True)
+        typer.echo(f"{name} failed: {error.splitlines()[0]}", err=True)
     if result.failed:
         typer.echo(
             f"homes that failed: {len(result.failed)}; the others can be used: {result.folder / 'failed'} says why; "

@@ -104,15 +104,18 @@ def export_scene(
 def explore(
     out: Annotated[Path, typer.Option(help="Folder for the maps.", show_default=False)],
     home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
-    steps: Annotated[list[int], typer.Option(help="Robot steps; may be repeated.")] = [50, 100, 150, 200],  # noqa: B006
-    seed: Annotated[int, typer.Option(help="Seed of the home and of the robot.")] = 0,
+    steps: Annotated[list[int], typer.Option(help="Robot steps, such as --steps 9 --steps 99.")] = [50, 100, 150, 200],  # noqa: B006
+    seed: Annotated[int, typer.Option(help="Seed of the robot, and of the home that is made.")] = 0,
     range_noise: Annotated[float, typer.Option(help="Standard deviation of the camera's ranges [m].")] = 0.0,
     drift: Annotated[float, typer.Option(help="Growth of the robot's error of position [m per m of way].")] = 0.0,
     missed_walls: Annotated[float, typer.Option(help="Share of walls that the camera misses, as glass [1].")] = 0.0,
     height_band: HeightBandOption = None,
     up: UpOption = None,
 ) -> None:
-    """Explore a home with a robot, and write its partial maps, a picture and an animation."""
+    """Explore a home with a robot, and write what it maps.
+
+    The folder --out gets the partial maps, the complete one, a picture and an animation.
+    """
     sensor = SensorSettings(range_noise, drift, missed_walls)
     require_writable(out)
     with show_progress() as report:

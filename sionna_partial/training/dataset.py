@@ -14,7 +14,7 @@ from pathlib import Path
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 
 from sionna_partial.errors import BackendError, OutputError, SettingsError
-from sionna_partial.files import atomic_write, output_path, require_writable
+from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
 from sionna_partial.settings import DatasetSettings, require_number, require_whole, settings_or_default
 from sionna_partial.training.home_process import (
     HomeResult,
@@ -112,7 +112,8 @@ def build_dataset(
     MapError
         If there is no home, or a path is not there.
     OutputError
-        If the folder cannot be written or holds something else, a worker cannot see it, or a worker cannot make homes.
+        If the folder cannot be written, holds something else or is being written by another run, a worker cannot see
+        it, or a worker cannot make homes.
     BackendError
         If the scheduler cannot be reached.
     """
@@ -124,13 +125,14 @@ def build_dataset(
         if scheduler is not None:
             raise SettingsError(f"workers = {workers!r} is for this machine, and scheduler is given: leave one out.")
     target, sources = Path(os.path.abspath(output_path(folder))), home_sources(homes)
-    tasks = _prepare(target, sources, settings, home_time_limit_s)
-    run = _Run(target, progress or (lambda done, total, message: None), len(tasks))
-    missing = [task for task in tasks if not run.skips(task)]
-    if missing:
-        at_once = min(workers or len(os.sched_getaffinity(0)), len(missing))
-        with _connected(scheduler, at_once) as client, client.as_current():
-            run.make(client, missing)
+    with locked_folder(target):
+        tasks = _prepare(target, sources, settings, home_time_limit_s)
+        run = _Run(target, progress or (lambda done, total, message: None), len(tasks))
+        missing = [task for task in tasks if not run.skips(task)]
+        if missing:
+            at_once = min(workers or len(os.sched_getaffinity(0)), len(missing))
+            with _connected(scheduler, at_once) as client, client.as_current():
+                run.make(client, missing)
     return DatasetReport(target, tuple(run.built), tuple(run.skipped), run.failed, time.monotonic() - start)
 
 
@@ -200,7 +202,6 @@ def _prepare(
     }
     text = json.dumps(index, indent=2, sort_keys=True) + "\n"
     _require_same(folder, json.loads(text))
-    require_writable(folder)
     for place in (folder, folder / SHARDS_FOLDER, folder / FAILED_FOLDER):
         for left in place.glob(".tmp-*"):
             shutil.rmtree(left, ignore_errors=True)
@@ -236,7 +237,7 @@ def _require_same(folder: Path, index: dict[str, object]) -> None:
 
 def _is_ours(entry: Path) -> bool:
     """Whether an entry of a folder without `dataset.json` is what a killed run may have left."""
-    return entry.name.startswith(".tmp-")
+    return entry.name == LOCK_FILE or entry.name.startswith(".tmp-")
 
 
 def _differences(earlier: dict[str, object], now: dict[str, object]) -> Iterator[tuple[str, str, str]]:

@@ -7,6 +7,7 @@ when it has had nothing to do for a while.
 import contextlib
 import faulthandler
 import hashlib
+import json
 import os
 import signal
 import socket
@@ -82,7 +83,8 @@ class HomeTask:
     @property
     def metadata(self) -> dict[str, object]:
         """What the shard notes beside its links."""
-        settings = asdict(self.settings) | {"stages": list(self.settings.stages)}
+        plain = json.dumps(asdict(self.settings), default=lambda number: number.item())  # a number of NumPy's
+        settings = json.loads(plain)
         return {"home": self.source.record, "settings": settings, "versions": self.versions}
 
     @property
@@ -109,7 +111,7 @@ class HomeResult:
     outcome : {"done", "failed", "unusable"}
         Unusable is a worker on which no home can be made.
     error : str
-        What went wrong.
+        What went wrong: in one line, and more below it.
     """
 
     outcome: Literal["done", "failed", "unusable"]
@@ -128,18 +130,19 @@ def run_home(task: HomeTask) -> HomeResult:
         return HomeResult("unusable", fault)
     if task.is_done:
         return HomeResult("done")
-    words = ""
+    words: list[str] = []
     for _ in range(ATTEMPTS):
         if _stopped.is_set():
             return HomeResult("failed", "stopped")
         result = _process_of_thread().make(task)
         if isinstance(result, HomeResult):
             return result
-        words = "\n".join(result)
-        if any(line.startswith(TIMEOUT_LINE) for line in result):
+        words = result
+        if any(line.startswith(TIMEOUT_LINE) for line in words):
             limit = f"took longer than {task.time_limit_s:g} s, the time limit of a home"
-            return HomeResult("failed", f"{limit}; it was at\n{words}")
-    return HomeResult("failed", f"its process died {ATTEMPTS} times; the last one wrote\n{words}")
+            return HomeResult("failed", "\n".join([limit, "It was at", *words]))
+    died = f"its process died {ATTEMPTS} times {words[-1]}"
+    return HomeResult("failed", "\n".join([died, "The last one wrote", *words]))
 
 
 def allow_homes() -> None:
@@ -178,6 +181,8 @@ class _HomeProcess:
         self._busy = threading.Lock()
         self._link, far_end = Pipe()
         self._notes = tempfile.TemporaryFile()  # noqa: SIM115
+        self._scratch = tempfile.TemporaryDirectory(prefix="sionna_partial_", ignore_cleanup_errors=True)
+        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": self._scratch.name}
         with far_end:
             descriptor = far_end.fileno()
             code = f"from sionna_partial.training.home_process import serve; serve({descriptor})"
@@ -187,7 +192,7 @@ class _HomeProcess:
                 stdout=self._notes,
                 stderr=self._notes,
                 pass_fds=[descriptor],
-                env=os.environ | ONE_THREAD | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+                env=os.environ | ONE_THREAD | own,
             )
         _alive.add(self)
 
@@ -228,6 +233,7 @@ class _HomeProcess:
     def _release(self) -> None:
         self._link.close()
         self._notes.close()
+        self._scratch.cleanup()  # a killed process leaves its temporary files
         if self._process.stdin:
             self._process.stdin.close()
 
@@ -277,8 +283,8 @@ def _made(task: HomeTask) -> HomeResult:
         return HomeResult("unusable", str(error))
     except SionnaPartialError as error:
         return HomeResult("failed", str(error))
-    except Exception:
-        return HomeResult("failed", "".join(traceback.format_exc()))
+    except Exception as error:
+        return HomeResult("failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}")
     return HomeResult("done")
 
 

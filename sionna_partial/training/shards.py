@@ -142,12 +142,13 @@ def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
         raise PredictorError(f"path = '{path}' is not there: give a shard of a data set.")
     try:
         schema = pq.read_schema(path)
-    except (OSError, pa.ArrowException) as error:
+        texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
+        notes = {key.removeprefix(_PREFIX): json.loads(text) for key, text in texts.items() if key.startswith(_PREFIX)}
+        names = schema.names
+    except (OSError, ValueError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
-    texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
-    notes = {key.removeprefix(_PREFIX): json.loads(text) for key, text in texts.items() if key.startswith(_PREFIX)}
     expected = pa.schema([(column.name, column.kind) for column in _COLUMNS])
-    alike = schema.names == expected.names and schema.types == expected.types
+    alike = names == expected.names and schema.types == expected.types
     if notes.get("format") != FORMAT or not alike:
         raise PredictorError(
             f"path = '{path}' is no shard of this version ({FORMAT}): give a folder that `sionna-partial dataset` "

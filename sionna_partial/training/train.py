@@ -108,8 +108,9 @@ def split_homes(homes: list[str], test_share: float, seed: int) -> tuple[tuple[s
     """
     require_number("test_share", test_share, 0.0, 0.99)
     if len(homes) < (2 if test_share else 1):
+        number = "1 home" if len(homes) == 1 else f"{len(homes)} homes"
         raise PredictorError(
-            f"dataset has {len(homes)} homes: give at least 2 to train on some and test on others, or test_share = 0."
+            f"dataset has {number}: give at least 2 to train on some and test on others, or test_share = 0."
         )
     shuffled = np.random.default_rng(seed).permutation(sorted(homes))
     count = min(max(round(test_share * len(homes)), 1), len(homes) - 1) if test_share else 0
