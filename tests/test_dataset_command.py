@@ -120,7 +120,7 @@ class TestRate:
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
         now = iter([100.0, 110.0, 130.0, 190.0])
-        monkeypatch.setattr("sionna_partial.commands.shell.time.monotonic", lambda: next(now))
+        monkeypatch.setattr("sionna_partial.commands.shell.monotonic", lambda: next(now))
         with show_rate("homes") as report:
             report(50, 60, "starting")
             report(52, 60, "too soon for another line")

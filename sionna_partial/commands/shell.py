@@ -2,10 +2,10 @@
 
 import itertools
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
 from typing import Annotated, Any
 
 import typer
@@ -149,7 +149,7 @@ def show_rate(unit: str) -> Iterator[Callable[[int, int, str], None]]:
 
         def report(done: int, total: int, message: str) -> None:
             nonlocal first, said
-            now = time.monotonic()
+            now = monotonic()
             first = first or (done, now)
             pace = rate_and_rest(done - first[0], total - done, now - first[1])
             bar.update(task, completed=done, total=total, pace=pace, description=message)
