@@ -24,16 +24,7 @@ from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
-
-@pytest.fixture(autouse=True)
-def _as_it_was(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Undo what the command line does to its process."""
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "put back in the end")
-    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    logger = logging.getLogger("sionna_partial")
-    handlers = list(logger.handlers)
-    yield
-    logger.handlers[:] = handlers
+pytestmark = pytest.mark.usefixtures("command_line")
 
 
 @pytest.fixture

@@ -1,8 +1,6 @@
 """The subcommands of learning: what they pass on, and what they say."""
 
 import json
-import logging
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +13,7 @@ from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import DatasetSettings, Material
 from sionna_partial.training.dataset import DatasetReport
 
-
-@pytest.fixture(autouse=True)
-def _as_it_was(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Undo what the command line does to its process."""
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "put back in the end")
-    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    logger = logging.getLogger("sionna_partial")
-    handlers = list(logger.handlers)
-    yield
-    logger.handlers[:] = handlers
+pytestmark = pytest.mark.usefixtures("command_line")
 
 
 def run(*args: object) -> Result:

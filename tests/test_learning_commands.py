@@ -1,8 +1,6 @@
 """The commands train and evaluate on a small data set: what they write, what they say, and how they fail."""
 
 import json
-import logging
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +13,7 @@ from sionna_partial import cli
 from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.predictor import Predictor
 
-pytestmark = QUIET
-
-
-@pytest.fixture(autouse=True)
-def _as_it_was(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Undo what the command line does to its process."""
-    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "put back in the end")
-    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-    logger = logging.getLogger("sionna_partial")
-    handlers = list(logger.handlers)
-    yield
-    logger.handlers[:] = handlers
+pytestmark = [QUIET, pytest.mark.usefixtures("command_line")]
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.planar import cross
+
 _LOOK_EDGES = 6
 _THROUGH_COSINE = -0.85
 
@@ -133,3 +135,9 @@ def _rotate(graph: WallGraph, points: list[int]) -> list[int]:
     places = graph.points[points[:-1]]
     start = int(np.argmax(((places - places.mean(axis=0)) ** 2).sum(axis=1)))
     return points[start:-1] + points[: start + 1]
+
+
+def turns(points: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Whether a polyline (n, 2) turns at each of its inner points (n - 2,)."""
+    step = np.diff(points.astype(np.float64), axis=0)
+    return cross(step[1:], step[:-1]) != 0.0

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.walls.chains import Chain, WallGraph, wall_chains
+from sionna_partial.walls.chains import Chain, WallGraph, turns, wall_chains
 from sionna_partial.walls.graph import lattice_graph
 from sionna_partial.walls.outlines import Outlines, assemble
 
@@ -36,9 +36,7 @@ def lattice_outlines(partial: PartialMap) -> Outlines:
 def _corners(graph: WallGraph, junction: NDArray[np.bool_], chain: Chain) -> NDArray[np.int64]:
     """Places (n, 2) [half cells] where a chain begins, turns, meets others and ends."""
     places = graph.points[chain.points]
-    step = np.diff(places, axis=0)
-    turns = step[1:, 0] * step[:-1, 1] != step[1:, 1] * step[:-1, 0]
     kept = junction[chain.points]
-    kept[1:-1] |= turns
+    kept[1:-1] |= turns(places)
     kept[[0, -1]] = True
     return places[kept]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.walls.cells import wall_cells
-from sionna_partial.walls.chains import Chain, WallGraph, wall_chains
+from sionna_partial.walls.chains import Chain, WallGraph, turns, wall_chains
 from sionna_partial.walls.graph import wall_graph
 from sionna_partial.walls.lines import fit_runs
 
@@ -101,9 +101,7 @@ def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArra
 def _fit(places: NDArray[np.float64], shift: NDArray[np.float64], chain: Chain, tolerance: float) -> _Fit:
     """Straight runs of a chain, moved to the middle of walls two cells thick."""
     points = places[chain.points]
-    step = np.diff(points, axis=0)
-    turn = step[1:, 0] * step[:-1, 1] != step[1:, 1] * step[:-1, 0]
-    corners = np.concatenate([[0], np.nonzero(turn)[0] + 1, [len(points) - 1]])
+    corners = np.concatenate([[0], np.nonzero(turns(points))[0] + 1, [len(points) - 1]])
     starts, lines = fit_runs(points[corners], tolerance)
     first = corners[starts]
     mean = np.add.reduceat(shift[chain.points], first) / np.diff(np.append(first, len(points)))[:, None]
