@@ -200,7 +200,7 @@ def rate(predictor: sp.Predictor, links: LinkTable, homes: Homes, kind: str, rep
         some = links.take(np.isin(links.home, list(homes)) & (links.stage == step))
         answer = predictor.predict(some.phi)
         metrics = measure(answer, some.link_state, some.gain_db)
-        seen = some.tx_seen & some.rx_seen
+        seen = some.context.tx_seen & some.context.rx_seen
         of_seen = measure(answer.take(seen), some.link_state[seen], some.gain_db[seen])
         score = Score(
             homes=kind,

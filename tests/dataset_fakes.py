@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import DatasetSettings
 from sionna_partial.training.link_table import LinkTable
 
@@ -72,20 +74,36 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
     settings = settings or DatasetSettings()
     rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
     count = 2 * settings.links_per_home * len(settings.stages)
-    tx_m, rx_m = rng.uniform(0.0, 9.0, (2, count, 3))
-    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    context = _context(rng, len(settings.stages), 2 * settings.links_per_home)
+    distance_m = np.linalg.norm(context.rx_m - context.tx_m, axis=1)
     state = rng.integers(0, 3, count).astype(np.uint8)
     return LinkTable(
         home=np.full(count, name),
         stage=np.repeat(settings.stages, 2 * settings.links_per_home).astype(np.int64),
-        tx_m=tx_m,
-        rx_m=rx_m,
-        phi=LinkFeatures(state[::-1].copy(), distance_m / 2, distance_m, rng.uniform(GAIN_FLOOR_DB, -40.0, count)),
+        phi=LinkFeatures(
+            state[::-1].copy(), distance_m / 2, distance_m, rng.uniform(GAIN_FLOOR_DB, -40.0, count), context
+        ),
         link_state=state,
         gain_db=rng.uniform(GAIN_FLOOR_DB, -40.0, count),
-        **{column: _coins(rng, count) for column in ("inside", "anywhere", "tx_seen", "rx_seen")},
+        **{column: _coins(rng, count) for column in ("inside", "anywhere")},
         observed_fraction=rng.uniform(0.0, 1.0, count),
+        complete_maps={name: _map(rng)},
     )
+
+
+def _context(rng: np.random.Generator, stages: int, links: int) -> LinkContext:
+    """Make up a map for each stage, and where as many links run on each."""
+    count = stages * links
+    tx_m, rx_m = rng.uniform(0.0, 9.0, (2, count, 3))
+    gains_db = rng.uniform(GAIN_FLOOR_DB, -40.0, (count, len(REACHES_M)))
+    maps = tuple(_map(rng) for _ in range(stages))
+    return LinkContext(maps, np.repeat(np.arange(stages), links), tx_m, rx_m, gains_db, rng.uniform(0.0, 9.0, count))
+
+
+def _map(rng: np.random.Generator) -> PartialMap:
+    shape, origin_m = rng.integers(3, 9, 2), tuple(rng.uniform(-1.0, 1.0, 2))
+    interior_cells = int(rng.integers(50)) if rng.random() < 0.5 else None
+    return PartialMap(rng.integers(0, 3, shape), rng.uniform(0.5, 1.0), origin_m, rng.uniform(2.0, 4.0), interior_cells)
 
 
 def _coins(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:

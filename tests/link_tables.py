@@ -1,40 +1,38 @@
-"""Tables of links from the known model of `predictor_links`, in homes without plans."""
+"""Tables of links from the known model of `predictor_links`, in homes of one corridor."""
 
+import dataclasses
 import json
 
 import numpy as np
-from predictor_links import make_links, quick_predictor
+from predictor_links import corridors, make_context, make_links, quick_predictor
 
 from sionna_partial.training.baselines import Baselines, Majority
-from sionna_partial.training.link_table import LinkTable
+from sionna_partial.training.link_table import COLUMNS, LinkTable
 from sionna_partial.training.shards import INDEX_FILE, shard_path, write_shard
 
 
 def make_table(homes=4, links=300, stages=(0, 100), seed=0):
     """Return links of homes "home 0", "home 1", ...: at each stage `links` indoors and as many anywhere.
 
-    Receivers are outside where more than 5 m are unobserved, and in outage there; those with less than 2 m are seen.
+    Receivers are outside where more than 5 m are unobserved, and in outage there; those with less than 2 m are seen,
+    and transmitters within 10 m.
     """
     parts = []
     for index, (home, stage) in enumerate((home, stage) for home in range(homes) for stage in stages):
         phi, state, gain_db = make_links(2 * links, seed=seed + index)
         anywhere = np.arange(2 * links) >= links
         inside = ~anywhere | (phi.unobserved_distance_m < 5.0)
-        rx_m = np.column_stack([phi.distance_m, np.zeros(2 * links), np.full(2 * links, 1.5)])
         parts.append(
             LinkTable(
                 home=np.full(2 * links, f"home {home}"),
                 stage=np.full(2 * links, stage),
-                tx_m=np.tile([0.0, 0.0, 1.5], (2 * links, 1)),
-                rx_m=rx_m,
-                phi=phi,
+                phi=dataclasses.replace(phi, context=make_context(phi)),
                 link_state=np.where(inside, state, 0).astype(np.uint8),
                 gain_db=np.where(inside, gain_db, -150.0),
                 inside=inside,
                 anywhere=anywhere,
-                tx_seen=phi.distance_m < 10.0,
-                rx_seen=phi.unobserved_distance_m < 2.0,
                 observed_fraction=np.full(2 * links, 0.5),
+                complete_maps={f"home {home}": corridors()[-1]},
             )
         )
     return LinkTable.concatenate(parts)
@@ -50,6 +48,27 @@ def make_dataset(folder, table, frequency_hz=28e9, diffraction=None):
     index = {"homes": [{"name": name} for name in names], "settings": {"trace": trace}}
     (folder / INDEX_FILE).write_text(json.dumps(index))
     return folder
+
+
+def assert_same(first, second):
+    """Check that two tables hold the same links on the same maps."""
+    for one, other, names in (
+        (first, second, COLUMNS),
+        (first.phi, second.phi, ("link_state", "unobserved_distance_m", "distance_m", "gain_db")),
+        (
+            first.context,
+            second.context,
+            ("tx_m", "rx_m", "indirect_gain_db", "strongest_unobserved_m", "tx_seen", "rx_seen"),
+        ),
+    ):
+        for name in names:
+            left, right = getattr(one, name), getattr(other, name)
+            np.testing.assert_array_equal(left, right, err_msg=name)
+            assert left.dtype == right.dtype, name
+    for home in set(first.home):
+        assert first.complete_maps[home] == second.complete_maps[home]
+    pairs = set(zip(first.context.map_index, second.context.map_index, strict=True))
+    assert all(first.context.maps[one] == second.context.maps[other] for one, other in pairs)
 
 
 def fitted_baselines():

@@ -2,15 +2,18 @@
 
 import dataclasses
 import functools
+import itertools
 
 import numpy as np
 import pytest
 
-from sionna_partial.constants import LinkState
+from sionna_partial.constants import CellState, LinkState
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import free_space_gain_db
 from sionna_partial.learning.predictor import Predictor
+from sionna_partial.maps.partial_map import PartialMap
 
 QUIET = pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning:keras")
 """Keras converts TensorFlow arrays in a way that NumPy deprecates."""
@@ -34,6 +37,34 @@ def make_links(count, seed=0):
     mean_db, std_db = true_gain(phi, state)
     gain_db = np.where(state == OUTAGE, -150.0, mean_db + std_db * rng.normal(size=count))
     return phi, state, gain_db
+
+
+@functools.cache
+def corridors():
+    """Return maps of a corridor along x: nothing seen, the end of the receivers, that of the transmitter at 0, both."""
+    maps = []
+    for tx_seen, rx_seen in itertools.product((False, True), repeat=2):
+        state = np.full((2, 32), CellState.UNKNOWN)
+        state[0, :1], state[0, 1:] = (CellState.FREE if seen else CellState.UNKNOWN for seen in (tx_seen, rx_seen))
+        maps.append(PartialMap(state, 0.5, (-0.25, -0.25)))
+    return tuple(maps)
+
+
+def make_context(phi):
+    """Return where links along the corridor run; the transmitter is seen from 10 m, the receiver if 2 m are not."""
+    count = len(phi)
+    tx_m = np.tile([0.0, 0.0, 1.5], (count, 1))
+    linked, crossed_m = phi.link_state != OUTAGE, phi.unobserved_distance_m
+    kept = np.stack([np.exp(-crossed_m / reach) if reach else crossed_m < 1e-3 for reach in REACHES_M], axis=1)
+    power = 10.0 ** ((phi.gain_db - 6.0 * (phi.link_state == LOS)) / 10.0) * linked
+    return LinkContext(
+        maps=corridors(),
+        map_index=2 * (phi.distance_m < 10.0) + (crossed_m < 2.0),
+        tx_m=tx_m,
+        rx_m=tx_m + np.column_stack([phi.distance_m, np.zeros((count, 2))]),
+        indirect_gain_db=10.0 * np.log10(np.maximum(power[:, None] * kept, 1e-15)),
+        strongest_unobserved_m=np.where(linked, crossed_m, phi.distance_m),
+    )
 
 
 def p_kept(phi):

@@ -33,7 +33,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def evaluation(table):
-    unsure = table.take(table.anywhere & ~table.rx_seen)
+    unsure = table.take(table.anywhere & ~table.context.rx_seen)
     predictor = trained_on("home 1", "elsewhere").fit_indoor(unsure.phi, unsure.inside)
     return evaluate(predictor, table, baselines=fitted_baselines())
 
@@ -58,7 +58,7 @@ class TestEvaluate:
 
     def test_figures_are_those_of_the_links(self, table, evaluation):
         chosen = np.isin(table.home, ["home 0", "home 2", "home 3"]) & ~table.anywhere & (table.stage == 100)
-        links = table.take(chosen & table.tx_seen & table.rx_seen)
+        links = table.take(chosen & table.context.tx_seen & table.context.rx_seen)
         (row,) = evaluation.select(homes="test", receivers="indoor", stage=100, ends_seen="both", answer="predictor")
         expected = measure(quick_predictor().predict(links.phi), links.link_state, links.gain_db).as_json()
         assert row.metrics.as_json() == pytest.approx(expected)

@@ -3,13 +3,12 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.learning.features import LinkFeatures, link_features, unobserved_distance_m
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.learning.unobserved import unobserved_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import TracedLinks
@@ -37,6 +36,13 @@ def phi_of(count=3):
     return LinkFeatures(np.full(count, LinkState.LOS), 0.5 * ones, ones * np.arange(1, count + 1), -60.0 * ones)
 
 
+def context_of(count=3):
+    tx_m = np.zeros((count, 3))
+    rx_m = tx_m + np.arange(1, count + 1)[:, None] * (1.0, 0.0, 0.0)
+    gains_db = np.full((count, len(REACHES_M)), -90.0)
+    return LinkContext((HALF,), np.zeros(count, dtype=np.int64), tx_m, rx_m, gains_db, np.zeros(count))
+
+
 def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
     count = len(rx)
     return TracedLinks(
@@ -57,68 +63,11 @@ def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
     )
 
 
-@pytest.mark.parametrize(
-    ("tx", "rx", "expected_m"),
-    [
-        ((1.5, 2.5, 1.5), (4.5, 2.5, 1.5), 0.0),
-        ((1.5, 2.5, 1.5), (7.5, 2.5, 1.5), 2.5),
-        ((6.5, 2.5, 1.5), (7.5, 2.5, 1.5), 1.0),
-        ((1.5, 2.5, 1.5), (9.5, 2.5, 1.5), 4.0),
-        ((3.5, 1.5, 1.5), (6.5, 3.5, 1.5), np.hypot(3, 2) / 2),
-        ((3.0, 2.5, 0.5), (7.0, 2.5, 2.5), np.sqrt(20) / 2),
-        ((6.5, 2.5, 0.5), (6.5, 2.5, 2.0), 1.5),
-        ((2.5, 2.5, 0.5), (2.5, 2.5, 2.0), 0.0),
-        ((6.5, 2.5, 1.5), (6.5, 2.5, 1.5), 0.0),
-        ((0.0, 2.5, 1.5), (12.0, 2.5, 1.5), 6.0),
-        ((-5.0, -1.0, 1.5), (12.0, -1.0, 1.5), 17.0),
-        ((-5.0, 2.5, 1.5), (-3.0, 2.5, 1.5), 2.0),
-    ],
-    ids=str,
-)
-def test_length_by_hand(tx, rx, expected_m):
-    assert unobserved_distance_m(HALF, tx, [rx]) == pytest.approx([expected_m], abs=1e-12)
-
-
-def test_diagonal_through_corners_by_hand():
-    chess = drawn("""
-        ?.
-        .?
-    """)
-    diagonal = [(2.0, 2.0, 1.0)], [(2.0, 0.0, 1.0)]
-    assert unobserved_distance_m(chess, (0.0, 0.0, 1.0), diagonal[0]) == pytest.approx([0.0], abs=1e-9)
-    assert unobserved_distance_m(chess, (0.0, 2.0, 1.0), diagonal[1]) == pytest.approx([np.sqrt(8)], abs=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("below", "above", "expected_m"),
-    [(".", "?", 0.0), ("?", ".", 0.0), ("#", "?", 1.0), ("?", "#", 1.0), ("#", "#", 0.0), ("?", "?", 1.0)],
-)
-@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (0.1, 0.7)])
-def test_segment_along_a_border_is_in_the_freest_cell(below, above, expected_m, origin_m):
-    partial = drawn(f"?{above}?\n?{below}?", 0.1, origin_m)
-    x, y = np.add(origin_m, (0.1, 0.1))
-    found = unobserved_distance_m(partial, (x, y, 1.0), [(x + 0.1, y, 1.0)])
-    assert found == pytest.approx([0.1 * expected_m], abs=1e-6)
-
-
-def test_zero_everywhere_on_a_complete_map():
-    room = drawn("""
-        ?????
-        ?###?
-        ?#.#?
-        ?###?
-        ?????
-    """)
-    assert room.is_complete
-    rx = np.array([(0.5, 0.5, 1.0), (2.5, 2.4, 1.0), (9.0, 9.0, 1.0)])
-    assert unobserved_distance_m(room, (2.5, 2.5, 1.0), rx).tolist() == [0.0, 0.0, 0.0]
-
-
-def test_everything_on_an_unknown_map():
-    nothing = PartialMap(np.full((4, 6), CellState.UNKNOWN), 0.5)
-    rx = np.random.default_rng(0).uniform(0.1, 1.9, (50, 3))
-    distance_m = np.linalg.norm(rx - (0.3, 0.2, 1.0), axis=1)
-    np.testing.assert_allclose(unobserved_distance_m(nothing, (0.3, 0.2, 1.0), rx), distance_m, rtol=1e-12)
+def test_unobserved_distance_is_that_of_the_direct_lines():
+    rx = np.array([(4.5, 2.5, 1.5), (7.5, 2.5, 1.5), (12.0, 2.5, 1.5), (6.5, 3.5, 2.5)])
+    found_m = unobserved_distance_m(HALF, (1.5, 2.5, 1.5), rx)
+    assert found_m == pytest.approx([0.0, 2.5, 6.0, np.sqrt(27) * 0.3], abs=1e-12)
+    np.testing.assert_array_equal(found_m, unobserved_lengths_m(HALF, np.array([1.5, 2.5, 1.5]), rx))
 
 
 def test_no_receivers():
@@ -139,66 +88,6 @@ def test_bad_positions(tx, rx, message):
         unobserved_distance_m(HALF, tx, rx)
 
 
-grids = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 2))
-places = st.tuples(st.floats(-0.3, 1.3), st.floats(-0.3, 1.3), st.floats(0.0, 3.0))
-
-
-def scaled(partial, place):
-    """Return the world point of a place in fractions of the map."""
-    x0, y0, x1, y1 = partial.bounds_m
-    return np.array([x0 + place[0] * (x1 - x0), y0 + place[1] * (y1 - y0), place[2]])
-
-
-@given(grids, places, places)
-def test_between_zero_and_distance(state, start, end):
-    partial = PartialMap(state, 0.3)
-    tx, rx = scaled(partial, start), scaled(partial, end)
-    length_m = unobserved_distance_m(partial, tx, rx[None])[0]
-    assert 0.0 <= length_m <= np.linalg.norm(rx - tx)
-
-
-@given(grids, places, places, st.data())
-def test_revealing_cells_never_raises_it(state, start, end, data):
-    seen = data.draw(hnp.arrays(np.uint8, state.shape, elements=st.sampled_from([0, 1, 2, 2])))
-    revealed = np.where(state == CellState.UNKNOWN, seen, state)
-    before, after = PartialMap(state, 0.3), PartialMap(revealed, 0.3)
-    assume(not before.is_complete)
-    tx, rx = scaled(before, start), scaled(before, end)[None]
-    assert unobserved_distance_m(after, tx, rx)[0] <= unobserved_distance_m(before, tx, rx)[0] + 1e-9
-
-
-@given(grids, places, places)
-def test_same_both_ways(state, start, end):
-    partial = PartialMap(state, 0.3)
-    tx, rx = scaled(partial, start), scaled(partial, end)
-    there = unobserved_distance_m(partial, tx, rx[None])
-    assert unobserved_distance_m(partial, rx, tx[None]) == pytest.approx(there, abs=1e-5)
-
-
-@given(grids, places, places)
-def test_moving_the_map_changes_nothing(state, start, end):
-    here, there = PartialMap(state, 0.25), PartialMap(state, 0.25, origin_m=(500_000.0, 4_500_000.0))
-    tx, rx = scaled(here, start), scaled(here, end)
-    shift = (500_000.0, 4_500_000.0, 0.0)
-    moved = unobserved_distance_m(there, tx + shift, (rx + shift)[None])
-    assert moved == pytest.approx(unobserved_distance_m(here, tx, rx[None]), abs=1e-5)
-
-
-@settings(max_examples=30)
-@given(grids, places, places)
-def test_agrees_with_dense_samples(state, start, end):
-    partial = PartialMap(state, 0.3)
-    assume(not partial.is_complete)
-    tx, rx = scaled(partial, start), scaled(partial, end)
-    count = 4000
-    samples = tx + (np.arange(count)[:, None] + 0.5) / count * (rx - tx)
-    share = (partial.state_at(samples) == CellState.UNKNOWN).mean()
-    distance_m = np.linalg.norm(rx - tx)
-    crossings = sum(state.shape) + 2
-    tolerance_m = crossings * distance_m / count + 1e-9
-    assert unobserved_distance_m(partial, tx, rx[None])[0] == pytest.approx(share * distance_m, abs=tolerance_m)
-
-
 def test_link_features():
     rx = np.array([(4.5, 2.5, 1.5), (7.5, 2.5, 1.5)])
     phi = link_features(HALF, traced((1.5, 2.5, 1.5), rx, -72.0))
@@ -207,6 +96,9 @@ def test_link_features():
     assert phi.distance_m.tolist() == [3.0, 6.0]
     assert phi.unobserved_distance_m == pytest.approx([0.0, 2.5])
     assert phi.gain_db.tolist() == [-72.0, -72.0]
+    assert phi.context.maps == (HALF,)
+    assert phi.context.rx_m.tolist() == rx.tolist()
+    assert phi.context.rx_seen.tolist() == [True, False]
 
 
 def test_link_features_of_no_links():
@@ -220,6 +112,20 @@ def test_take_and_concatenate():
     joined = LinkFeatures.concatenate([phi.take(slice(0, 1)), phi.take(slice(1, 3))])
     for field in dataclasses.fields(phi):
         assert np.array_equal(getattr(joined, field.name), getattr(phi, field.name))
+
+
+def test_take_and_concatenate_with_context():
+    phi = dataclasses.replace(phi_of(3), context=context_of(3))
+    some = phi.take(np.array([2, 0]))
+    assert some.context.rx_m[:, 0].tolist() == some.distance_m.tolist() == [3.0, 1.0]
+    joined = LinkFeatures.concatenate([some, phi])
+    assert joined.context.rx_m[:, 0].tolist() == joined.distance_m.tolist() == [3.0, 1.0, 1.0, 2.0, 3.0]
+    assert LinkFeatures.concatenate([some, phi_of(3)]).context is None
+
+
+def test_context_of_other_links():
+    with pytest.raises(PredictorError, match="context has 2 links: give one of the same 3 links"):
+        dataclasses.replace(phi_of(3), context=context_of(2))
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,15 @@
 """Links of one home: places, truth, features, and what does not depend on what."""
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from link_tables import assert_same, make_table
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.errors import MapError, PositionError
+from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.learning.features import link_features
 from sionna_partial.maps.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
@@ -16,7 +17,7 @@ from sionna_partial.settings import DatasetSettings, TraceSettings
 from sionna_partial.tracing.trace import trace_links
 from sionna_partial.training import home_links as module
 from sionna_partial.training.home_links import NEAREST_M, home_links, map_area
-from sionna_partial.training.link_table import COLUMNS, LinkTable
+from sionna_partial.training.link_table import LinkTable
 
 SETTINGS = DatasetSettings(
     links_per_home=31, transmitters_per_home=3, stages=(0, 3, 40), trace=TraceSettings(max_depth=2)
@@ -43,12 +44,6 @@ def table(home: PartialMap) -> LinkTable:
     return home_links(home, "two rooms", SETTINGS)
 
 
-def same(first: LinkTable, second: LinkTable) -> bool:
-    pairs = [(getattr(first, name), getattr(second, name)) for name in COLUMNS]
-    pairs += [(getattr(first.phi, field.name), getattr(second.phi, field.name)) for field in fields(first.phi)]
-    return all(np.array_equal(one, other) for one, other in pairs)
-
-
 class TestPlaces:
     def test_counts(self, table: LinkTable) -> None:
         assert len(table) == 2 * 31 * 3
@@ -56,25 +51,27 @@ class TestPlaces:
         for stage in SETTINGS.stages:
             here = table.take(table.stage == stage)
             assert (here.anywhere.sum(), (~here.anywhere).sum()) == (31, 31)
-            _, counts = np.unique(here.tx_m, axis=0, return_counts=True)
+            _, counts = np.unique(here.context.tx_m, axis=0, return_counts=True)
             assert sorted(counts) == [20, 20, 22]
 
     def test_every_stage_has_the_same_links_and_truth(self, table: LinkTable) -> None:
         first, *others = (table.take(table.stage == stage) for stage in SETTINGS.stages)
         for other in others:
-            for name in ("tx_m", "rx_m", "link_state", "gain_db", "inside", "anywhere"):
+            for name in ("link_state", "gain_db", "inside", "anywhere"):
                 np.testing.assert_array_equal(getattr(other, name), getattr(first, name))
+            np.testing.assert_array_equal(other.context.tx_m, first.context.tx_m)
+            np.testing.assert_array_equal(other.context.rx_m, first.context.rx_m)
 
     def test_where_they_are(self, home: PartialMap, table: LinkTable) -> None:
-        state = home.state_at(table.rx_m)
-        assert (home.state_at(table.tx_m) == CellState.FREE).all()
+        state = home.state_at(table.context.rx_m)
+        assert (home.state_at(table.context.tx_m) == CellState.FREE).all()
         assert (state[~table.anywhere] == CellState.FREE).all()
         assert not (state == CellState.WALL).any()
         np.testing.assert_array_equal(table.inside, state == CellState.FREE)
         x0, y0, x1, y1 = map_area(home, SETTINGS.margin_m).bounds_m
-        assert (table.rx_m[:, :2] >= (x0, y0)).all()
-        assert (table.rx_m[:, :2] <= (x1, y1)).all()
-        assert {*table.tx_m[:, 2], *table.rx_m[:, 2]} == {1.5}
+        assert (table.context.rx_m[:, :2] >= (x0, y0)).all()
+        assert (table.context.rx_m[:, :2] <= (x1, y1)).all()
+        assert {*table.context.tx_m[:, 2], *table.context.rx_m[:, 2]} == {1.5}
         assert 0.1 < table.inside[table.anywhere].mean() < 0.6
 
     def test_none_is_at_its_transmitter(self) -> None:
@@ -97,9 +94,9 @@ class TestPlaces:
 class TestTruthAndFeatures:
     def test_truth_is_the_trace_on_the_complete_home(self, home: PartialMap, table: LinkTable) -> None:
         here = table.take((table.stage == 40) & table.inside)
-        for tx in np.unique(here.tx_m, axis=0):
-            mine = here.take((here.tx_m == tx).all(axis=1))
-            links = trace_links(home, tx, mine.rx_m, settings=SETTINGS.trace)
+        for tx in np.unique(here.context.tx_m, axis=0):
+            mine = here.take((here.context.tx_m == tx).all(axis=1))
+            links = trace_links(home, tx, mine.context.rx_m, settings=SETTINGS.trace)
             np.testing.assert_array_equal(mine.link_state, links.link_state)
             np.testing.assert_allclose(mine.gain_db, links.gain_db, atol=1e-3)
 
@@ -111,8 +108,8 @@ class TestTruthAndFeatures:
 
     def test_nothing_is_seen_at_stage_0(self, table: LinkTable) -> None:
         here = table.take(table.stage == 0)
-        assert not here.tx_seen.any()
-        assert not here.rx_seen.any()
+        assert not here.context.tx_seen.any()
+        assert not here.context.rx_seen.any()
         assert not here.observed_fraction.any()
         assert (here.phi.link_state == LinkState.LOS).all()
         np.testing.assert_allclose(here.phi.unobserved_distance_m, here.phi.distance_m)
@@ -125,18 +122,34 @@ class TestTruthAndFeatures:
             return maps
 
         monkeypatch.setattr(module, "explore", noted)
-        assert same(home_links(home, "two rooms", SETTINGS), table)
+        assert_same(home_links(home, "two rooms", SETTINGS), table)
+        assert table.context.maps == tuple(maps)
+        np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.context.map_index], table.stage)
         partial = maps[1]
         here = table.take(table.stage == 3)
         assert here.observed_fraction == pytest.approx(partial.observed_fraction)
-        np.testing.assert_array_equal(here.tx_seen, partial.state_at(here.tx_m) != CellState.UNKNOWN)
-        np.testing.assert_array_equal(here.rx_seen, partial.state_at(here.rx_m) != CellState.UNKNOWN)
-        tx = here.tx_m[0]
-        mine = here.take((here.tx_m == tx).all(axis=1))
-        phi = link_features(partial, trace_links(partial, tx, mine.rx_m, settings=SETTINGS.trace))
+        np.testing.assert_array_equal(here.context.tx_seen, partial.state_at(here.context.tx_m) != CellState.UNKNOWN)
+        np.testing.assert_array_equal(here.context.rx_seen, partial.state_at(here.context.rx_m) != CellState.UNKNOWN)
+        tx = here.context.tx_m[0]
+        mine = here.take((here.context.tx_m == tx).all(axis=1))
+        phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, settings=SETTINGS.trace))
         np.testing.assert_array_equal(mine.phi.link_state, phi.link_state)
         np.testing.assert_array_equal(mine.phi.unobserved_distance_m, phi.unobserved_distance_m)
         np.testing.assert_array_equal(mine.phi.gain_db, phi.gain_db)
+        assert phi.context is not None
+        np.testing.assert_array_equal(mine.context.indirect_gain_db, phi.context.indirect_gain_db)
+        np.testing.assert_array_equal(mine.context.strongest_unobserved_m, phi.context.strongest_unobserved_m)
+
+    def test_complete_map_comes_along(self, home: PartialMap, table: LinkTable) -> None:
+        assert table.complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
+        assert table.take(slice(3)).complete_maps == table.complete_maps
+
+    def test_complete_home_of_each_map(self, table: LinkTable) -> None:
+        other = replace(table, home=np.full(len(table), "b"), complete_maps={"b": two_rooms()})
+        both = LinkTable.concatenate([other.take(other.stage == 0), table.take(table.stage == 40)])
+        area, (first, between, last) = table.complete_maps["two rooms"], table.context.maps
+        assert both.context.maps == (first, between, last)
+        assert both.complete_of_maps == [two_rooms(), between, area]
 
     def test_a_map_that_stays_is_traced_once(self, home: PartialMap, monkeypatch: Any) -> None:
         traced: list[PartialMap] = []
@@ -161,16 +174,16 @@ class TestSeeds:
         self, home: PartialMap, table: LinkTable, change: Callable[[DatasetSettings], tuple[DatasetSettings, str]]
     ) -> None:
         settings, name = change(replace(SETTINGS, stages=(0,)))
-        assert not np.isin(home_links(home, name, settings).rx_m[:, 0], table.rx_m[:, 0]).any()
+        assert not np.isin(home_links(home, name, settings).context.rx_m[:, 0], table.context.rx_m[:, 0]).any()
 
     def test_size_of_the_grid_is_of_no_account(self, table: LinkTable) -> None:
         moved = two_rooms((200, 300), (120, 44))
         shift = (np.array([44, 120]) - [3, 2]) * 0.1
         moved = replace(moved, origin_m=tuple(np.array(moved.origin_m) - shift))
         other = home_links(moved, "two rooms", SETTINGS)
-        np.testing.assert_allclose(other.rx_m, table.rx_m, atol=1e-9)
+        np.testing.assert_allclose(other.context.rx_m, table.context.rx_m, atol=1e-9)
         np.testing.assert_array_equal(other.link_state, table.link_state)
-        np.testing.assert_array_equal(other.rx_seen, table.rx_seen)
+        np.testing.assert_array_equal(other.context.rx_seen, table.context.rx_seen)
 
 
 class TestMapArea:
@@ -195,6 +208,15 @@ class TestRefused:
             MapError, match=r"home 'ruin' is not complete, a free cell touches an unknown one: give maps of"
         ):
             home_links(replace(home, state=state), "ruin", SETTINGS)
+
+    def test_table_without_context(self) -> None:
+        table = make_table(homes=1, links=3)
+        with pytest.raises(PredictorError, match=r"phi has no context: give the LinkFeatures of link_features\."):
+            replace(table, phi=replace(table.phi, context=None))
+
+    def test_no_tables(self) -> None:
+        with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
+            LinkTable.concatenate([])
 
     def test_no_map(self) -> None:
         with pytest.raises(MapError, match="home is of type str: give a PartialMap"):

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError
+from sionna_partial.maps import homes
 from sionna_partial.maps.explore import explore
 from sionna_partial.maps.homes import DOOR_M, STYLES, make_home
 from sionna_partial.maps.map_files import load_map
@@ -31,22 +32,67 @@ def free_area_m2(home: PartialMap) -> float:
 
 @settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 10**9), kind=st.sampled_from([None, *STYLES]))
-def test_every_home_is_complete_connected_and_tight(seed, kind):
+def test_every_home_is_complete_and_tight(seed, kind):
     home = make_home(seed, kind, resolution_m=0.1)
     free = home.state == CellState.FREE
     assert home.is_complete
     assert home.interior_cells == free.sum()
     assert home.observed_fraction == 1.0
-    assert ndimage.label(free)[1] == 1
     around = ndimage.binary_dilation(free) & ~free
     assert (home.state[around] == CellState.WALL).all()
     assert not (home.state[[0, -1]] == CellState.FREE).any()
     assert not (home.state[:, [0, -1]] == CellState.FREE).any()
 
 
+def parts_of(home: PartialMap) -> list[np.ndarray]:
+    """Connected parts of the free cells, the largest first: a robot starts there."""
+    labels, count = ndimage.label(home.state == CellState.FREE)
+    return sorted((labels == number for number in range(1, count + 1)), key=np.sum, reverse=True)
+
+
+@cache
+def homes_with_shut_rooms() -> dict[int, PartialMap]:
+    """Homes of 120 seeds with free cells that no robot reaches."""
+    drawn = {seed: make_home(seed, resolution_m=0.1) for seed in range(120)}
+    return {seed: home for seed, home in drawn.items() if len(parts_of(home)) > 1}
+
+
+def test_some_homes_have_rooms_that_nobody_reaches():
+    found = homes_with_shut_rooms()
+    assert 0.05 < len(found) / 120 < 0.45
+    for home in found.values():
+        first, *others = parts_of(home)
+        for other in others:
+            around = ndimage.binary_dilation(other) & ~other
+            assert (home.state[around] == CellState.WALL).all()
+            assert not (ndimage.binary_dilation(other) & first).any()
+        robot = explore(home, steps=[30])[0].state == CellState.FREE
+        assert robot.any()
+        assert not (robot & ~first).any()
+
+
+def test_what_nobody_reaches_is_the_lesser_part():
+    """Real homes have at most a few rooms of that kind, not a hall beside them."""
+    shares = []
+    for home in homes_with_shut_rooms().values():
+        first, *others = parts_of(home)
+        shares.append(sum(other.sum() for other in others) / sum(part.sum() for part in (first, *others)))
+    assert 0.03 < np.mean(shares) < 0.25, shares
+    assert max(shares) < 0.4, shares
+
+
+def test_they_are_beside_the_home_that_there_is_without_them(monkeypatch):
+    """It is drawn in the same way, and only stands elsewhere on the grid."""
+    found = homes_with_shut_rooms()
+    monkeypatch.setattr(homes, "SHUT_SHARE", 0.0)
+    for seed, home in found.items():
+        (alone,) = parts_of(make_home(seed, resolution_m=0.1))
+        assert parts_of(home)[0].sum() == pytest.approx(alone.sum(), rel=0.05), seed
+
+
 def roamed_share(home: PartialMap, radius_m: float) -> float:
-    """Share of the free area that a disc covers, wherever it gets in one piece."""
-    free = home.state == CellState.FREE
+    """Share of the largest part of the free area that a disc covers, wherever it gets in one piece."""
+    free = parts_of(home)[0]
     reach_m = ndimage.distance_transform_edt(free) * home.resolution_m
     labels, _ = ndimage.label(reach_m >= radius_m)
     body = labels == np.argmax(np.bincount(labels[labels > 0]))
@@ -111,9 +157,9 @@ def test_some_walls_meet_at_corners_of_cells_only_and_some_are_thick():
 
 
 def test_equal_seeds_give_equal_homes_and_others_differ():
-    homes = [make_home(seed) for seed in range(6)]
-    assert homes == [make_home(seed) for seed in range(6)]
-    assert len({home.state.tobytes() for home in homes}) == 6
+    drawn = [make_home(seed) for seed in range(6)]
+    assert drawn == [make_home(seed) for seed in range(6)]
+    assert len({home.state.tobytes() for home in drawn}) == 6
 
 
 def test_kinds_differ_in_size_and_none_draws_one():

@@ -1,8 +1,10 @@
 """Links through Parquet files: nothing is lost, equal links give equal bytes, and damage is told from emptiness."""
 
+import base64
 import json
 import re
-from dataclasses import fields, replace
+import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from dataset_fakes import fake_links
+from link_tables import assert_same
 
 from sionna_partial.errors import OutputError, PredictorError
 from sionna_partial.settings import DatasetSettings
@@ -23,7 +26,12 @@ from sionna_partial.training.shards import (
     write_shard,
 )
 
+PLAIN = {"shape": [2, 3], "resolution_m": 0.5, "origin_m": [0, 0], "wall_height_m": 3.0, "interior_cells": None}
 NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}
+
+
+def packed(cells: bytes) -> str:
+    return base64.b64encode(zlib.compress(cells)).decode()
 
 
 @pytest.fixture
@@ -37,15 +45,6 @@ def shard(links: LinkTable, tmp_path: Path) -> Path:
     return tmp_path / "villa.parquet"
 
 
-def assert_same(first: LinkTable, second: LinkTable) -> None:
-    for name in COLUMNS:
-        one, other = getattr(first, name), getattr(second, name)
-        np.testing.assert_array_equal(one, other)
-        assert one.dtype == other.dtype, name
-    for field in fields(first.phi):
-        np.testing.assert_array_equal(getattr(first.phi, field.name), getattr(second.phi, field.name))
-
-
 class TestShard:
     def test_round_trip(self, links: LinkTable, shard: Path) -> None:
         assert_same(read_shard(shard), links)
@@ -54,17 +53,26 @@ class TestShard:
         names = set(pq.read_schema(shard).names)
         positions = {f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"}
         phi = {"partial_link_state", "partial_gain_db", "unobserved_distance_m", "distance_m"}
-        assert names == {*COLUMNS} - {"tx_m", "rx_m"} | positions | phi
+        reaches = {f"indirect_gain_reach_{reach}_m_db" for reach in ("inf", "4", "1", "0.25", "0")}
+        assert names == {*COLUMNS} | positions | phi | reaches | {"strongest_unobserved_m", "map_index"}
 
     def test_columns_hold_what_they_say(self, links: LinkTable, shard: Path) -> None:
         columns = pq.read_table(shard)
-        np.testing.assert_array_equal(columns["rx_y_m"], links.rx_m[:, 1])
+        np.testing.assert_array_equal(columns["rx_y_m"], links.context.rx_m[:, 1])
+        np.testing.assert_array_equal(columns["indirect_gain_reach_4_m_db"], links.context.indirect_gain_db[:, 1])
         np.testing.assert_array_equal(columns["partial_gain_db"], links.phi.gain_db)
         np.testing.assert_array_equal(columns["gain_db"], links.gain_db)
         np.testing.assert_array_equal(columns["partial_link_state"], links.phi.link_state)
 
+    def test_maps_come_back(self, links: LinkTable, shard: Path) -> None:
+        found = read_shard(shard)
+        assert found.context.maps == links.context.maps
+        assert found.complete_maps == links.complete_maps
+        assert {each.interior_cells is None for each in found.context.maps} == {True, False}
+
     def test_notes(self, shard: Path) -> None:
-        assert shard_metadata(shard) == {"format": FORMAT, **NOTES}
+        notes = shard_metadata(shard)
+        assert {name: notes[name] for name in notes if name != "maps"} == {"format": FORMAT, **NOTES}
 
     def test_equal_links_give_equal_bytes(self, links: LinkTable, shard: Path, tmp_path: Path) -> None:
         write_shard(links, tmp_path / "again.parquet", dict(reversed(NOTES.items())))
@@ -96,7 +104,8 @@ class TestDamaged:
 
     def test_one_byte_of_a_column(self, shard: Path) -> None:
         content = bytearray(shard.read_bytes())
-        content[len(content) // 4] ^= 0xFF
+        column = pq.read_metadata(shard).row_group(0).column(5)
+        content[column.dictionary_page_offset + column.total_compressed_size - 1] ^= 0xFF
         shard.write_bytes(content)
         with pytest.raises(PredictorError, match=r"villa\.parquet' is damaged"):
             read_shard(shard)
@@ -137,6 +146,31 @@ class TestDamaged:
         field = table.schema.field("distance_m")
         pq.write_table(table.set_column(column, field, pa.array(-np.ones(len(table)))), shard)
         with pytest.raises(PredictorError, match=r"is damaged, or no Parquet file \(distance_m\[0\] = -1"):
+            read_shard(shard)
+
+    @pytest.mark.parametrize(
+        ("change", "words"),
+        [
+            ({"partial": None}, "NoneType"),
+            ({"partial": []}, r"map_index\[0\] = 0 is not allowed"),
+            ({"complete": {"villa": {}}}, "cells"),
+            ({"complete": {"villa": {"cells": "AAAA"}}}, "Error -3"),
+            ({"complete": {"villa": {"cells": packed(b"\0" * 5), **PLAIN}}}, "reshape"),
+            ({"complete": {"villa": {"cells": packed(b"\7" * 6), **PLAIN}}}, "state has values 7 to 7"),
+        ],
+    )
+    def test_maps_that_are_none(self, shard: Path, change: dict[str, object], words: str) -> None:
+        maps = json.dumps(shard_metadata(shard)["maps"] | change)  # type: ignore[operator]
+        table = pq.read_table(shard)
+        pq.write_table(table.replace_schema_metadata({**table.schema.metadata, b"sionna_partial.maps": maps}), shard)
+        with pytest.raises(PredictorError, match=rf"is damaged, or no Parquet file \(.*{words}"):
+            read_shard(shard)
+
+    def test_no_maps(self, shard: Path) -> None:
+        table = pq.read_table(shard)
+        metadata = {name: text for name, text in table.schema.metadata.items() if name != b"sionna_partial.maps"}
+        pq.write_table(table.replace_schema_metadata(metadata), shard)
+        with pytest.raises(PredictorError, match=r"is damaged, or no Parquet file \('maps'\)"):
             read_shard(shard)
 
 

@@ -83,7 +83,7 @@ class TestTrain:
     def test_links_indoors_make_the_predictor_and_those_anywhere_the_indoor_model(self, table, run):
         links = table.take(np.isin(table.home, run.train_homes))
         assert sum(run.predictor.links.values()) == (~links.anywhere).sum()
-        hidden = links.take(links.anywhere & ~links.rx_seen)
+        hidden = links.take(links.anywhere & ~links.context.rx_seen)
         p_indoor = run.predictor.predict_indoor(hidden.phi)
         assert p_indoor[hidden.inside].mean() > p_indoor[~hidden.inside].mean() + 0.3
         assert p_indoor.mean() == pytest.approx(hidden.inside.mean(), abs=0.02)

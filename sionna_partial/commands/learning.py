@@ -1,5 +1,6 @@
 """Subcommands of learning: dataset, train, evaluate."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +21,15 @@ from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSetting
 DatasetArgument = Annotated[
     Path, typer.Argument(metavar="DATASET", help="Folder that `dataset` wrote.", show_default=False)
 ]
+
+
+class Networks(StrEnum):
+    """The choices of `PredictorSettings.networks`."""
+
+    MAP = "map"
+    PATHS = "paths"
+    PAPER = "paper"
+
 
 DEFAULT_HOMES = 100
 """Number of homes that are made where no map is given."""
@@ -92,7 +102,10 @@ def train(
     folder: DatasetArgument,
     out: Annotated[Path, typer.Option(metavar="RUN", help="Folder for predictor and baselines.", show_default=False)],
     test_share: Annotated[float, typer.Option(help="Share of the homes that is kept for testing.")] = 0.3,
-    steps: Annotated[int, typer.Option(help="Gradient steps of each network.")] = 4000,
+    networks: Annotated[
+        Networks, typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around.")
+    ] = Networks.MAP,
+    passes: Annotated[int, typer.Option(help="How many times the networks beside the paper's see the links.")] = 20,
     seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = 0,
 ) -> None:
     """Train a predictor, and test it on other homes.
@@ -109,7 +122,7 @@ def train(
         from sionna_partial.training.train import train as train_predictor
 
         links, traces = open_links(folder)
-        settings = settings_for(traces, steps=steps, seed=seed)
+        settings = settings_for(traces, networks=networks.value, passes=passes, seed=seed)
         run = train_predictor(links, test_share=test_share, settings=settings, progress=report)
         files = run.save(out)
     typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")

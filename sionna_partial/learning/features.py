@@ -4,23 +4,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PositionError, PredictorError
+from sionna_partial.learning.link_context import LinkContext, link_context
+from sionna_partial.learning.unobserved import unobserved_lengths_m
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.tracing.trace import TracedLinks
-
-_FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
-
-_BORDER_CELLS = 1e-6
-"""Distance within which a segment runs along the border of cells [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkFeatures:
-    """Features of N links (paper, eq. 8).
+    """Features of N links: those of the paper (eq. 8), and where the links run.
 
     Parameters
     ----------
@@ -32,6 +28,8 @@ class LinkFeatures:
         Distance from transmitter to receiver [m].
     gain_db : (N,) float64 array
         Omnidirectional path gain traced on the partial map [dB], at least -150.
+    context : LinkContext, optional
+        What the map shows along and around the links; `link_features` gives it. The paper's predictor does not use it.
 
     Raises
     ------
@@ -43,6 +41,7 @@ class LinkFeatures:
     unobserved_distance_m: NDArray[np.float64]
     distance_m: NDArray[np.float64]
     gain_db: NDArray[np.float64]
+    context: LinkContext | None = None
 
     def __post_init__(self) -> None:
         count = np.size(self.distance_m)
@@ -54,6 +53,8 @@ class LinkFeatures:
         _require(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
         remedy = f"clip gains at {GAIN_FLOOR_DB:g} dB, the gain of an outage."
         _require(self.gain_db >= GAIN_FLOOR_DB, "gain_db", self.gain_db, remedy)
+        if self.context is not None and len(self.context) != count:
+            raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
 
     def __len__(self) -> int:
         """Return the number of links N."""
@@ -61,14 +62,22 @@ class LinkFeatures:
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
         """Return the links that an index array, a mask (N,) or a slice selects."""
-        return LinkFeatures(*(getattr(self, field.name)[index] for field in fields(self)))
+        context = None if self.context is None else self.context.take(index)
+        return LinkFeatures(**{name: getattr(self, name)[index] for name in _PAPER}, context=context)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkFeatures"]) -> "LinkFeatures":
         """Return the links of all `parts`, one part after the other."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
+        contexts = [part.context for part in parts if part.context is not None]
+        context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
+        return cls(
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PAPER}, context=context
+        )
+
+
+_PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name != "context")
 
 
 def link_numbers(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
@@ -136,6 +145,7 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
         unobserved_distance_m=np.concatenate([unobserved_distance_m(partial, tx, links.rx) for tx in transmitters]),
         distance_m=_distance_m(transmitters[:, None], links.rx).ravel(),
         gain_db=links.gain_db.ravel(),
+        context=link_context(partial, links),
     )
 
 
@@ -170,11 +180,7 @@ def unobserved_distance_m(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> 
             raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, {shape}.")
         if not np.isfinite(points).all():
             raise PositionError(f"{name} holds a position that is not finite: give finite numbers in metres.")
-    if partial.is_complete:
-        return np.zeros(len(rx_m))
-    cells = ((points[..., :2] - partial.origin_m) / partial.resolution_m for points in (tx_m, rx_m))
-    start, ends = (np.round(places, 6) for places in cells)
-    return _unknown_shares(partial.state, start, ends) * _distance_m(tx_m, rx_m)
+    return unobserved_lengths_m(partial, tx_m, rx_m)
 
 
 def _distance_m(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -185,80 +191,3 @@ def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], re
     if not good.all():
         index = int(np.argmin(good))
         raise PredictorError(f"{name}[{index}] = {values[index]:g} is not allowed: {remedy}")
-
-
-@njit(cache=True)
-def _unknown_shares(
-    state: NDArray[np.uint8], start: NDArray[np.float64], ends: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the shares (N,), in [0, 1], of the segments from `start` (2,) to `ends` (N, 2) [cells] that are unknown.
-
-    The grid is walked from line to line (Amanatides and Woo 1987). The distance to each line is computed afresh and the
-    cell is looked up in the middle between two lines, so that rounding neither adds up nor picks a wrong cell.
-    """
-    ny, nx = state.shape
-    shares = np.empty(len(ends))
-    for i in range(len(ends)):
-        step_x, step_y = ends[i, 0] - start[0], ends[i, 1] - start[1]
-        enter_x, leave_x = _inside(start[0], step_x, nx)
-        enter_y, leave_y = _inside(start[1], step_y, ny)
-        here, leave = max(enter_x, enter_y), min(leave_x, leave_y)
-        shares[i] = 1.0 - max(0.0, leave - here)
-        line_x = _first_line(start[0] + here * step_x, step_x)
-        line_y = _first_line(start[1] + here * step_y, step_y)
-        reach_x, reach_y = _reach(start[0], step_x, line_x), _reach(start[1], step_y, line_y)
-        while here < leave:
-            there = min(max(here, min(reach_x, reach_y)), leave)
-            middle = 0.5 * (here + there)
-            if _is_unknown(state, start[0] + middle * step_x, start[1] + middle * step_y):
-                shares[i] += there - here
-            if reach_x <= there:
-                line_x += np.sign(step_x)
-                reach_x = _reach(start[0], step_x, line_x)
-            if reach_y <= there:
-                line_y += np.sign(step_y)
-                reach_y = _reach(start[1], step_y, line_y)
-            here = there
-        shares[i] = min(max(shares[i], 0.0), 1.0)
-    return shares
-
-
-@njit(cache=True)
-def _inside(start: float, step: float, size: int) -> tuple[float, float]:
-    """Return the shares of a segment at which it enters and leaves [0, size] along one axis; enter > leave if never."""
-    if step == 0.0:
-        return (0.0, 1.0) if 0.0 <= start <= size else (1.0, 0.0)
-    low, high = -start / step, (size - start) / step
-    return max(0.0, min(low, high)), min(1.0, max(low, high))
-
-
-@njit(cache=True)
-def _first_line(place: float, step: float) -> float:
-    """Return the first grid line that is met from `place` in the direction of `step`."""
-    return np.floor(place) + 1.0 if step > 0.0 else np.ceil(place) - 1.0
-
-
-@njit(cache=True)
-def _reach(start: float, step: float, line: float) -> float:
-    """Return the share of a segment at which it meets a grid line."""
-    return (line - start) / step if step != 0.0 else np.inf
-
-
-@njit(cache=True)
-def _is_unknown(state: NDArray[np.uint8], x: float, y: float) -> bool:
-    """Whether the freest cell within 1e-6 cells of a point [cells] is unknown."""
-    ny, nx = state.shape
-    row, column = int(np.floor(y)), int(np.floor(x))
-    deep_x = _BORDER_CELLS < x - column < 1.0 - _BORDER_CELLS
-    deep_y = _BORDER_CELLS < y - row < 1.0 - _BORDER_CELLS
-    if deep_x and deep_y and 0 <= row < ny and 0 <= column < nx:
-        return state[row, column] == _UNKNOWN
-    found = False
-    for row in range(int(np.floor(y - _BORDER_CELLS)), int(np.floor(y + _BORDER_CELLS)) + 1):
-        for column in range(int(np.floor(x - _BORDER_CELLS)), int(np.floor(x + _BORDER_CELLS)) + 1):
-            outside = row < 0 or row >= ny or column < 0 or column >= nx
-            cell = _UNKNOWN if outside else state[row, column]
-            if cell == _FREE:
-                return False
-            found |= cell == _UNKNOWN
-    return found

@@ -140,9 +140,9 @@ def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike
     count = np.size(bias)
     places, scaled = _scaled_inputs(inputs, ranges)
     activation = "softmax" if count > 1 else "sigmoid"
-    layer = _layer(keras, "Dense", "probability", count, activation=activation, kernel_initializer="zeros")
-    network = keras.Model(places, layer(scaled), name=name)
-    layer.bias.assign(np.asarray(bias, dtype=np.float32))
+    dense = layer(keras, "Dense", "probability", count, activation=activation, kernel_initializer="zeros")
+    network = keras.Model(places, dense(scaled), name=name)
+    dense.bias.assign(np.asarray(bias, dtype=np.float32))
     return network
 
 
@@ -173,29 +173,38 @@ def gain_network(
     for number in (1, 2):
         start = keras.initializers.GlorotUniform(seed=seed + number)
         units, name = row.hidden_units, f"hidden_{number}"
-        hidden = _layer(keras, "Dense", name, units, activation="relu", kernel_initializer=start)(hidden)
-    shape = _layer(keras, "Dense", "mean_shape", 1, kernel_initializer="zeros")(hidden)
-    offset = _layer(keras, "Rescaling", "offset_db", std_db, offset_db)(shape)
-    mean = _layer(keras, "Add", "mean_db")([_anchor(keras, row, places, frequency_hz), offset])
+        hidden = layer(keras, "Dense", name, units, activation="relu", kernel_initializer=start)(hidden)
+    shape = layer(keras, "Dense", "mean_shape", 1, kernel_initializer="zeros")(hidden)
+    offset = layer(keras, "Rescaling", "offset_db", std_db, offset_db)(shape)
+    mean = layer(keras, "Add", "mean_db")([_anchor(keras, row, places, frequency_hz), offset])
     low, high = (2.0 * math.log(std) for std in STD_RANGE_DB)
     share = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
-    spread = _layer(keras, "Dense", "spread_shape", 1, activation="sigmoid", kernel_initializer="zeros")
-    log_variance = _layer(keras, "Rescaling", "log_variance", high - low, low)(spread(hidden))
+    spread = layer(keras, "Dense", "spread_shape", 1, activation="sigmoid", kernel_initializer="zeros")
+    log_variance = layer(keras, "Rescaling", "log_variance", high - low, low)(spread(hidden))
     spread.bias.assign([math.log(share / (1.0 - share))])
-    return keras.Model(places, _layer(keras, "Concatenate", "gain")([mean, log_variance]), name=row.name)
+    return keras.Model(places, layer(keras, "Concatenate", "gain")([mean, log_variance]), name=row.name)
 
 
 def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
-    """Put networks, by the names of `OUTPUT_WIDTHS`, side by side in one model."""
+    """Put networks side by side in one model: those of `OUTPUT_WIDTHS`, and any others, which share no inputs."""
     keras = import_keras()
     inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in FEATURES}
     outputs = {name: networks[name]({key: inputs[key] for key in networks[name].input}) for name in OUTPUT_WIDTHS}
+    for name in sorted(networks.keys() - outputs.keys()):
+        place = own_input(name)
+        inputs[place] = keras.Input(networks[name].input_shape[1:], name=place, dtype="float32")
+        outputs[name] = networks[name](inputs[place])
     return keras.Model(inputs, outputs, name="predictor")
+
+
+def own_input(name: str) -> str:
+    """Return the name of the input of a network that shares its input with no other."""
+    return f"input_of_{name}"
 
 
 def parts(model: "keras.Model") -> dict[str, "keras.Model"]:
     """Return the networks that `assemble` put together."""
-    return {name: model.get_layer(name) for name in OUTPUT_WIDTHS}
+    return {name: model.get_layer(name) for name in model.output}
 
 
 def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict[str, NDArray[np.float32]]:
@@ -205,18 +214,23 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict
 
 
 def evaluate_networks(model: "keras.Model", phi: LinkFeatures) -> dict[str, NDArray[np.float64]]:
-    """Evaluate every network on every link: (N, `OUTPUT_WIDTHS`) arrays by name."""
+    """Evaluate every network of the paper on every link: (N, `OUTPUT_WIDTHS`) arrays by name."""
+    networks = {name: network for name, network in parts(model).items() if name in OUTPUT_WIDTHS}
     blocks = []
     for start in range(0, max(1, len(phi)), _LINKS_AT_ONCE):
-        values = model(network_inputs(phi.take(slice(start, start + _LINKS_AT_ONCE))), training=False)
-        blocks.append({name: np.asarray(values[name], dtype=np.float64) for name in OUTPUT_WIDTHS})
-    return {name: np.concatenate([block[name] for block in blocks]) for name in OUTPUT_WIDTHS}
+        inputs = network_inputs(phi.take(slice(start, start + _LINKS_AT_ONCE)))
+        chosen = {name: {key: inputs[key] for key in network.input} for name, network in networks.items()}
+        values = {name: network(chosen[name], training=False) for name, network in networks.items()}
+        blocks.append({name: np.asarray(value, dtype=np.float64) for name, value in values.items()})
+    return {name: np.concatenate([block[name] for block in blocks]) for name in networks}
 
 
 def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
     """Return the range [low, high] to which each network clamps and scales its inputs, by network and feature."""
     ranges = {}
     for name, network in parts(model).items():
+        if name not in OUTPUT_WIDTHS:
+            continue
         scaling = network.get_layer("scaled").get_config()
         names = [key for key in FEATURES if key in network.input]
         spans = zip(names, scaling["scale"], scaling["offset"], strict=True)
@@ -229,11 +243,11 @@ def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, An
     keras = import_keras()
     places = {name: keras.Input((1,), name=name, dtype="float32") for name in names}
     columns = list(places.values())
-    joined = _layer(keras, "Concatenate", "joined")(columns) if len(columns) > 1 else columns[0]
+    joined = layer(keras, "Concatenate", "joined")(columns) if len(columns) > 1 else columns[0]
     scale = [1.0 / (ranges[name][1] - ranges[name][0]) for name in names]
     offset = [-ranges[name][0] * factor for name, factor in zip(names, scale, strict=True)]
-    scaled = _layer(keras, "Rescaling", "scaled", scale, offset)(joined)
-    return places, _layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
+    scaled = layer(keras, "Rescaling", "scaled", scale, offset)(joined)
+    return places, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
 
 
 def _anchor(keras: ModuleType, row: GainNetwork, places: Mapping[str, Any], frequency_hz: float) -> Any:
@@ -241,13 +255,13 @@ def _anchor(keras: ModuleType, row: GainNetwork, places: Mapping[str, Any], freq
     if row.anchored_to_trace:
         return places["gain_db"]
     decades = keras.ops.log10(keras.ops.maximum(places["distance_m"], NEAREST_M))
-    return _layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
+    return layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
 
 
 def _gain_at_1m_db(frequency_hz: float) -> float:
     return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
 
 
-def _layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:
+def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:
     """Return a stock layer in single precision, whatever the user's global policy is."""
     return getattr(keras.layers, kind)(*arguments, name=name, dtype="float32", **options)

@@ -1,4 +1,4 @@
-"""Predictor: LinkFeatures -> LinkPrediction, the paper's link-state classifier, gain networks and indoor model."""
+"""Predictor: LinkFeatures -> LinkPrediction, by the paper's networks or by ones that see where links run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -11,23 +11,29 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError, SettingsError
+from sionna_partial.learning.context_fitting import fit_context_networks
+from sionna_partial.learning.context_networks import LINK_NETWORK, evaluate_context_networks
 from sionna_partial.learning.features import LinkFeatures, link_numbers, link_states
 from sionna_partial.learning.fitting import PredictorSettings, fit_indoor_networks, fit_networks
 from sionna_partial.learning.networks import (
     GAIN_NETWORKS,
     INDOOR_NETWORKS,
     STATE_NETWORKS,
+    assemble,
     evaluate_networks,
     import_keras,
     network_ranges,
+    parts,
 )
 from sionna_partial.learning.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.tracing.trace import Progress
 
 if TYPE_CHECKING:
     import keras
 
-SHIPPED = ("paper",)
+SHIPPED = ("map", "paper")
 """Their names; the first is the default."""
 
 
@@ -104,6 +110,11 @@ class LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
 
+    def where(self, taken: NDArray[np.bool_], other: "LinkPrediction") -> "LinkPrediction":
+        """Return `other` for the links of a mask (N,), and this distribution for the rest."""
+        columns = (column.name for column in fields(self))
+        return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
+
     def anywhere(self, p_indoor: ArrayLike) -> "LinkPrediction":
         """Return the distribution for receivers that may be outside, where every link is in outage.
 
@@ -139,12 +150,16 @@ class LinkPrediction:
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """The paper's predictor of link state and path gain (Sections III-D and III-E), made by `fit` or `load`.
+    """A predictor of link state and path gain, made by `fit` or `load`.
 
-    P(link state | features) is one multinomial logistic classifier on distance and unobserved distance for each partial
-    link state; the gain given the link state is Gaussian, its mean and log-variance from the networks of the paper's
-    table. P(indoor) is a logistic classifier on the unobserved distance for each partial link state; it is 1 until
-    `fit_indoor`, as the paper has every receiver indoors.
+    That of the paper (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on
+    distance and unobserved distance for each partial link state; the gain given the link state is Gaussian, its mean
+    and log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved
+    distance for each partial link state; it is 1 until `fit_indoor`, as the paper has every receiver indoors.
+
+    With settings other than "paper", networks beside these see what each path crosses, and the map around the
+    transmitter (`context_networks`). They answer for features with a context; the trace itself does where the map is
+    complete. For features without one the paper's networks answer, fitted to the same links.
 
     Parameters
     ----------
@@ -189,6 +204,8 @@ class Predictor:
         *,
         homes: Sequence[str] = (),
         settings: PredictorSettings | None = None,
+        complete: Sequence[PartialMap] | None = None,
+        progress: Progress | None = None,
     ) -> "Predictor":
         """Train by maximum likelihood: cross-entropy of the link state, Gaussian likelihood of the gain.
 
@@ -205,6 +222,12 @@ class Predictor:
         homes : sequence of str
             Where the links come from, to be recorded.
         settings : PredictorSettings, optional
+            The paper's networks by default.
+        complete : sequence of PartialMap, optional
+            The complete home of each of the maps of the features' context, for settings with networks "map": they learn
+            how plans go on.
+        progress : callable, optional
+            Called as ``progress(share_done, message)``.
 
         Returns
         -------
@@ -221,7 +244,13 @@ class Predictor:
             raise PredictorError("features has no links: give at least one.")
         states = link_states("link_state", link_state, len(features))
         gains_db = np.maximum(link_numbers("gain_db", gain_db, len(features)), GAIN_FLOOR_DB)
-        model = fit_networks(features, states, gains_db, settings)
+        context_networks = {}
+        if settings.networks != "paper":
+            _require_context(features, complete)
+            context_networks = fit_context_networks(
+                features, states, gains_db, settings, complete=complete, progress=progress
+            )
+        model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
         links = {
             f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
             for partial in LinkState
@@ -271,6 +300,14 @@ class Predictor:
         LinkPrediction
         """
         _require_features(features)
+        networks = parts(self.model)
+        if features.context is None or LINK_NETWORK not in networks:
+            return self._paper_answer(features)
+        answer = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
+        return answer.where(features.context.complete, LinkPrediction.of_trace(features))
+
+    def _paper_answer(self, features: LinkFeatures) -> LinkPrediction:
+        """Let the paper's networks answer."""
         outputs = evaluate_networks(self.model, features)
         probabilities = _chosen(outputs, STATE_NETWORKS, features).T
         probabilities /= probabilities.sum(axis=0)
@@ -352,6 +389,19 @@ class Predictor:
                 f"path = '{card_path}' is damaged ({error!r}): copy it again, or train anew."
             ) from error
         return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
+
+
+def _require_context(features: LinkFeatures, complete: Sequence[PartialMap] | None) -> None:
+    if features.context is None:
+        raise PredictorError(
+            "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
+            "or PredictorSettings(networks='paper')."
+        )
+    if complete is not None and len(complete) != len(features.context.maps):
+        raise PredictorError(
+            f"complete has {len(complete)} maps: give one for each of the {len(features.context.maps)} maps of the "
+            "features' context."
+        )
 
 
 def _require_features(features: object) -> None:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, temporary_folder
+from sionna_partial.learning.context_networks import CONTEXT_SHAPES
 from sionna_partial.learning.networks import FEATURES, OUTPUT_WIDTHS, import_keras
 
 if TYPE_CHECKING:
@@ -29,9 +30,13 @@ SUFFIX = ".keras"
 _MAX_BYTES = 64_000_000
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _LAYERS = {"Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"}
+_LAYERS |= {"Conv2D", "MaxPooling2D", "UpSampling2D"}
 _CLASSES = _LAYERS | {"Maximum", "Log10", "DTypePolicy", "GlorotUniform", "Zeros", "Constant", "__keras_tensor__"}
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
 """Names that Keras numbers through a process; each of our networks has one of each."""
+
+_INPUTS = dict.fromkeys(FEATURES, (None, 1))
+_OUTPUTS = {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}
 
 _FIXED_ENTRIES = {
     "format": FORMAT,
@@ -193,10 +198,11 @@ def _unpack(path: Path, archive: bytes) -> "keras.Model":
         copy.write_bytes(archive)
         try:
             model = keras.saving.load_model(copy, compile=False, safe_mode=True)
-            shapes = {name: tuple(output.shape) for name, output in model.output.items()}
-            names = set(model.input)
+            inputs, outputs = (
+                {name: tuple(end.shape) for name, end in ends.items()} for ends in (model.input, model.output)
+            )
         except Exception as error:
             raise PredictorError(f"path = '{path}' cannot be loaded by Keras ({error}): train it anew.") from error
-    if names != set(FEATURES) or shapes != {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}:
-        raise PredictorError(f"path = '{path}' has inputs {sorted(names)} and outputs {shapes}: train it anew.")
+    if not any(inputs == _INPUTS | more.inputs and outputs == _OUTPUTS | more.outputs for more in CONTEXT_SHAPES):
+        raise PredictorError(f"path = '{path}' has inputs {sorted(inputs)} and outputs {outputs}: train it anew.")
     return model

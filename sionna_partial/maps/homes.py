@@ -41,6 +41,9 @@ WIDE_M = (1.2, 2.5)
 LOCKED_SHARE = 0.25
 """Share of the rooms at dead ends that stay locked, on average."""
 
+SHUT_SHARE = 0.4
+"""Share of the homes in which locked rooms are free all the same, out of reach, as on scans of real homes."""
+
 LEAF_SHARE = 0.2
 """Share of the doors whose leaf stands open into a room."""
 
@@ -103,8 +106,9 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
     Returns
     -------
     PartialMap
-        Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture. All
-        free cells are connected, and nothing is missing (`is_complete`). Walls meet at least at the corners of cells.
+        Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture.
+        Nothing is missing (`is_complete`). Free cells are connected, but for those of locked rooms, which some homes
+        have. Walls meet at least at the corners of cells.
 
     Raises
     ------
@@ -123,20 +127,24 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
     thickness_m = rng.choice([0.0, rng.uniform(0.13, 0.25)], p=[0.85, 0.15])
     corners = bool(thickness_m > 0 or rng.random() < 0.3)
     angle_deg = float(rng.choice([0.0, rng.uniform(-45, 45)], p=[0.3, 0.7]))
-    free, lines = (affinity.rotate(shape, angle_deg, origin=(0, 0)) for shape in (plan.free, plan.lines))
-    state = _cells(free, lines, resolution_m, max(1, round(thickness_m / resolution_m)), corners, plan)
+    turned = replace(plan, **{name: affinity.rotate(getattr(plan, name), angle_deg, origin=(0, 0)) for name in _SHAPES})
+    state = _cells(turned, resolution_m, max(1, round(thickness_m / resolution_m)), corners)
     return PartialMap(state, resolution_m, interior_cells=int((state == CellState.FREE).sum()))
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """One home: free area and wall lines [m], how far walls and furniture swell [m], and the share and waves of it."""
+    """One home: free area, locked rooms, wall lines; how far walls and furniture swell [m], its share, and waves."""
 
     free: Polygon
+    shut: shapely.Geometry
     lines: shapely.Geometry
     swelling_m: float
     raggedness: float
     waves: NDArray[np.float64]
+
+
+_SHAPES = ("free", "shut", "lines")
 
 
 def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
@@ -144,7 +152,7 @@ def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
     style = _varied(rng, kind)
     outline = _outline(rng, _log_uniform(rng, style.area))
     rooms = [core for piece in _rooms(rng, outline, style) for core in _cores(piece)]
-    rooms, openings = _connected(rng, rooms, style)
+    rooms, openings, locked = _connected(rng, rooms, style)
     leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < LEAF_SHARE]
     gaps = union_of([opening.buffer(0.05, cap_style="flat") for opening in openings])
     lines = union_of([room.boundary for room in rooms]).difference(gaps, grid_size=GRID_M)
@@ -159,7 +167,10 @@ def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
     if not walked or walked[0].area < max(_SMALLEST_M2, _WALKED_SHARE * sum(part.area for part in walked)):
         return None
     free = next(part for part in parts_of(free) if part.intersects(walked[0]))
-    return _Plan(free, lines, style.swelling, style.raggedness, rng.normal(size=(_WAVES, 3)))
+    waves = rng.normal(size=(_WAVES, 3))
+    apart = free.buffer(style.wall, join_style="mitre")
+    shut = union_of(locked if rng.spawn(1)[0].random() < SHUT_SHARE else []).difference(apart, grid_size=GRID_M)
+    return _Plan(free, shut, lines, style.swelling, style.raggedness, waves)
 
 
 def _varied(rng: np.random.Generator, style: _Style) -> _Style:
@@ -259,8 +270,10 @@ def _cores(piece: Polygon) -> list[Polygon]:
     return [core for core in parts_of(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
 
 
-def _connected(rng: np.random.Generator, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString]]:
-    """Rooms that can be reached, and their openings: those of a random spanning tree, and some more."""
+def _connected(
+    rng: np.random.Generator, rooms: list[Polygon], style: _Style
+) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
+    """Rooms that can be reached, their openings (those of a random spanning tree, and some more), and locked rooms."""
     jamb_m = _JAMB_M + style.wall / 2
     pairs = [(i, j) for i in range(len(rooms)) for j in range(i)]
     walls = [_common_wall(rooms[i], rooms[j]) for i, j in pairs]
@@ -270,9 +283,10 @@ def _connected(rng: np.random.Generator, rooms: list[Polygon], style: _Style) ->
     degree = np.bincount([room for k in doors for room in pairs[k]], minlength=len(rooms))
     locked = (degree == 0) | ((degree == 1) & (rng.random(len(rooms)) < style.locked))
     if locked.all():
-        return rooms[:1], []
+        return rooms[:1], [], rooms[1:]
     openings = [_opening(rng, walls[k], style, jamb_m) for k in doors if not locked[list(pairs[k])].any()]
-    return [room for room, shut in zip(rooms, locked, strict=True) if not shut], openings
+    open_rooms, locked_rooms = ([rooms[k] for k in np.flatnonzero(locked == shut)] for shut in (False, True))
+    return open_rooms, openings, locked_rooms
 
 
 def _tree(rng: np.random.Generator, rooms: list[Polygon], pairs: list[tuple[int, int]]) -> set[tuple[int, int]]:
@@ -315,19 +329,21 @@ def _leaf(rng: np.random.Generator, opening: LineString) -> LineString:
     return affinity.rotate(opening, rng.choice([-1, 1]) * rng.uniform(75, 110), origin=hinge)
 
 
-def _cells(
-    free: Polygon, lines: shapely.Geometry, resolution_m: float, wall_cells: int, corners: bool, plan: _Plan
-) -> NDArray[np.uint8]:
+def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> NDArray[np.uint8]:
     """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
-    x0, y0, x1, y1 = free.bounds
+    x0, y0, x1, y1 = shapely.union(plan.free, plan.shut).bounds
     margin = _MARGIN_M + wall_cells * resolution_m
     x, y = x0 - margin, y0 - margin
     shape = math.ceil((y1 + margin - y) / resolution_m), math.ceil((x1 + margin - x) / resolution_m)
     grid = {"out_shape": shape, "transform": Affine(resolution_m, 0, x, 0, resolution_m, y), "dtype": np.uint8}
-    inside = rasterize([free], **grid).astype(bool)
-    inside &= ~rasterize([lines], all_touched=True, **grid).astype(bool)
+    lines = rasterize([plan.lines], all_touched=True, **grid).astype(bool)
+    inside = rasterize([plan.free], **grid).astype(bool) & ~lines
     inside = _largest(inside & ~_swollen(inside, resolution_m, plan))
-    beside = ndimage.binary_dilation(inside, ndimage.generate_binary_structure(2, 1 + corners), iterations=wall_cells)
+    around = ndimage.generate_binary_structure(2, 1 + corners)
+    if not plan.shut.is_empty:
+        shut = rasterize([plan.shut], **grid).astype(bool) & ~lines
+        inside |= shut & ~_swollen(shut, resolution_m, plan) & ~ndimage.binary_dilation(inside, around)
+    beside = ndimage.binary_dilation(inside, around, iterations=wall_cells)
     return np.where(inside, CellState.FREE, np.where(beside, CellState.WALL, CellState.UNKNOWN)).astype(np.uint8)
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -86,7 +86,9 @@ class Baselines:
         """
         blind = nothing_seen(links.phi, settings.frequency_hz)
         homes = list(dict.fromkeys(map(str, links.home)))
-        distance = Predictor.fit(blind, links.link_state, links.gain_db, homes=homes, settings=settings)
+        distance = Predictor.fit(
+            blind, links.link_state, links.gain_db, homes=homes, settings=replace(settings, networks="paper")
+        )
         return cls(Majority.fit(links.link_state, links.gain_db), distance)
 
     def save(self, folder: Path) -> None:

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.fitting import NetworkKind, PredictorSettings
 from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.shards import INDEX_FILE, read_dataset
 
@@ -74,7 +74,11 @@ def open_links(dataset: LinkTable | str | PathLike[str]) -> tuple[LinkTable, Lin
 
 
 def settings_for(
-    traces: LinkTraces | None, steps: int = PredictorSettings.steps, seed: int = PredictorSettings.seed
+    traces: LinkTraces | None,
+    *,
+    networks: NetworkKind = "map",
+    passes: int = PredictorSettings.passes,
+    seed: int = PredictorSettings.seed,
 ) -> PredictorSettings:
     """Return settings of a training on such links.
 
@@ -82,7 +86,7 @@ def settings_for(
     ----------
     traces : LinkTraces or None
         None takes the defaults.
-    steps, seed : int
+    networks, passes, seed
         As in PredictorSettings.
 
     Returns
@@ -95,7 +99,7 @@ def settings_for(
         For a value out of range.
     """
     known = traces or LinkTraces.of_settings(PredictorSettings())
-    return PredictorSettings(frequency_hz=known.frequency_hz, diffraction=known.diffraction, steps=steps, seed=seed)
+    return PredictorSettings(networks, known.frequency_hz, known.diffraction, passes, seed=seed)
 
 
 def require_like(found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str) -> None:

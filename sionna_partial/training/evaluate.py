@@ -187,7 +187,7 @@ class _Contestants:
     def anywhere(self, links: LinkTable) -> Mapping[str, LinkPrediction]:
         """Answers where receivers may be outside."""
         indoors = self.predictor.predict(links.phi)
-        p_indoor = np.where(links.rx_seen, 1.0, self.predictor.predict_indoor(links.phi))
+        p_indoor = np.where(links.context.rx_seen, 1.0, self.predictor.predict_indoor(links.phi))
         outage = indoors.anywhere(np.zeros(len(links)))
         return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 
@@ -230,7 +230,7 @@ def _paper(model: Predictor) -> Predictor | None:
 def _rows(
     homes: str, receivers: str, stage: int, links: LinkTable, given: Mapping[str, LinkPrediction]
 ) -> Iterator[Row]:
-    ends = links.tx_seen.astype(np.int64) + links.rx_seen
+    ends = links.context.tx_seen.astype(np.int64) + links.context.rx_seen
     cells = {"all": np.ones(len(links), dtype=bool)} | {name: ends == count for name, count in ENDS_SEEN.items()}
     for name, cell in cells.items():
         state, gain_db = links.link_state[cell], links.gain_db[cell]

@@ -87,7 +87,9 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     places = _draw_places(area, name, settings, rng)
     truth = _truth(area, places, settings)
     seen = zip(settings.stages, maps, _features(maps, places, settings), strict=True)
-    return LinkTable.concatenate(_stage_links(name, stage, partial, phi, places, truth) for stage, partial, phi in seen)
+    return LinkTable.concatenate(
+        _stage_links(name, area, stage, partial, phi, places, truth) for stage, partial, phi in seen
+    )
 
 
 def map_area(home: PartialMap, margin_m: float) -> PartialMap:
@@ -187,6 +189,7 @@ def _features(maps: list[PartialMap], places: _Places, settings: DatasetSettings
 
 def _stage_links(
     name: str,
+    home: PartialMap,
     stage: int,
     partial: PartialMap,
     phi: LinkFeatures,
@@ -194,19 +197,14 @@ def _stage_links(
     truth: tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.float64]],
 ) -> LinkTable:
     inside, link_state, gain_db = truth
-    counts = [len(rx) for rx in places.rx_m]
-    tx_m, rx_m = np.repeat(places.tx_m, counts, axis=0), np.concatenate(places.rx_m)
     return LinkTable(
-        home=np.full(len(rx_m), name),
-        stage=np.full(len(rx_m), stage, dtype=np.int64),
-        tx_m=tx_m,
-        rx_m=rx_m,
+        home=np.full(len(phi), name),
+        stage=np.full(len(phi), stage, dtype=np.int64),
         phi=phi,
         link_state=link_state,
         gain_db=gain_db,
         inside=inside,
         anywhere=np.concatenate(places.anywhere),
-        tx_seen=partial.state_at(tx_m) != CellState.UNKNOWN,
-        rx_seen=partial.state_at(rx_m) != CellState.UNKNOWN,
-        observed_fraction=np.full(len(rx_m), partial.observed_fraction),
+        observed_fraction=np.full(len(phi), partial.observed_fraction),
+        complete_maps={name: home},
     )

@@ -1,13 +1,15 @@
 """Links of many homes at several stages of exploration, with what is true of them: what a predictor learns from."""
 
-from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.link_context import LinkContext
+from sionna_partial.maps.partial_map import PartialMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,10 +22,8 @@ class LinkTable:
         Name of the home, such as "make_home(10003)".
     stage : (N,) int64 array
         Steps that the robot has explored.
-    tx_m, rx_m : (N, 3) float64 arrays
-        Positions of transmitter and receiver [m].
     phi : LinkFeatures
-        Features of the trace on the partial map.
+        Features of the trace on the partial map, with their context.
     link_state : (N,) uint8 array of LinkState
         Link state on the complete map; a receiver that is not inside is in outage (paper, "Indoor-Outdoor Estimation").
     gain_db : (N,) float64 array
@@ -32,34 +32,56 @@ class LinkTable:
         Whether the receiver is in a free cell of the complete map.
     anywhere : (N,) bool array
         Whether the receiver was drawn from the whole map area rather than from the free cells of the complete map.
-    tx_seen, rx_seen : (N,) bool arrays
-        Whether the transmitter, the receiver is in an observed cell of the partial map.
     observed_fraction : (N,) float64 array
         Share of the home's free area that the robot has seen.
+    complete_maps : mapping of str to PartialMap
+        The complete homes by name.
+
+    Raises
+    ------
+    PredictorError
+        If the features have no context.
     """
 
     home: NDArray[np.str_]
     stage: NDArray[np.int64]
-    tx_m: NDArray[np.float64]
-    rx_m: NDArray[np.float64]
     phi: LinkFeatures
     link_state: NDArray[np.uint8]
     gain_db: NDArray[np.float64]
     inside: NDArray[np.bool_]
     anywhere: NDArray[np.bool_]
-    tx_seen: NDArray[np.bool_]
-    rx_seen: NDArray[np.bool_]
     observed_fraction: NDArray[np.float64]
+    complete_maps: Mapping[str, PartialMap]
+
+    def __post_init__(self) -> None:
+        if self.phi.context is None:
+            raise PredictorError("phi has no context: give the LinkFeatures of link_features.")
 
     def __len__(self) -> int:
         """Return the number of links N."""
         return len(self.home)
 
+    @property
+    def context(self) -> LinkContext:
+        """Where the links run, and on which maps."""
+        assert self.phi.context is not None
+        return self.phi.context
+
+    @property
+    def complete_of_maps(self) -> list[PartialMap]:
+        """The complete home of each of the context's maps; of a map without links, the map itself."""
+        numbers, links = np.unique(self.context.map_index, return_index=True)
+        homes = dict(zip(numbers.tolist(), map(str, self.home[links]), strict=True))
+        return [
+            self.complete_maps[homes[number]] if number in homes else partial
+            for number, partial in enumerate(self.context.maps)
+        ]
+
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
         """Return the links that an index array, a mask (N,) or a slice selects."""
         phi = self.phi.take(index)
         columns = {name: getattr(self, name)[index] for name in COLUMNS}
-        return LinkTable(phi=phi, **columns)
+        return LinkTable(phi=phi, complete_maps=self.complete_maps, **columns)
 
     @classmethod
     def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
@@ -75,8 +97,9 @@ class LinkTable:
             raise PredictorError("parts is empty: give at least one LinkTable.")
         phi = LinkFeatures.concatenate([table.phi for table in tables])
         columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in COLUMNS}
-        return cls(phi=phi, **columns)
+        complete_maps = {name: home for table in tables for name, home in table.complete_maps.items()}
+        return cls(phi=phi, complete_maps=complete_maps, **columns)
 
 
-COLUMNS = tuple(field.name for field in fields(LinkTable) if field.name != "phi")
+COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
 """Names of the columns beside the features."""

@@ -1,26 +1,31 @@
 """LinkTable <-> Parquet: one shard for each home of a data set."""
 
+import base64
 import io
 import json
 import os
+import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from sionna_partial.errors import PredictorError
+from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.training.link_table import LinkTable
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
 """What a data set's folder holds: its settings and homes, a shard for each home, a note for each home that failed."""
 
-FORMAT = "sionna-partial links 1"
+FORMAT = "sionna-partial links 2"
 """Name and version of the shards' format, in their metadata."""
 
 _PREFIX = "sionna_partial."
@@ -37,7 +42,15 @@ class _Column:
 
 def _position(field: str, axis: int) -> _Column:
     name = f"{field.removesuffix('_m')}_{'xyz'[axis]}_m"
-    return _Column(name, pa.float64(), lambda table: getattr(table, field)[:, axis])
+    return _Column(name, pa.float64(), lambda table: getattr(table.context, field)[:, axis])
+
+
+def _indirect_gain(index: int) -> _Column:
+    return _Column(_INDIRECT[index], pa.float64(), lambda table: table.context.indirect_gain_db[:, index])
+
+
+def _of_context(name: str, kind: pa.DataType) -> _Column:
+    return _Column(name, kind, lambda table: getattr(table.context, name))
 
 
 def _of_table(name: str, kind: pa.DataType) -> _Column:
@@ -47,6 +60,8 @@ def _of_table(name: str, kind: pa.DataType) -> _Column:
 def _of_features(name: str, field: str, kind: pa.DataType) -> _Column:
     return _Column(name, kind, lambda table: getattr(table.phi, field))
 
+
+_INDIRECT = [f"indirect_gain_reach_{reach:g}_m_db" for reach in REACHES_M]
 
 _FEATURES = {
     "partial_link_state": "link_state",
@@ -63,9 +78,12 @@ _COLUMNS = (
         _of_features(name, field, pa.uint8() if field == "link_state" else pa.float64())
         for name, field in _FEATURES.items()
     ),
+    *(_indirect_gain(index) for index in range(len(REACHES_M))),
+    _of_context("strongest_unobserved_m", pa.float64()),
+    _of_context("map_index", pa.int64()),
     _of_table("link_state", pa.uint8()),
     _of_table("gain_db", pa.float64()),
-    *(_of_table(name, pa.bool_()) for name in ("inside", "anywhere", "tx_seen", "rx_seen")),
+    *(_of_table(name, pa.bool_()) for name in ("inside", "anywhere")),
     _of_table("observed_fraction", pa.float64()),
 )
 
@@ -74,7 +92,8 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
     """Write links as a Parquet file, whole or not at all. Equal links and metadata give equal bytes.
 
     Columns are named as in `LinkTable`, with the unit behind the name; positions have a column for each axis
-    (`tx_x_m`), and the link state and the gain of the partial trace are `partial_link_state` and `partial_gain_db`.
+    (`tx_x_m`), and the link state and the gain of the partial trace are `partial_link_state` and `partial_gain_db`. The
+    maps are in the file's metadata; `map_index` says on which of them a link was traced.
 
     Parameters
     ----------
@@ -88,7 +107,11 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
     OutputError
         If writing fails; no half a file is left.
     """
-    notes = {"format": FORMAT, **metadata}
+    maps = {
+        "partial": [_packed(each) for each in table.context.maps],
+        "complete": {name: _packed(home) for name, home in table.complete_maps.items()},
+    }
+    notes = {"format": FORMAT, "maps": maps, **metadata}
     texts = {_PREFIX + name: json.dumps(notes[name], sort_keys=True) for name in sorted(notes)}
     schema = pa.schema([pa.field(column.name, column.kind, nullable=False) for column in _COLUMNS], metadata=texts)
     values = [pa.array(column.values(table), type=column.kind) for column in _COLUMNS]
@@ -114,12 +137,16 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
     PredictorError
         If there is no such file, or it is damaged, or no shard.
     """
-    shard_metadata(path)
+    notes = shard_metadata(path)
     try:
         table = pq.ParquetFile(path, page_checksum_verification=True).read()
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
-    return _links_of(path, {name: table[name].to_numpy() for name in table.column_names})
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    try:
+        return _links_of(columns, notes["maps"])
+    except (KeyError, TypeError, ValueError, IndexError, zlib.error, MapError, PredictorError) as error:
+        raise _damaged(path, error) from error
 
 
 def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
@@ -203,17 +230,39 @@ def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
     return Path(folder) / SHARDS_FOLDER / f"{name}.parquet"
 
 
-def _links_of(path: str | os.PathLike[str], columns: dict[str, NDArray[np.generic]]) -> LinkTable:
+def _links_of(columns: dict[str, Any], maps: Any) -> LinkTable:
     positions = {
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
-    features = {field: columns.pop(name) for name, field in _FEATURES.items()}
-    try:
-        phi = LinkFeatures(**features)  # type: ignore[arg-type]
-    except PredictorError as error:
-        raise _damaged(path, error) from error
-    home = columns.pop("home").astype(np.str_)
-    return LinkTable(home=home, phi=phi, **positions, **columns)  # type: ignore[arg-type]
+    context = LinkContext(
+        maps=tuple(_unpacked(each) for each in maps["partial"]),
+        map_index=columns.pop("map_index"),
+        indirect_gain_db=np.column_stack([columns.pop(name) for name in _INDIRECT]),
+        strongest_unobserved_m=columns.pop("strongest_unobserved_m"),
+        **positions,
+    )
+    phi = LinkFeatures(**{field: columns.pop(name) for name, field in _FEATURES.items()}, context=context)
+    complete_maps = {name: _unpacked(each) for name, each in maps["complete"].items()}
+    return LinkTable(home=columns.pop("home").astype(np.str_), phi=phi, complete_maps=complete_maps, **columns)
+
+
+def _packed(partial: PartialMap) -> dict[str, object]:
+    """Return a floor plan as JSON has it, its cells deflated."""
+    cells = base64.b64encode(zlib.compress(partial.state.tobytes(), 9)).decode()
+    return {
+        "shape": list(partial.shape),
+        "cells": cells,
+        "resolution_m": partial.resolution_m,
+        "origin_m": list(partial.origin_m),
+        "wall_height_m": partial.wall_height_m,
+        "interior_cells": partial.interior_cells,
+    }
+
+
+def _unpacked(entry: Any) -> PartialMap:
+    cells = np.frombuffer(zlib.decompress(base64.b64decode(entry["cells"])), dtype=np.uint8)
+    rest = {name: entry[name] for name in ("resolution_m", "wall_height_m", "interior_cells")}
+    return PartialMap(cells.reshape(entry["shape"]), origin_m=tuple(entry["origin_m"]), **rest)
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:

@@ -160,11 +160,19 @@ def train(
     report = progress or (lambda share, message: None)
     train_homes, test_homes = split_homes(list(dict.fromkeys(map(str, table.home))), test_share, settings.seed)
     links = table.take(np.isin(table.home, train_homes))
-    indoors, unsure = links.take(~links.anywhere), links.take(links.anywhere & ~links.rx_seen)
+    indoors, unsure = links.take(~links.anywhere), links.take(links.anywhere & ~links.context.rx_seen)
     report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
-    predictor = Predictor.fit(indoors.phi, indoors.link_state, indoors.gain_db, homes=train_homes, settings=settings)
+    predictor = Predictor.fit(
+        indoors.phi,
+        indoors.link_state,
+        indoors.gain_db,
+        homes=train_homes,
+        settings=settings,
+        complete=indoors.complete_of_maps,
+        progress=lambda share, message: report(0.6 * share, message),
+    )
     predictor = predictor.fit_indoor(unsure.phi, unsure.inside)
-    report(0.4, "training the baselines")
+    report(0.6, "training the baselines")
     baselines = Baselines.fit(indoors, settings)
     run = TrainingRun(predictor, baselines, train_homes, test_homes, test_share, None)
     if not test_homes:

@@ -1,0 +1,208 @@
+"""Training of the networks that see where links run, by maximum likelihood, window by window."""
+
+import logging
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import LinkState
+from sionna_partial.errors import PredictorError
+from sionna_partial.learning.context_networks import context_networks, decode, link_inputs, look
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.networks import free_space_gain_db, import_keras
+from sionna_partial.learning.windows import WINDOW_CELLS, plan_windows, transmitter_windows, window_places
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.trace import Progress
+
+if TYPE_CHECKING:
+    import keras
+
+WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
+"""Number of windows in a gradient step, and of links that are drawn for each of them."""
+
+LEARNING_RATE, WEIGHT_DECAY = 2e-3, 1e-4
+"""Of AdamW; the rate falls to 0 along a cosine."""
+
+GAIN_WEIGHT, PLAN_WEIGHT = 0.3, 0.3
+"""Weights of the likelihoods of gain, and of the complete plan, beside that of the link state."""
+
+_REPORT_STEPS = 50
+
+_log = logging.getLogger(__name__)
+
+
+def fit_context_networks(
+    phi: LinkFeatures,
+    link_state: NDArray[np.uint8],
+    gain_db: NDArray[np.float64],
+    settings: PredictorSettings,
+    *,
+    complete: Sequence[PartialMap] | None = None,
+    progress: Progress | None = None,
+) -> dict[str, "keras.Model"]:
+    """Fit the networks that see where links run; every receiver is taken to be indoors.
+
+    Windows are turned and mirrored at random. The same links and settings give the same weights.
+
+    Parameters
+    ----------
+    phi : LinkFeatures
+        Of N links, with a context.
+    link_state : (N,) uint8 array of LinkState
+        True link state.
+    gain_db : (N,) float64 array
+        True omnidirectional path gain [dB].
+    settings : PredictorSettings
+        With `networks` "paths" or "map".
+    complete : sequence of M PartialMap, optional
+        The complete home of each of the context's maps, from which the map network learns how plans go on.
+    progress : callable, optional
+        Called as ``progress(share_done, message)``.
+
+    Returns
+    -------
+    dict of str to keras.Model
+        By name.
+
+    Raises
+    ------
+    PredictorError
+        If the training diverges.
+    """
+    networks = context_networks(settings.seed, with_map=settings.networks == "map")
+    examples = _Examples.of_links(phi, link_state, gain_db, settings, complete)
+    steps = math.ceil(settings.passes * len(examples.windows) / WINDOWS_AT_ONCE)
+    step = _gradient_step(networks, steps)
+    report = progress or (lambda share, message: None)
+    losses = []
+    for number, batch in enumerate(examples.batches(steps, np.random.default_rng(settings.seed))):
+        losses.append(float(step(**batch)))
+        if number % _REPORT_STEPS == 0:
+            recent = np.mean(losses[-_REPORT_STEPS:])
+            report(number / steps, f"step {number} of {steps}, loss {recent:.4f}")
+    _log.info("%d steps on %d windows: loss %.4f", steps, len(examples.windows), np.mean(losses[-_REPORT_STEPS:]))
+    if not np.isfinite(losses).all():
+        raise PredictorError(f"training diverged in step {int(np.argmin(np.isfinite(losses)))}: give another seed.")
+    return networks
+
+
+@dataclass(frozen=True, eq=False)
+class _Examples:
+    """Training links, ordered by window.
+
+    Parameters
+    ----------
+    windows : (W, S, S, C) uint8 array
+    plans : (W, S, S, 2) uint8 array or None
+        What the complete map shows, in 255ths.
+    first : (W + 1,) int array
+        Where the links of each window begin.
+    columns : mapping of str to (N, ...) arrays
+        Of the links, by the names of the arguments of a gradient step.
+    """
+
+    windows: NDArray[np.uint8]
+    plans: NDArray[np.uint8] | None
+    first: NDArray[np.intp]
+    columns: Mapping[str, NDArray[np.generic]]
+
+    @classmethod
+    def of_links(
+        cls,
+        phi: LinkFeatures,
+        link_state: NDArray[np.uint8],
+        gain_db: NDArray[np.float64],
+        settings: PredictorSettings,
+        complete: Sequence[PartialMap] | None,
+    ) -> "_Examples":
+        context = phi.context
+        assert context is not None
+        windows, index = transmitter_windows(context)
+        order = np.argsort(index, kind="stable")
+        columns = {
+            "links": link_inputs(phi, settings.frequency_hz),
+            "places": window_places(context),
+            "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
+            "link_state": link_state.astype(np.int32),
+            "gain_db": gain_db.astype(np.float32),
+        }
+        plans = None
+        if complete is not None and settings.networks == "map":
+            whole = replace(context, maps=tuple(complete))
+            plans = plan_windows(whole)
+        first = np.searchsorted(index[order], np.arange(len(windows) + 1))
+        return cls(windows, plans, first, {name: column[order] for name, column in columns.items()})
+
+    def batches(self, steps: int, rng: np.random.Generator) -> Iterator[dict[str, NDArray[np.generic]]]:
+        """Yield the arguments of so many gradient steps."""
+        order = np.zeros(0, dtype=np.intp)
+        for _ in range(steps):
+            while len(order) < WINDOWS_AT_ONCE:
+                order = np.concatenate([order, rng.permutation(len(self.windows))])
+            chosen, order = order[:WINDOWS_AT_ONCE], order[WINDOWS_AT_ONCE:]
+            yield self._batch(chosen, rng)
+
+    def _batch(self, chosen: NDArray[np.intp], rng: np.random.Generator) -> dict[str, NDArray[np.generic]]:
+        low, high = self.first[chosen], self.first[chosen + 1]
+        links = rng.integers(low[:, None], high[:, None], (len(chosen), LINKS_OF_WINDOW))
+        batch = {name: column[links] for name, column in self.columns.items()}
+        batch["windows"] = self.windows[chosen]
+        if self.plans is not None:
+            batch["plans"] = self.plans[chosen]
+        turns = rng.integers(8, size=len(chosen))
+        for name in batch.keys() & {"windows", "plans"}:
+            turned = [_turned(image, turn) for image, turn in zip(batch[name], turns, strict=True)]
+            batch[name] = np.stack(turned).astype(np.float32)
+        places = zip(batch["places"], turns, strict=True)
+        batch["places"] = np.stack([_turned_places(place, turn) for place, turn in places])
+        return batch
+
+
+def _turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
+    """One of the eight ways to lay a square (S, S, C)."""
+    image = image[:, ::-1] if turn & 1 else image
+    image = image[::-1] if turn & 2 else image
+    return image.transpose(1, 0, 2) if turn & 4 else image
+
+
+def _turned_places(places: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
+    """Where places (R, 2) are when the window is laid that way [cells]."""
+    x, y = places.T
+    x = WINDOW_CELLS - x if turn & 1 else x
+    y = WINDOW_CELLS - y if turn & 2 else y
+    return np.stack([y, x] if turn & 4 else [x, y], axis=1)
+
+
+def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callable[..., Any]:
+    """Return a function that takes one of so many gradient steps and returns the loss."""
+    import tensorflow as tf
+
+    keras = import_keras()
+    rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
+    optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
+    weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
+
+    def step(
+        windows: Any, links: Any, places: Any, free_db: Any, link_state: Any, gain_db: Any, plans: Any = None
+    ) -> Any:
+        with tf.GradientTape() as tape:
+            outputs, plan = look(networks, windows, links, places)
+            log_p, means_db, log_variances = decode(outputs, free_db)
+            loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
+            gain = 0.5 * (log_variances + tf.square(gain_db[..., None] - means_db) * tf.exp(-log_variances))
+            states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
+            linked = tf.cast(link_state[..., None] == states, tf.float32)
+            loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(gain * linked, axis=-1))
+            if plans is not None:
+                shares = tf.nn.sigmoid_cross_entropy_with_logits(plans / 255.0, plan)
+                loss += PLAN_WEIGHT * tf.reduce_mean(shares)
+        optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
+        return loss
+
+    compiled: Callable[..., Any] = tf.function(step, jit_compile=False)
+    return compiled

@@ -1,0 +1,285 @@
+"""The networks that see where links run, as Keras 3 models: a map network and a link network.
+
+The map network reads the window around the transmitter and writes `MAP_FEATURES` numbers into each of its cells: a
+U-Net (Ronneberger, Fischer and Brox 2015). What it makes of an empty window is taken off, so that a map says nothing
+where nothing was observed. The link network reads what the trace knows of a link, and the numbers at its receiver. It
+says P(link state), and mean and log-variance of the gain in line of sight and without.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
+from sionna_partial.learning.unobserved import unknown_shares
+from sionna_partial.learning.windows import CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
+
+if TYPE_CHECKING:
+    import keras
+
+Shape = tuple[int | None, ...]
+
+MAP_NETWORK, LINK_NETWORK = "map_network", "link_network"
+"""Names of the two networks."""
+
+MAP_FEATURES = 16
+"""Number of values of a cell that the link network reads."""
+
+PLAN_CHANNELS = 2
+"""Number of further values of a cell: logits of "free" and "wall" on the complete map, which only training uses."""
+
+LINK_OUTPUTS = 7
+"""Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
+
+_WIDTHS = (16, 24, 32, 48)
+_HIDDEN_UNITS = 64
+_LOS_OFFSET_DB, _NLOS_OFFSET_DB = 2.0, -25.0
+_LOS_SCALE_DB, _NLOS_SCALE_DB = 10.0, 20.0
+_SCALE_M, _SCALE_DB = 15.0, 100.0
+_NEAREST_M = 0.1
+
+
+def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
+    """Return what the trace knows of N links, scaled to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
+
+    Parameters
+    ----------
+    phi : LinkFeatures
+        With a context.
+    frequency_hz : float
+        Carrier frequency [Hz].
+
+    Returns
+    -------
+    (N, LINK_INPUTS) float32 array
+    """
+    context = phi.context
+    assert context is not None
+    distance_m, unobserved_m, state = phi.distance_m, phi.unobserved_distance_m, phi.link_state
+    free_db, walled_m = free_space_gain_db(distance_m, frequency_hz), _walled_m(context, distance_m)
+    near_m, los = np.maximum(distance_m, _NEAREST_M), state == LinkState.LOS
+    indirect_db = context.indirect_gain_db.T
+    certain = los & (unobserved_m == 0.0) & (walled_m == 0.0)
+    columns = [
+        *(state == each for each in LinkState),
+        *(context.tx_seen, context.rx_seen, certain, los & (walled_m > 0.0), np.minimum(walled_m, 1.0)),
+        *(distance_m / _SCALE_M, np.log(near_m), unobserved_m / _SCALE_M, unobserved_m / near_m),
+        *((distance_m - unobserved_m) / _SCALE_M, context.strongest_unobserved_m / _SCALE_M),
+        *((gain_db - GAIN_FLOOR_DB) / _SCALE_DB for gain_db in (phi.gain_db, free_db, *indirect_db)),
+        *(np.clip((gain_db - free_db) / 30.0, -2.0, 0.5) for gain_db in (phi.gain_db, *indirect_db)),
+    ]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+LINK_INPUTS = 14 + 2 + len(REACHES_M) + 1 + len(REACHES_M)
+"""Number of values that `link_inputs` gives of a link."""
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """Shapes of what goes in and comes out of networks that `assemble` puts together, by name."""
+
+    inputs: dict[str, Shape]
+    outputs: dict[str, Shape]
+
+    @classmethod
+    def of(cls, **networks: tuple[Shape, Shape]) -> "Shapes":
+        """Take (input, output) of each network, without the first axis."""
+        inputs = {own_input(name): (None, *ends[0]) for name, ends in networks.items()}
+        return cls(inputs, {name: (None, *ends[1]) for name, ends in networks.items()})
+
+
+_SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
+
+CONTEXT_SHAPES = (
+    Shapes.of(),
+    Shapes.of(link_network=((LINK_INPUTS,), (LINK_OUTPUTS,))),
+    Shapes.of(
+        link_network=((LINK_INPUTS + MAP_FEATURES,), (LINK_OUTPUTS,)),
+        map_network=((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES + PLAN_CHANNELS)),
+    ),
+)
+"""What a predictor may have beside the networks of the paper: nothing, "paths", or "map"."""
+
+
+def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
+    """Build the networks, untrained, by name.
+
+    Parameters
+    ----------
+    seed : int
+        Of the first weights.
+    with_map : bool
+        Whether there is a map network; without one, the link network knows nothing but the trace.
+
+    Returns
+    -------
+    dict of str to keras.Model
+    """
+    keras = import_keras()
+    start = _Seeds(keras, seed)
+    networks = {LINK_NETWORK: _link_network(keras, start, LINK_INPUTS + (MAP_FEATURES if with_map else 0))}
+    return networks | ({MAP_NETWORK: _map_network(keras, start)} if with_map else {})
+
+
+def look(networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places: Any) -> tuple[Any, Any]:
+    """Evaluate the networks on R links of each of B windows.
+
+    Parameters
+    ----------
+    networks : mapping of str to keras.Model
+        By name.
+    windows : (B, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) float32 tensor
+        In [0, 255].
+    links : (B, R, LINK_INPUTS) float32 tensor
+    places : (B, R, 2) float32 tensor
+        Of the receivers: x, y in cells of the window.
+
+    Returns
+    -------
+    outputs : (B, R, LINK_OUTPUTS) float32 tensor
+    plan : (B, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS) float32 tensor
+        Logits of what the complete map shows; None without a map network.
+    """
+    import tensorflow as tf
+
+    plan = None
+    if MAP_NETWORK in networks:
+        maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0))
+        known, plan = maps[:-1, ..., :MAP_FEATURES], maps[:-1, ..., MAP_FEATURES:]
+        links = tf.concat([links, _between(known - maps[-1:, ..., :MAP_FEATURES], places)], axis=-1)
+    outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
+    return tf.reshape(outputs, (tf.shape(places)[0], -1, LINK_OUTPUTS)), plan
+
+
+def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
+    """Return log-probabilities of the link states, and means and log-variances of the gain given LOS and NLOS.
+
+    Parameters
+    ----------
+    outputs : (..., LINK_OUTPUTS) tensor
+    free_db : (...) tensor
+        Gain of free space [dB].
+
+    Returns
+    -------
+    log_probabilities : (..., 3) tensor
+        By LinkState.
+    means_db, log_variances : (..., 2) tensors
+        Of LOS and NLOS [dB, dB^2].
+    """
+    import tensorflow as tf
+
+    means_db = free_db[..., None] + outputs[..., 3:5] * (_LOS_SCALE_DB, _NLOS_SCALE_DB)
+    means_db += (_LOS_OFFSET_DB, _NLOS_OFFSET_DB)
+    low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
+    return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
+
+
+def evaluate_context_networks(
+    networks: Mapping[str, "keras.Model"], phi: LinkFeatures, frequency_hz: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Evaluate the networks on N links.
+
+    Parameters
+    ----------
+    networks : mapping of str to keras.Model
+        By name.
+    phi : LinkFeatures
+        With a context.
+    frequency_hz : float
+        Carrier frequency [Hz].
+
+    Returns
+    -------
+    probabilities, means_db, stds_db : (3, N) float64 arrays
+        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+    """
+    context = phi.context
+    assert context is not None
+    windows, index = transmitter_windows(context)
+    inputs, places = link_inputs(phi, frequency_hz), window_places(context)
+    outputs = np.zeros((len(phi), LINK_OUTPUTS))
+    for number, window in enumerate(windows):
+        here = np.flatnonzero(index == number)
+        found, _ = look(networks, window[None].astype(np.float32), inputs[None, here], places[None, here])
+        outputs[here] = found[0]
+    log_p, gains_db, log_variances = decode(outputs, free_space_gain_db(phi.distance_m, frequency_hz))
+    probabilities = np.exp(log_p).T
+    means_db, stds_db = np.full_like(probabilities, GAIN_FLOOR_DB), np.zeros_like(probabilities)
+    means_db[1:] = np.maximum(np.transpose(gains_db), GAIN_FLOOR_DB)
+    stds_db[1:] = np.exp(0.5 * np.transpose(log_variances))
+    return probabilities, means_db, stds_db
+
+
+class _Seeds:
+    """First weights, each layer with a seed of its own."""
+
+    def __init__(self, keras: Any, seed: int) -> None:
+        self._keras, self._next = keras, 1000 * seed
+
+    def __call__(self) -> Any:
+        self._next += 1
+        return self._keras.initializers.GlorotUniform(seed=self._next)
+
+
+def _map_network(keras: Any, start: _Seeds) -> "keras.Model":
+    def convolved(x: Any, units: int, name: str) -> Any:
+        options = {"padding": "same", "activation": "relu", "kernel_initializer": start()}
+        return layer(keras, "Conv2D", name, units, 3, **options)(x)
+
+    window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), name="window", dtype="float32")
+    shares = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
+    x = convolved(shares, _WIDTHS[0], "down_0")
+    levels = []
+    for depth, units in enumerate(_WIDTHS[1:], 1):
+        levels.append(x)
+        x = layer(keras, "MaxPooling2D", f"pool_{depth}")(x)
+        x = convolved(convolved(x, units, f"down_{depth}"), units, f"down_{depth}_again")
+    for depth in reversed(range(len(levels))):
+        x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
+        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), _WIDTHS[depth], f"up_{depth}")
+        x = convolved(x, _WIDTHS[depth], f"up_{depth}_again") if depth else x
+    joined = layer(keras, "Concatenate", "all")([x, shares])
+    values = layer(keras, "Conv2D", "values", MAP_FEATURES + PLAN_CHANNELS, 1, kernel_initializer=start())(joined)
+    return keras.Model(window, values, name=MAP_NETWORK)
+
+
+def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
+    x = link = keras.Input((inputs,), name="link", dtype="float32")
+    for number in (1, 2):
+        options = {"activation": "silu", "kernel_initializer": start()}
+        x = layer(keras, "Dense", f"hidden_{number}", _HIDDEN_UNITS, **options)(x)
+    outputs = layer(keras, "Dense", "outputs", LINK_OUTPUTS, kernel_initializer="zeros")(x)
+    return keras.Model(link, outputs, name=LINK_NETWORK)
+
+
+def _walled_m(context: LinkContext, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Length of the direct lines (N,) in cells of known walls [m]: outlines of walls may leave them open."""
+    walled_m = np.zeros(len(context))
+    for number in np.unique(context.map_index):
+        partial, here = context.maps[number], context.map_index == number
+        walls = np.where(partial.state == CellState.WALL, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
+        ends = (np.round((at_m[here, :2] - partial.origin_m) / partial.resolution_m, 6) for at_m in _ends(context))
+        walled_m[here] = unknown_shares(walls, *ends) * distance_m[here]
+    return walled_m
+
+
+def _ends(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return context.tx_m, context.rx_m
+
+
+def _between(maps: Any, places: Any) -> Any:
+    """Values (B, R, C) of maps (B, S, S, C) at places (B, R, 2) [cells], bilinear between the middles of cells."""
+    import tensorflow as tf
+
+    middles = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5
+    x, y = tf.unstack(tf.maximum(1.0 - tf.abs(places[..., None] - middles), 0.0), axis=2)
+    return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))

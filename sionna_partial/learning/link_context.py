@@ -1,0 +1,172 @@
+"""Where links run: what their paths cross, and the maps around them. TracedLinks + PartialMap -> LinkContext."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.errors import PredictorError
+from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.trace import TracedLinks
+
+REACHES_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
+"""How far paths are taken to get through unobserved space [m]: a path that crosses u of it counts exp(-u / reach)."""
+
+_SEEN_M = 1e-3
+"""Unobserved length below which a path is wholly in observed space [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkContext:
+    """What the map shows along and around N links, beyond the paper's features.
+
+    Parameters
+    ----------
+    maps : tuple of M PartialMap
+        The maps on which the links were traced.
+    map_index : (N,) int64 array
+        Which of them is each link's.
+    tx_m, rx_m : (N, 3) float64 arrays
+        Positions of transmitter and receiver [m].
+    indirect_gain_db : (N, R) float64 array
+        Gain of all traced paths but the direct one, each path weakened by the unobserved space that it crosses, for
+        each of `REACHES_M` [dB], at least -150: of all of them first, of those wholly in observed space last.
+    strongest_unobserved_m : (N,) float64 array
+        Unobserved length of the strongest path but the direct one [m]; the distance where there is none.
+
+    Raises
+    ------
+    PredictorError
+        For arrays of other shapes, or a map that is not there.
+    """
+
+    maps: tuple[PartialMap, ...]
+    map_index: NDArray[np.int64]
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    indirect_gain_db: NDArray[np.float64]
+    strongest_unobserved_m: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        count = len(self.map_index)
+        shapes = {"tx_m": (3,), "rx_m": (3,), "indirect_gain_db": (len(REACHES_M),), "strongest_unobserved_m": ()}
+        for name, shape in shapes.items():
+            found = np.shape(getattr(self, name))
+            if found != (count, *shape):
+                raise PredictorError(f"{name} has shape {found}: give {(count, *shape)}, a row for each link.")
+        there = (self.map_index >= 0) & (self.map_index < len(self.maps))
+        if not there.all():
+            index = int(np.argmin(there))
+            raise PredictorError(
+                f"map_index[{index}] = {self.map_index[index]} is not allowed: give places in maps, which has "
+                f"{len(self.maps)}, from 0."
+            )
+
+    def __len__(self) -> int:
+        """Return the number of links N."""
+        return len(self.map_index)
+
+    @cached_property
+    def tx_seen(self) -> NDArray[np.bool_]:
+        """Whether each transmitter (N,) is in an observed cell of its map."""
+        return self._seen(self.tx_m)
+
+    @cached_property
+    def rx_seen(self) -> NDArray[np.bool_]:
+        """Whether each receiver (N,) is in an observed cell of its map."""
+        return self._seen(self.rx_m)
+
+    @cached_property
+    def complete(self) -> NDArray[np.bool_]:
+        """Whether the map of each link (N,) is complete."""
+        return np.array([each.is_complete for each in self.maps], dtype=bool)[self.map_index]
+
+    def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
+        """Return the links that an index array, a mask (N,) or a slice selects."""
+        return LinkContext(self.maps, *(getattr(self, name)[index] for name in _COLUMNS))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["LinkContext"]) -> "LinkContext":
+        """Return the links of all `parts`, one part after the other."""
+        if not parts:
+            raise PredictorError("parts is empty: give at least one LinkContext.")
+        places: dict[int, int] = {}
+        maps: list[PartialMap] = []
+        index = []
+        for part in parts:
+            for each in part.maps:
+                if places.setdefault(id(each), len(maps)) == len(maps):
+                    maps.append(each)
+            index.append(np.array([places[id(each)] for each in part.maps], dtype=np.int64)[part.map_index])
+        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS[1:])
+        return cls(tuple(maps), np.concatenate(index), *columns)
+
+    def _seen(self, places_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        seen = np.zeros(len(self), dtype=bool)
+        for number in np.unique(self.map_index):
+            here = self.map_index == number
+            seen[here] = self.maps[number].state_at(places_m[here]) != CellState.UNKNOWN
+        return seen
+
+
+_COLUMNS = ("map_index", "tx_m", "rx_m", "indirect_gain_db", "strongest_unobserved_m")
+
+
+def link_context(partial: PartialMap, links: TracedLinks) -> LinkContext:
+    """Measure what the paths of traced links cross.
+
+    Parameters
+    ----------
+    partial : PartialMap
+        The map on which the links were traced.
+    links : TracedLinks
+        From one or T transmitters to N receivers.
+
+    Returns
+    -------
+    LinkContext
+        Of N or T N links, transmitter by transmitter.
+    """
+    transmitters, receivers = links.tx.reshape(-1, 3), len(links.rx)
+    tx_m = np.repeat(transmitters, receivers, axis=0)
+    rx_m = np.tile(links.rx, (len(transmitters), 1))
+    indirect = np.any(links.interactions > 0, axis=1)
+    link = (links.path_tx.astype(np.int64) * receivers + links.path_rx)[indirect]
+    power = np.abs(links.a[indirect]) ** 2
+    unobserved_m = _path_unobserved_m(partial, links, indirect)
+    gains_db = np.stack([_gain_db(link, power * _kept(unobserved_m, reach), len(tx_m)) for reach in REACHES_M], axis=1)
+    strongest_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    weakest_first = np.argsort(power, kind="stable")
+    strongest_m[link[weakest_first]] = unobserved_m[weakest_first]
+    return LinkContext((partial,), np.zeros(len(tx_m), dtype=np.int64), tx_m, rx_m, gains_db, strongest_m)
+
+
+def _path_unobserved_m(partial: PartialMap, links: TracedLinks, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Length of the chosen paths in unknown cells [m]."""
+    paths = np.flatnonzero(chosen)
+    total_m = np.zeros(len(paths))
+    if partial.is_complete:
+        return total_m
+    here_m = links.tx.reshape(-1, 3)[links.path_tx[paths]]
+    for depth in range(links.interactions.shape[1]):
+        bends = np.flatnonzero(links.interactions[paths, depth])
+        there_m = links.vertices_m[paths[bends], depth]
+        total_m[bends] += unobserved_lengths_m(partial, here_m[bends], there_m)
+        here_m[bends] = there_m
+    return total_m + unobserved_lengths_m(partial, here_m, links.rx[links.path_rx[paths]])
+
+
+def _kept(unobserved_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
+    """Share (P,) of the power of paths that gets through the unobserved space that they cross."""
+    return np.exp(-unobserved_m / reach_m) if reach_m > 0.0 else (unobserved_m < _SEEN_M).astype(np.float64)
+
+
+def _gain_db(link: NDArray[np.int64], power: NDArray[np.float64], links: int) -> NDArray[np.float64]:
+    total = np.bincount(link, weights=power, minlength=links).astype(np.float64)
+    with np.errstate(divide="ignore"):
+        return np.maximum(10.0 * np.log10(total), GAIN_FLOOR_DB)

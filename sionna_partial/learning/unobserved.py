@@ -1,0 +1,134 @@
+"""How much of straight lines has not been observed: the grid integral behind d_unobs (paper, Section III-C)."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sionna_partial.constants import CellState
+from sionna_partial.maps.partial_map import PartialMap
+
+_FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
+
+_BORDER_CELLS = 1e-6
+"""Distance within which a segment runs along the border of cells [cells]."""
+
+_ALONG_CELLS = 1e-3
+"""Extent along one axis below which a segment may run along the border of cells [cells]."""
+
+
+def unobserved_lengths_m(
+    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Measure the length of segments inside unknown cells, exact to rounding.
+
+    Everything outside the grid is unknown. On a complete map nothing unknown can be reached, and the length is 0 by
+    definition. A segment along the border of cells is in the freest of them, as in `PartialMap.state_at`.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    start_m, end_m : (N, 3) float64 arrays
+        Ends of the segments [m]; one may be (3,).
+
+    Returns
+    -------
+    (N,) float64 array
+        Between 0 and the lengths of the segments [m].
+    """
+    start_m, end_m = np.broadcast_arrays(start_m, end_m)
+    if partial.is_complete:
+        return np.zeros(len(end_m))
+    starts, ends = (
+        np.round((points[:, :2] - partial.origin_m) / partial.resolution_m, 6) for points in (start_m, end_m)
+    )
+    return unknown_shares(partial.state, starts, ends) * np.linalg.norm(end_m - start_m, axis=1)
+
+
+@njit(cache=True)
+def unknown_shares(
+    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] that are unknown."""
+    shares = np.empty(len(ends))
+    for i in range(len(ends)):
+        shares[i] = _unknown_share(state, starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
+    return shares
+
+
+@njit(cache=True)
+def _unknown_share(state: NDArray[np.uint8], start_x: float, start_y: float, end_x: float, end_y: float) -> float:
+    """Return the share of a segment that is unknown.
+
+    The grid is walked from line to line (Amanatides and Woo 1987). The distance to each line is computed afresh, so
+    that rounding does not add up. Only a segment along an axis can run along the border of cells for a while.
+    """
+    ny, nx = state.shape
+    step_x, step_y = end_x - start_x, end_y - start_y
+    enter_x, leave_x = _inside(start_x, step_x, nx)
+    enter_y, leave_y = _inside(start_y, step_y, ny)
+    here, leave = max(enter_x, enter_y), min(leave_x, leave_y)
+    share = 1.0 - max(0.0, leave - here)
+    turn_x, turn_y = int(np.sign(step_x)), int(np.sign(step_y))
+    pace_x = 1.0 / step_x if turn_x else 0.0
+    pace_y = 1.0 / step_y if turn_y else 0.0
+    line_x = _first_line(start_x + here * step_x, step_x)
+    line_y = _first_line(start_y + here * step_y, step_y)
+    reach_x = (line_x - start_x) * pace_x if turn_x else np.inf
+    reach_y = (line_y - start_y) * pace_y if turn_y else np.inf
+    column = int(line_x) - 1 if turn_x > 0 else int(line_x)
+    row = int(line_y) - 1 if turn_y > 0 else int(line_y)
+    along = min(abs(step_x), abs(step_y)) < _ALONG_CELLS
+    while here < leave:
+        there = min(max(here, min(reach_x, reach_y)), leave)
+        if along:
+            middle = 0.5 * (here + there)
+            unknown = _is_unknown(state, start_x + middle * step_x, start_y + middle * step_y)
+        else:
+            unknown = not (0 <= row < ny and 0 <= column < nx) or state[row, column] == _UNKNOWN
+        if unknown:
+            share += there - here
+        if reach_x <= there:
+            line_x += turn_x
+            column += turn_x
+            reach_x = (line_x - start_x) * pace_x
+        if reach_y <= there:
+            line_y += turn_y
+            row += turn_y
+            reach_y = (line_y - start_y) * pace_y
+        here = there
+    return min(max(share, 0.0), 1.0)
+
+
+@njit(cache=True)
+def _inside(start: float, step: float, size: int) -> tuple[float, float]:
+    """Return the shares of a segment at which it enters and leaves [0, size] along one axis; enter > leave if never."""
+    if step == 0.0:
+        return (0.0, 1.0) if 0.0 <= start <= size else (1.0, 0.0)
+    low, high = -start / step, (size - start) / step
+    return max(0.0, min(low, high)), min(1.0, max(low, high))
+
+
+@njit(cache=True)
+def _first_line(place: float, step: float) -> float:
+    """Return the first grid line that is met from `place` in the direction of `step`."""
+    return np.floor(place) + 1.0 if step > 0.0 else np.ceil(place) - 1.0
+
+
+@njit(cache=True)
+def _is_unknown(state: NDArray[np.uint8], x: float, y: float) -> bool:
+    """Whether the freest cell within 1e-6 cells of a point [cells] is unknown."""
+    ny, nx = state.shape
+    row, column = int(np.floor(y)), int(np.floor(x))
+    deep_x = _BORDER_CELLS < x - column < 1.0 - _BORDER_CELLS
+    deep_y = _BORDER_CELLS < y - row < 1.0 - _BORDER_CELLS
+    if deep_x and deep_y and 0 <= row < ny and 0 <= column < nx:
+        return state[row, column] == _UNKNOWN
+    found = False
+    for row in range(int(np.floor(y - _BORDER_CELLS)), int(np.floor(y + _BORDER_CELLS)) + 1):
+        for column in range(int(np.floor(x - _BORDER_CELLS)), int(np.floor(x + _BORDER_CELLS)) + 1):
+            outside = row < 0 or row >= ny or column < 0 or column >= nx
+            cell = _UNKNOWN if outside else state[row, column]
+            if cell == _FREE:
+                return False
+            found |= cell == _UNKNOWN
+    return found

@@ -1,0 +1,168 @@
+"""What a map shows around a transmitter, as the image that a convolutional network reads: PartialMap -> window."""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from sionna_partial.constants import CellState
+from sionna_partial.learning.link_context import LinkContext
+from sionna_partial.learning.unobserved import unknown_shares
+from sionna_partial.maps.partial_map import PartialMap
+
+WINDOW_CELLS, CELL_M = 64, 0.3
+"""Number of cells along each side of a window, and their edge [m]. The transmitter is in the middle."""
+
+CHANNELS = ("free", "wall", "seen", "hidden", "detour")
+"""What a cell of a window says, each in 255ths, and 0 where nothing was observed.
+
+free, wall: share of the cell's area that is known to be so. seen: share of the direct line from the transmitter that is
+observed. hidden: whether that line meets a known wall. detour: how much longer the way on foot is, see `_detours`.
+"""
+
+_WALL_COST = 100.0
+"""Cost of a cell of nothing but wall to one who walks, in cells."""
+
+_LONGEST_DETOUR_M = 12.0
+
+_GRAZE = 1e-9
+"""Share of a line up to which a wall is only grazed: lines between grid points meet many corners, to rounding."""
+
+
+def transmitter_windows(context: LinkContext) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    """Draw the window of every transmitter on every map.
+
+    Parameters
+    ----------
+    context : LinkContext
+        Of N links.
+
+    Returns
+    -------
+    windows : (W, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) uint8 array
+        Row 0 has the smallest y.
+    index : (N,) int array
+        Which of them is each link's.
+    """
+    return _each(context, transmitter_window, len(CHANNELS))
+
+
+def plan_windows(context: LinkContext) -> NDArray[np.uint8]:
+    """Draw the first two channels, free and wall, of every window of `transmitter_windows`: (W, ..., 2) uint8 array."""
+    return _each(context, _plan_window, 2)[0]
+
+
+def window_places(context: LinkContext) -> NDArray[np.float32]:
+    """Return where receivers (N, 2) are in the windows: x, y in cells, those outside at the border."""
+    places = (context.rx_m - context.tx_m)[:, :2] / CELL_M + WINDOW_CELLS / 2
+    return np.clip(places, 0.5, WINDOW_CELLS - 0.5).astype(np.float32)
+
+
+def _each(
+    context: LinkContext, draw: Callable[[PartialMap, NDArray[np.float64]], NDArray[np.uint8]], channels: int
+) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    keys = np.column_stack([context.map_index, context.tx_m[:, :2]])
+    places, index = np.unique(keys, axis=0, return_inverse=True)
+    windows = [draw(context.maps[int(number)], np.array([x, y])) for number, x, y in places]
+    shape = (0, WINDOW_CELLS, WINDOW_CELLS, channels)
+    return np.stack(windows) if windows else np.zeros(shape, dtype=np.uint8), index.reshape(-1)
+
+
+def transmitter_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Draw the window around one transmitter.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    tx_m : (2,) float64 array
+        Its x and y [m].
+
+    Returns
+    -------
+    (WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) uint8 array
+    """
+    if (partial.state == CellState.UNKNOWN).all():
+        return np.zeros((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), dtype=np.uint8)
+    state, start = _surroundings(partial, tx_m)
+    edges = _edges(partial, start)
+    free, wall = _plan(state, edges)
+    centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
+    starts = np.tile(start, (len(centres), 1))
+    walls = np.where(state == CellState.WALL, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
+    unknown, blocked = (unknown_shares(cells, starts, centres).reshape(free.shape) for cells in (state, walls))
+    return _in_255ths([free, wall, 1.0 - unknown, blocked > _GRAZE, _detours(wall)])
+
+
+def _plan_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
+    state, start = _surroundings(partial, tx_m)
+    return _in_255ths(_plan(state, _edges(partial, start)))
+
+
+def _in_255ths(layers: Sequence[NDArray[np.generic]]) -> NDArray[np.uint8]:
+    return np.round(255.0 * np.stack(layers, axis=-1)).astype(np.uint8)
+
+
+def _surroundings(partial: PartialMap, tx_m: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Extend or cut a map to what a window covers, and say where the transmitter is in it [cells]."""
+    reach = int(np.ceil(0.5 * WINDOW_CELLS * CELL_M / partial.resolution_m)) + 1
+    start = np.round((tx_m - partial.origin_m) / partial.resolution_m, 6)
+    column, row = np.floor(start).astype(int)
+    spans = [(low - reach, low + reach + 1) for low in (row, column)]
+    state = np.full((2 * reach + 1, 2 * reach + 1), CellState.UNKNOWN, dtype=np.uint8)
+    inner = [(max(low, 0), min(high, count)) for (low, high), count in zip(spans, partial.shape, strict=True)]
+    if all(low < high for low, high in inner):
+        known = partial.state[inner[0][0] : inner[0][1], inner[1][0] : inner[1][1]]
+        top, left = inner[0][0] - spans[0][0], inner[1][0] - spans[1][0]
+        state[top : top + known.shape[0], left : left + known.shape[1]] = known
+    return state, start - np.array([spans[1][0], spans[0][0]])
+
+
+def _edges(partial: PartialMap, start: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Borders (2, WINDOW_CELLS + 1) of the window's cells along x and y [cells of the map]."""
+    steps = np.arange(WINDOW_CELLS + 1) - WINDOW_CELLS / 2
+    return start[:, None] + CELL_M / partial.resolution_m * steps
+
+
+def _plan(state: NDArray[np.uint8], edges: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    """Shares of the area of the window's cells that are free, and wall."""
+    columns, rows = (_overlaps(edge, len(state)) for edge in edges)
+    return [rows @ (state == kind) @ columns.T for kind in (CellState.FREE, CellState.WALL)]
+
+
+def _overlaps(edges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Share of each interval between `edges` (K + 1,) that each of `count` unit cells covers: (K, count)."""
+    cells = np.arange(count)
+    low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)
+    return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
+
+
+def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How much longer the way around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR_M`.
+
+    Ways go from cell to cell, also across corners. Walls are crossed at a price.
+    """
+    ends, lengths = _steps()
+    cost = (1.0 + _WALL_COST * wall).ravel()
+    weights = lengths * 0.5 * (cost[ends[0]] + cost[ends[1]])
+    ways = csr_array((weights, ends), shape=(cost.size, cost.size))
+    middle = WINDOW_CELLS // 2
+    costs = dijkstra(ways, directed=False, indices=middle * WINDOW_CELLS + middle).reshape(wall.shape)
+    offsets = np.abs(np.arange(WINDOW_CELLS) - middle)
+    short, long = np.minimum.outer(offsets, offsets), np.maximum.outer(offsets, offsets)
+    straight = long + (math.sqrt(2.0) - 1.0) * short
+    return np.clip((costs - straight) * CELL_M / _LONGEST_DETOUR_M, 0.0, 1.0)
+
+
+@cache
+def _steps() -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Pairs of neighbouring cells (2, E), and their distances (E,) [cells]."""
+    cell = np.arange(WINDOW_CELLS**2).reshape(WINDOW_CELLS, WINDOW_CELLS)
+    pairs = [(cell[:, :-1], cell[:, 1:]), (cell[:-1], cell[1:]), (cell[:-1, :-1], cell[1:, 1:])]
+    pairs.append((cell[:-1, 1:], cell[1:, :-1]))
+    lengths = np.repeat([1.0, 1.0, math.sqrt(2.0), math.sqrt(2.0)], [one.size for one, _ in pairs])
+    ends = np.concatenate([np.stack([one.ravel(), other.ravel()]) for one, other in pairs], axis=1)
+    return ends, lengths

@@ -1,0 +1,314 @@
+"""What the paths of hand-made links cross, and where the links run."""
+
+import dataclasses
+import math
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.errors import PredictorError
+from sionna_partial.learning.link_context import REACHES_M, LinkContext, link_context
+from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.trace import TracedLinks, trace_links
+
+FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+DEPTH = 4
+
+
+def room(resolution_m=1.0, origin_m=(0.0, 0.0), unknown_from=5):
+    """Return 8 by 3 free cells in walls; nothing is known from a column of cells on, but for the outer wall."""
+    state = np.full((5, 10), WALL)
+    state[1:-1, 1:-1] = FREE
+    state[1:-1, unknown_from:-1] = UNKNOWN
+    return PartialMap(state, resolution_m, origin_m)
+
+
+HALF, WHOLE = room(), room(unknown_from=9)
+TX = (1.5, 2.5, 1.5)
+NEAR, FAR = (4.5, 2.5, 1.5), (7.5, 2.5, 1.5)
+
+
+def traced(tx, rx, *paths):
+    """Return links with paths (transmitter, receiver, complex gain, vertices)."""
+    tx, rx = np.array(tx, dtype=float), np.array(rx, dtype=float).reshape(-1, 3)
+    shape = (len(rx),) if tx.ndim == 1 else (len(tx), len(rx))
+    interactions = np.zeros((len(paths), DEPTH), dtype=np.uint8)
+    vertices_m = np.full((len(paths), DEPTH, 3), np.nan)
+    for number, (_, _, _, vertices) in enumerate(paths):
+        interactions[number, : len(vertices)] = 1
+        vertices_m[number, : len(vertices)] = np.reshape(vertices, (-1, 3))
+    return TracedLinks(
+        tx=tx,
+        rx=rx,
+        link_state=np.zeros(shape, dtype=np.uint8),
+        gain_db=np.full(shape, GAIN_FLOOR_DB),
+        path_tx=np.array([path[0] for path in paths], dtype=np.int32),
+        path_rx=np.array([path[1] for path in paths], dtype=np.int32),
+        a=np.array([path[2] for path in paths], dtype=complex),
+        delay_s=np.zeros(len(paths)),
+        departure_rad=np.zeros((len(paths), 2)),
+        arrival_rad=np.zeros((len(paths), 2)),
+        interactions=interactions,
+        vertices_m=vertices_m,
+        settings=TraceSettings(),
+        scene_settings=SceneSettings(),
+    )
+
+
+def of_paths(*paths, partial=HALF, rx=FAR):
+    """Return the context of one link with paths (complex gain, vertices)."""
+    return link_context(partial, traced(TX, [rx], *((0, 0, a, vertices) for a, vertices in paths)))
+
+
+def gains_db(power, crossed_m):
+    """Return the gain at each reach of paths that cross so much unobserved space."""
+    power, crossed_m = np.array(power), np.array(crossed_m)
+    totals = []
+    for reach in REACHES_M:
+        kept = (crossed_m == 0.0) if reach == 0.0 else np.exp(-crossed_m / reach)
+        totals.append((power * kept).sum())
+    return [max(10 * math.log10(total), -150.0) if total else -150.0 for total in totals]
+
+
+def test_reaches_go_from_all_paths_to_those_wholly_observed():
+    assert REACHES_M[0] == math.inf
+    assert REACHES_M[-1] == 0.0
+    assert list(REACHES_M) == sorted(REACHES_M, reverse=True)
+
+
+class TestPaths:
+    @pytest.mark.parametrize(
+        ("rx", "vertices", "crossed_m"),
+        [
+            (NEAR, [(3.0, 4.0, 1.5)], 0.0),
+            (NEAR, [(9.5, 2.5, 1.5)], 8.0),  # there and back through four unknown cells
+            (NEAR, [(6.5, 2.5, 1.5)], 3.0),
+            (FAR, [(9.5, 2.5, 1.5)], 4.0 + 1.5),
+            (FAR, [(3.5, 2.5, 1.5), (2.5, 2.5, 1.5)], 2.5),
+            (FAR, [(6.5, 2.5, 1.5), (3.5, 2.5, 1.5), (6.5, 2.5, 1.5), (2.5, 2.5, 1.5)], 3 * 1.5 + 1.5 + 2.5),
+            (FAR, [(3.5, 2.5, 0.0)], 2.5 * math.hypot(4.0, 1.5) / 4.0),  # on the floor
+            (FAR, [(5.5, 4.0, 1.5)], math.hypot(4.0, 1.5) / 8.0 + math.hypot(2.0, 1.5)),
+        ],
+        ids=str,
+    )
+    def test_unobserved_length_of_one_path_by_hand(self, rx, vertices, crossed_m):
+        found = of_paths((0.01, vertices), rx=rx)
+        assert found.strongest_unobserved_m == pytest.approx([crossed_m], abs=1e-9)
+        assert found.indirect_gain_db[0] == pytest.approx(gains_db([1e-4], [crossed_m]), abs=1e-9)
+
+    def test_powers_add_up_whatever_the_phases(self):
+        above, behind = [(3.0, 4.0, 1.5)], [(6.5, 2.5, 1.5)]
+        found = of_paths((0.01, above), (-0.02j, behind), (0.003 + 0.004j, behind), rx=NEAR)
+        expected = gains_db([1e-4, 4e-4, 0.25e-4], [0.0, 3.0, 3.0])
+        assert found.indirect_gain_db[0] == pytest.approx(expected, abs=1e-9)
+        assert expected[-1] == pytest.approx(-40.0)
+
+    @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+    def test_strongest_path(self, order):
+        paths = [(0.01, [(3.0, 4.0, 1.5)]), (-0.02j, [(6.5, 2.5, 1.5)]), (0.0199, [(9.5, 2.5, 1.5)])]
+        found = of_paths(*(paths[index] for index in order), rx=NEAR)
+        assert found.strongest_unobserved_m == pytest.approx([3.0], abs=1e-9)
+
+    def test_direct_path_is_left_out(self):
+        bounced = (1e-4, [(6.5, 2.5, 1.5)])
+        assert same(of_paths((0.5, []), bounced, rx=NEAR), of_paths(bounced, rx=NEAR))
+
+    @pytest.mark.parametrize("paths", [[], [(0.5, [])]])
+    @pytest.mark.parametrize("partial", [HALF, WHOLE])
+    def test_no_path_but_the_direct_one(self, paths, partial):
+        found = of_paths(*paths, partial=partial)
+        assert found.indirect_gain_db.tolist() == [[GAIN_FLOOR_DB] * len(REACHES_M)]
+        assert found.strongest_unobserved_m.tolist() == [6.0]
+
+    def test_a_faint_path_is_at_the_floor(self):
+        assert of_paths((1e-9, [(3.0, 4.0, 1.5)]), rx=NEAR).indirect_gain_db.tolist() == [[-150.0] * len(REACHES_M)]
+
+    def test_rounding_at_the_border_of_the_unknown_hides_no_path(self):
+        found = of_paths((0.01, [(5.0 + 1e-5, 2.5, 1.5)]), rx=NEAR)
+        assert found.indirect_gain_db[0, -1] == pytest.approx(-40.0)
+        assert of_paths((0.01, [(5.01, 2.5, 1.5)]), rx=NEAR).indirect_gain_db[0, -1] == GAIN_FLOOR_DB
+
+    def test_on_a_complete_map_every_reach_is_the_same(self):
+        found = of_paths((0.01, [(9.5, 2.5, 1.5)]), (0.02, [(12.0, 9.0, 1.5)]), partial=WHOLE)
+        assert found.indirect_gain_db[0] == pytest.approx([10 * math.log10(5e-4)] * len(REACHES_M))
+        assert found.strongest_unobserved_m.tolist() == [0.0]
+
+    @given(st.integers(0, 2**32))
+    def test_random_paths_leg_by_leg(self, seed):
+        rng = np.random.default_rng(seed)
+        paths = []
+        for _ in range(int(rng.integers(0, 6))):
+            vertices = rng.uniform((0.0, 0.0, 0.0), (10.0, 5.0, 3.0), (int(rng.integers(1, DEPTH + 1)), 3))
+            paths.append((complex(*rng.normal(size=2)) * 1e-3, vertices))
+        found = of_paths(*paths)
+        crossed_m = [
+            unobserved_lengths_m(HALF, np.array([TX, *vertices]), np.array([*vertices, FAR])).sum()
+            for _, vertices in paths
+        ]
+        power = [abs(a) ** 2 for a, _ in paths]
+        assert found.indirect_gain_db[0] == pytest.approx(gains_db(power, crossed_m), abs=1e-6)
+        assert (np.diff(found.indirect_gain_db[0]) <= 1e-9).all()
+        expected_m = crossed_m[int(np.argmax(power))] if paths else 6.0
+        assert found.strongest_unobserved_m == pytest.approx([expected_m], abs=1e-9)
+
+    @pytest.mark.parametrize(("resolution_m", "origin_m"), [(0.1, (0.0, 0.0)), (0.25, (-7.0, 300.5))])
+    def test_other_resolutions_and_origins(self, resolution_m, origin_m):
+        def placed(place):
+            return np.array(place) * resolution_m + (*origin_m, 0.0)
+
+        partial = room(resolution_m, origin_m)
+        links = traced(placed(TX), [placed(FAR)], (0, 0, 0.01, [placed((9.5, 2.5, 1.5))]))
+        crossed_m = 5.5 * resolution_m
+        found = link_context(partial, links)
+        assert found.strongest_unobserved_m == pytest.approx([crossed_m], abs=1e-6)
+        assert found.indirect_gain_db[0] == pytest.approx(gains_db([1e-4], [crossed_m]), abs=1e-4)
+
+
+class TestLinks:
+    PATHS = (
+        (0, 0, 0.01, [(9.5, 2.5, 1.5)]),
+        (0, 1, 0.02, [(3.0, 4.0, 1.5)]),
+        (1, 0, 0.03, [(6.5, 2.5, 1.5)]),
+        (1, 2, 0.04, []),
+        (1, 2, 0.05, [(3.0, 4.0, 1.5)]),
+    )
+    TXS = (TX, (2.5, 1.5, 2.0))
+    RXS = (FAR, NEAR, (3.5, 3.5, 1.0))
+
+    def test_several_transmitters_one_after_the_other(self):
+        both = link_context(HALF, traced(self.TXS, self.RXS, *self.PATHS))
+        parts = []
+        for index, tx in enumerate(self.TXS):
+            mine = [(0, *path[1:]) for path in self.PATHS if path[0] == index]
+            parts.append(link_context(HALF, traced(tx, self.RXS, *mine)))
+        assert same(both, LinkContext.concatenate(parts))
+        assert both.tx_m.tolist() == [list(tx) for tx in self.TXS for _ in self.RXS]
+        assert both.rx_m.tolist() == [list(rx) for rx in self.RXS] * 2
+        assert both.maps == (HALF,)
+        assert len(both) == 6
+
+    def test_a_link_does_not_know_of_the_others(self):
+        both = link_context(HALF, traced(self.TXS, self.RXS, *self.PATHS))
+        alone = link_context(HALF, traced(self.TXS[1], [self.RXS[2]], *((0, 0, *path[2:]) for path in self.PATHS[3:])))
+        assert same(both.take(slice(5, 6)), alone)
+
+    @pytest.mark.parametrize("tx", [TX, TXS])
+    def test_no_receivers(self, tx):
+        found = link_context(HALF, traced(tx, []))
+        assert len(found) == 0
+        assert found.indirect_gain_db.shape == (0, len(REACHES_M))
+        assert found.tx_seen.shape == found.complete.shape == (0,)
+
+    def test_with_the_direct_path_it_is_the_gain_of_the_trace(self):
+        partial = room(0.5, unknown_from=7)
+        rx = np.array([(1.2, 1.4, 1.5), (3.1, 0.9, 1.2), (4.2, 1.6, 1.5)])
+        links = trace_links(partial, (0.8, 0.7, 1.5), rx, settings=TraceSettings(max_depth=2))
+        found = link_context(partial, links)
+        direct = ~links.interactions.any(axis=1)
+        power = np.bincount(links.path_rx[direct], np.abs(links.a[direct]) ** 2, minlength=3)
+        total_db = 10 * np.log10(power + 10 ** (found.indirect_gain_db[:, 0] / 10))
+        np.testing.assert_allclose(total_db, links.gain_db, atol=1e-6)
+        assert (found.indirect_gain_db[:, 0] > found.indirect_gain_db[:, -1]).any()
+        assert direct.sum() == 3
+
+
+def same(first, second):
+    names = ("tx_m", "rx_m", "indirect_gain_db", "strongest_unobserved_m")
+    pairs = [(getattr(first, name), getattr(second, name)) for name in names]
+    maps = [[each.maps[number] for number in each.map_index] for each in (first, second)]
+    return maps[0] == maps[1] and all(np.array_equal(one, other) for one, other in pairs)
+
+
+def context_of(count=3, partial=HALF, tx=TX, rx=NEAR):
+    tx_m, rx_m = (np.broadcast_to(np.array(place, dtype=float), (count, 3)) for place in (tx, rx))
+    gain_db = np.arange(count * len(REACHES_M), dtype=float).reshape(count, -1) - 140.0
+    return LinkContext((partial,), np.zeros(count, dtype=np.int64), tx_m, rx_m, gain_db, np.arange(count) / 2)
+
+
+class TestTakeAndConcatenate:
+    @pytest.mark.parametrize("index", [slice(1, 3), np.array([2, 0]), np.array([True, False, True])], ids=str)
+    def test_take(self, index):
+        some = context_of(3).take(index)
+        assert some.strongest_unobserved_m.tolist() == context_of(3).strongest_unobserved_m[index].tolist()
+        assert some.indirect_gain_db.tolist() == context_of(3).indirect_gain_db[index].tolist()
+        assert len(some) == 2
+
+    def test_maps_are_shared(self):
+        one, two = context_of(2), context_of(3, partial=WHOLE)
+        both = LinkContext.concatenate([one, two, one.take(slice(1)), two.take(np.array([2]))])
+        assert [id(each) for each in both.maps] == [id(HALF), id(WHOLE)]
+        assert both.map_index.tolist() == [0, 0, 1, 1, 1, 0, 1]
+        assert both.take(slice(2, 5)).maps is both.maps
+        assert same(both.take(slice(2, 5)), two)
+        again = LinkContext.concatenate([both.take(np.array([3])), both])
+        assert again.maps == both.maps
+        assert again.map_index.tolist() == [1, *both.map_index]
+
+    def test_order_of_maps_is_that_of_their_links_parts(self):
+        both = LinkContext.concatenate([context_of(1, partial=WHOLE), context_of(1), context_of(1, partial=WHOLE)])
+        assert both.maps == (WHOLE, HALF)
+        assert both.map_index.tolist() == [0, 1, 0]
+
+    def test_nothing(self):
+        with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkContext\."):
+            LinkContext.concatenate([])
+
+
+class TestSeen:
+    @pytest.mark.parametrize(
+        ("place", "seen"),
+        [
+            ((4.5, 2.5, 1.5), True),
+            ((5.5, 2.5, 1.5), False),
+            ((5.0, 2.5, 1.5), True),  # on the border, in the freer cell
+            ((9.5, 2.5, 1.5), True),  # inside a wall
+            ((9.0, 2.5, 1.5), False),  # between a wall and the unknown
+            ((0.5, 0.0, 1.5), False),  # on the border of the map, a wall inside and unknown outside
+            ((-0.5, 2.5, 1.5), False),
+            ((100.0, 2.5, 1.5), False),
+        ],
+        ids=str,
+    )
+    def test_by_hand(self, place, seen):
+        assert context_of(2, rx=place).rx_seen.tolist() == [seen, seen]
+        assert context_of(2, tx=place).tx_seen.tolist() == [seen, seen]
+        assert context_of(1, rx=place).tx_seen.tolist() == [True]
+
+    def test_free_cells_at_the_border_of_the_map(self):
+        bare = PartialMap(np.full((2, 2), FREE), 1.0)
+        assert context_of(1, partial=bare, rx=(2.0, 2.0, 1.0)).rx_seen.tolist() == [True]
+        assert context_of(1, partial=bare, rx=(2.1, 2.0, 1.0)).rx_seen.tolist() == [False]
+
+    def test_each_link_on_its_own_map(self):
+        both = LinkContext.concatenate([context_of(1, rx=FAR), context_of(2, rx=FAR, partial=WHOLE)])
+        assert both.rx_seen.tolist() == [False, True, True]
+        assert both.tx_seen.tolist() == [True, True, True]
+        assert both.complete.tolist() == [False, True, True]
+        assert both.take(np.array([2, 0])).rx_seen.tolist() == [True, False]
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"tx_m": np.zeros(3)}, "tx_m has shape (3,): give (3, 3), a row for each link."),
+            ({"rx_m": np.zeros((2, 3))}, "rx_m has shape (2, 3): give (3, 3), a row for each link."),
+            ({"indirect_gain_db": np.zeros((3, 2))}, "indirect_gain_db has shape (3, 2): give (3, 5), a row for each"),
+            ({"strongest_unobserved_m": np.zeros(4)}, "strongest_unobserved_m has shape (4,): give (3,), a row for"),
+            (
+                {"map_index": np.array([0, 1, 0])},
+                "map_index[1] = 1 is not allowed: give places in maps, which has 1, from 0.",
+            ),
+            ({"map_index": np.array([0, 0, -1])}, "map_index[2] = -1 is not allowed: give places in maps"),
+            ({"maps": ()}, "map_index[0] = 0 is not allowed: give places in maps, which has 0"),
+        ],
+    )
+    def test_bad_arrays(self, change, message):
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            dataclasses.replace(context_of(3), **change)

@@ -1,0 +1,241 @@
+"""How much of segments runs through unknown cells: by hand, in exact fractions, and by its properties."""
+
+from fractions import Fraction
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sionna_partial.constants import CellState
+from sionna_partial.learning.unobserved import unknown_shares, unobserved_lengths_m
+from sionna_partial.maps.partial_map import PartialMap
+
+SYMBOLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
+FREE, WALL, UNKNOWN = (int(state) for state in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
+
+
+def drawn(text, resolution_m=1.0, origin_m=(0.0, 0.0)):
+    """Return the map of an ASCII drawing, top line = largest y."""
+    rows = [[SYMBOLS[symbol] for symbol in line.strip()] for line in text.split()][::-1]
+    return PartialMap(np.array(rows), resolution_m, origin_m)
+
+
+HALF = drawn("""
+    ##########
+    #....????#
+    #....????#
+    #....????#
+    ##########
+""")
+
+
+def length_m(partial, start, end):
+    return unobserved_lengths_m(partial, np.array([start], dtype=float), np.array([end], dtype=float))[0]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "expected_m"),
+    [
+        ((1.5, 2.5, 1.5), (4.5, 2.5, 1.5), 0.0),
+        ((1.5, 2.5, 1.5), (7.5, 2.5, 1.5), 2.5),
+        ((6.5, 2.5, 1.5), (7.5, 2.5, 1.5), 1.0),
+        ((1.5, 2.5, 1.5), (9.5, 2.5, 1.5), 4.0),
+        ((3.5, 1.5, 1.5), (6.5, 3.5, 1.5), np.hypot(3, 2) / 2),
+        ((3.0, 2.5, 0.5), (7.0, 2.5, 2.5), np.sqrt(20) / 2),
+        ((6.5, 2.5, 0.5), (6.5, 2.5, 2.0), 1.5),
+        ((2.5, 2.5, 0.5), (2.5, 2.5, 2.0), 0.0),
+        ((6.5, 2.5, 1.5), (6.5, 2.5, 1.5), 0.0),
+        ((0.0, 2.5, 1.5), (12.0, 2.5, 1.5), 6.0),
+        ((-5.0, -1.0, 1.5), (12.0, -1.0, 1.5), 17.0),
+        ((-5.0, 2.5, 1.5), (-3.0, 2.5, 1.5), 2.0),
+        ((-1.0, 2.5, 1.5), (11.0, 2.5, 1.5), 6.0),
+    ],
+    ids=str,
+)
+def test_length_by_hand(start, end, expected_m):
+    assert length_m(HALF, start, end) == pytest.approx(expected_m, abs=1e-12)
+
+
+def test_diagonal_through_corners_by_hand():
+    chess = drawn("""
+        ?.
+        .?
+    """)
+    assert length_m(chess, (0.0, 0.0, 1.0), (2.0, 2.0, 1.0)) == pytest.approx(0.0, abs=1e-9)
+    assert length_m(chess, (0.0, 2.0, 1.0), (2.0, 0.0, 1.0)) == pytest.approx(np.sqrt(8), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("below", "above", "expected_m"),
+    [(".", "?", 0.0), ("?", ".", 0.0), ("#", "?", 1.0), ("?", "#", 1.0), ("#", "#", 0.0), ("?", "?", 1.0)],
+)
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (0.1, 0.7)])
+@pytest.mark.parametrize("upright", [False, True])
+def test_segment_along_a_border_is_in_the_freest_cell(below, above, expected_m, origin_m, upright):
+    partial = drawn(f"?{above}?\n?{below}?", 0.1, origin_m)
+    ends = np.array([[0.1, 0.1], [0.2, 0.1]])
+    if upright:
+        partial, ends = PartialMap(partial.state.T, 0.1, origin_m), ends[:, ::-1]
+    found = length_m(partial, *np.column_stack([ends + origin_m, [1.0, 1.0]]))
+    assert found == pytest.approx(0.1 * expected_m, abs=1e-6)
+
+
+def test_zero_everywhere_on_a_complete_map():
+    room = drawn("""
+        ?????
+        ?###?
+        ?#.#?
+        ?###?
+        ?????
+    """)
+    assert room.is_complete
+    ends = np.array([(0.5, 0.5, 1.0), (2.5, 2.4, 1.0), (9.0, 9.0, 1.0)])
+    assert unobserved_lengths_m(room, np.array([2.5, 2.5, 1.0]), ends).tolist() == [0.0, 0.0, 0.0]
+
+
+def test_everything_on_an_unknown_map():
+    nothing = PartialMap(np.full((4, 6), CellState.UNKNOWN), 0.5)
+    starts, ends = np.random.default_rng(0).uniform(0.1, 1.9, (2, 50, 3))
+    lengths_m = np.linalg.norm(ends - starts, axis=1)
+    np.testing.assert_allclose(unobserved_lengths_m(nothing, starts, ends), lengths_m, rtol=1e-12)
+
+
+def test_no_segments():
+    assert unobserved_lengths_m(HALF, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+    assert unobserved_lengths_m(HALF, np.zeros(3), np.zeros((0, 3))).shape == (0,)
+
+
+def test_segments_do_not_know_of_each_other():
+    starts, ends = np.random.default_rng(1).uniform((-1.0, -1.0, 0.0), (11.0, 6.0, 3.0), (2, 200, 3))
+    together = unobserved_lengths_m(HALF, starts, ends)
+    assert together.tolist() == [length_m(HALF, *pair) for pair in zip(starts, ends, strict=True)]
+    one = unobserved_lengths_m(HALF, starts[0], ends)
+    assert one.tolist() == unobserved_lengths_m(HALF, np.tile(starts[0], (200, 1)), ends).tolist()
+    assert one.tolist() == pytest.approx(unobserved_lengths_m(HALF, ends, starts[0]).tolist(), abs=1e-9)
+
+
+grids = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.integers(0, 2))
+thousandths = st.integers(-2_000, 11_000) | st.integers(-2, 11).map(lambda cells: 1_000 * cells)
+cells = st.tuples(thousandths, thousandths)
+"""Places in thousandths of a cell, many of them on the border of cells."""
+
+
+def shares(state, *pairs):
+    """Return the unknown share of segments between places in thousandths of a cell."""
+    starts, ends = (np.array(places) / 1_000 for places in zip(*pairs, strict=True))
+    return unknown_shares(state, starts, ends)
+
+
+def is_unknown(state, x, y):
+    """Whether the freest of the cells that hold a point is unknown."""
+    columns, rows = ({value.__floor__(), value.__ceil__() - 1} for value in (x, y))
+    ny, nx = state.shape
+    inside = product(rows, columns)
+    found = {int(state[row, column]) if 0 <= row < ny and 0 <= column < nx else UNKNOWN for row, column in inside}
+    return FREE not in found and UNKNOWN in found
+
+
+def exact_share(state, start, end):
+    """Return the unknown share of a segment in exact fractions: between two grid lines it is in one cell."""
+    places = [Fraction(place, 1_000) for place in start]
+    steps = [Fraction(there - here, 1_000) for here, there in zip(start, end, strict=True)]
+    met = {Fraction(0), Fraction(1)}
+    for place, step in zip(places, steps, strict=True):
+        met |= {(line - place) / step for line in range(-3, 13) if step}
+    share = Fraction(0)
+    for here, there in pairwise(sorted(each for each in met if 0 <= each <= 1)):
+        if is_unknown(state, *(place + (here + there) / 2 * step for place, step in zip(places, steps, strict=True))):
+            share += there - here
+    return float(share)
+
+
+@settings(max_examples=1000)
+@given(grids, cells, cells)
+def test_exact(state, start, end):
+    assert shares(state, (start, end))[0] == pytest.approx(exact_share(state, start, end), abs=1e-9)
+
+
+@settings(max_examples=200)
+@given(grids, cells, cells)
+def test_adds_up_over_two_halves(state, start, end):
+    start, end = ([2 * (number // 2) for number in place] for place in (start, end))
+    middle = [(here + there) // 2 for here, there in zip(start, end, strict=True)]
+    whole, first, second = shares(state, (start, end), (start, middle), (middle, end))
+    assert whole == pytest.approx((first + second) / 2, abs=1e-9)
+
+
+@settings(max_examples=200)
+@given(grids, cells, cells)
+def test_same_both_ways_to_rounding(state, start, end):
+    there, back = shares(state, (start, end), (end, start))
+    assert there == pytest.approx(back, abs=1e-9)
+
+
+@given(grids, cells, cells)
+def test_turned_and_mirrored_maps(state, start, end):
+    (x0, y0), (x1, y1) = start, end
+    width = 1_000 * state.shape[1]
+    found = shares(state, (start, end))[0]
+    assert shares(state.T.copy(), ((y0, x0), (y1, x1)))[0] == pytest.approx(found, abs=1e-9)
+    assert shares(state[:, ::-1].copy(), ((width - x0, y0), (width - x1, y1)))[0] == pytest.approx(found, abs=1e-9)
+
+
+places = st.tuples(st.floats(-0.3, 1.3), st.floats(-0.3, 1.3), st.floats(0.0, 3.0))
+
+
+def scaled(partial, place):
+    """Return the world point of a place in fractions of the map."""
+    x0, y0, x1, y1 = partial.bounds_m
+    return np.array([x0 + place[0] * (x1 - x0), y0 + place[1] * (y1 - y0), place[2]])
+
+
+@given(grids, places, places)
+def test_between_zero_and_length(state, start, end):
+    partial = PartialMap(state, 0.3)
+    start_m, end_m = scaled(partial, start), scaled(partial, end)
+    assert 0.0 <= length_m(partial, start_m, end_m) <= np.linalg.norm(end_m - start_m)
+
+
+@given(grids, places, places, st.data())
+def test_revealing_cells_never_raises_it(state, start, end, data):
+    seen = data.draw(hnp.arrays(np.uint8, state.shape, elements=st.sampled_from([FREE, WALL, UNKNOWN, UNKNOWN])))
+    revealed = np.where(state == CellState.UNKNOWN, seen, state)
+    before, after = PartialMap(state, 0.3), PartialMap(revealed, 0.3)
+    assume(not before.is_complete)
+    start_m, end_m = scaled(before, start), scaled(before, end)
+    assert length_m(after, start_m, end_m) <= length_m(before, start_m, end_m) + 1e-9
+
+
+@given(grids, places, places)
+def test_same_both_ways(state, start, end):
+    partial = PartialMap(state, 0.3)
+    start_m, end_m = scaled(partial, start), scaled(partial, end)
+    there_m = length_m(partial, start_m, end_m)
+    assert length_m(partial, end_m, start_m) == pytest.approx(there_m, abs=1e-5)
+
+
+@given(grids, places, places)
+def test_moving_the_map_changes_nothing(state, start, end):
+    shift = (500_000.0, 4_500_000.0, 0.0)
+    here, there = PartialMap(state, 0.25), PartialMap(state, 0.25, origin_m=shift[:2])
+    start_m, end_m = scaled(here, start), scaled(here, end)
+    moved_m = length_m(there, start_m + shift, end_m + shift)
+    assert moved_m == pytest.approx(length_m(here, start_m, end_m), abs=1e-5)
+
+
+@settings(max_examples=30)
+@given(grids, places, places)
+def test_agrees_with_dense_samples(state, start, end):
+    partial = PartialMap(state, 0.3)
+    assume(not partial.is_complete)
+    start_m, end_m = scaled(partial, start), scaled(partial, end)
+    count = 4000
+    samples = start_m + (np.arange(count)[:, None] + 0.5) / count * (end_m - start_m)
+    share = (partial.state_at(samples) == CellState.UNKNOWN).mean()
+    whole_m = np.linalg.norm(end_m - start_m)
+    crossings = sum(state.shape) + 2
+    tolerance_m = crossings * whole_m / count + 1e-9
+    assert length_m(partial, start_m, end_m) == pytest.approx(share * whole_m, abs=tolerance_m)

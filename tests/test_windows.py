@@ -1,0 +1,280 @@
+"""Windows around transmitters, against a reckoning with every cell of the map and every cell of the window."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from sionna_partial.constants import CellState
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.learning.windows import (
+    CELL_M,
+    CHANNELS,
+    WINDOW_CELLS,
+    plan_windows,
+    transmitter_window,
+    transmitter_windows,
+    window_places,
+)
+from sionna_partial.maps.partial_map import PartialMap
+
+FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+SHAPE = (WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
+HALF_M = WINDOW_CELLS * CELL_M / 2
+ROUNDING = 0.51 / 255
+TX_M = np.array([0.0, 0.0])
+FLOOR = (PartialMap(np.zeros((1, 1), dtype=np.uint8), 1.0),)
+
+
+def channel(window, name):
+    """Return a channel of a window, in [0, 1]."""
+    return window[..., CHANNELS.index(name)] / 255
+
+
+def assert_alike(first, second):
+    """Check that two windows are equal, but for rounding to the 255th above or below."""
+    np.testing.assert_allclose(first.astype(int), second.astype(int), rtol=0, atol=1)
+    assert np.mean(first != second) < 0.02
+
+
+def middles_m(tx_m):
+    """Return the centres (WINDOW_CELLS**2, 2) of the cells of a window, row by row [m]."""
+    offsets = (np.arange(WINDOW_CELLS) + 0.5) * CELL_M - HALF_M
+    x, y = np.meshgrid(tx_m[0] + offsets, tx_m[1] + offsets)
+    return np.column_stack([x.ravel(), y.ravel()])
+
+
+def cells_m(partial, *states):
+    """Return the lower-left corners (K, 2) of the cells in some states [m]."""
+    rows, columns = np.nonzero(np.isin(partial.state, states))
+    return partial.origin_m + np.column_stack([columns, rows]) * partial.resolution_m
+
+
+def covered(partial, tx_m, state):
+    """Return the share of each cell of a window that the map's cells in a state cover, cell by cell."""
+    low = middles_m(tx_m) - CELL_M / 2
+    total = np.zeros(len(low))
+    for corner in cells_m(partial, state):
+        sides = np.minimum(low + CELL_M, corner + partial.resolution_m) - np.maximum(low, corner)
+        total += np.prod(np.maximum(sides, 0.0), axis=1) / CELL_M**2
+    return total.reshape(SHAPE[:2])
+
+
+def crossed(partial, tx_m, *states, wider_m=0.0):
+    """Return the share of each line from the transmitter to a cell of its window inside the map's cells in states.
+
+    Each cell of the map, wider on all sides, cuts its own piece out of each line (Liang and Barsky 1984).
+    """
+    steps = middles_m(tx_m) - tx_m
+    total = np.zeros(len(steps))
+    for corner in cells_m(partial, *states):
+        first, last = (corner - wider_m - tx_m) / steps, (corner + partial.resolution_m + wider_m - tx_m) / steps
+        enter = np.minimum(first, last).max(axis=1).clip(0.0, 1.0)
+        leave = np.maximum(first, last).min(axis=1).clip(0.0, 1.0)
+        total += np.maximum(leave - enter, 0.0)
+    return total.reshape(SHAPE[:2])
+
+
+maps = st.builds(
+    PartialMap,
+    hnp.arrays(np.uint8, st.tuples(st.integers(1, 8), st.integers(1, 8)), elements=st.sampled_from([0, 1, 2])),
+    st.sampled_from([0.05, 0.1, 0.25, 0.3, 0.7, 1.0, 4.0]),
+    st.tuples(st.floats(-100.0, 100.0), st.floats(-100.0, 100.0)),
+)
+shares = st.tuples(st.floats(-1.0, 2.0), st.floats(-1.0, 2.0))
+
+
+def placed(partial, share):
+    """Return the place of a transmitter in fractions of the map, off round numbers [m]."""
+    x0, y0, x1, y1 = partial.bounds_m
+    return np.array([x0 + share[0] * (x1 - x0) + 0.00123, y0 + share[1] * (y1 - y0) + 0.00377])
+
+
+class TestTransmitterWindow:
+    @settings(max_examples=20, deadline=None)
+    @given(maps, shares)
+    def test_shares_of_free_and_wall_are_exact(self, partial, share):
+        tx_m = placed(partial, share)
+        window = transmitter_window(partial, tx_m)
+        assert window.shape == SHAPE
+        assert window.dtype == np.uint8
+        for name, state in (("free", FREE), ("wall", WALL)):
+            expected = covered(partial, tx_m, state)
+            np.testing.assert_allclose(channel(window, name), expected, atol=ROUNDING)
+
+    @settings(max_examples=20, deadline=None)
+    @given(maps, shares)
+    def test_lines_are_exact(self, partial, share):
+        tx_m = placed(partial, share)
+        window = transmitter_window(partial, tx_m)
+        np.testing.assert_allclose(channel(window, "seen"), crossed(partial, tx_m, FREE, WALL), atol=ROUNDING)
+        of_walls, hidden = crossed(partial, tx_m, WALL), channel(window, "hidden")
+        assert set(np.unique(hidden)) <= {0.0, 1.0}
+        sure = (of_walls > 1e-5) | (crossed(partial, tx_m, WALL, wider_m=1e-5) == 0.0)
+        np.testing.assert_array_equal(hidden[sure], of_walls[sure] > 1e-5)
+        assert sure.mean() > 0.9
+
+    @pytest.mark.parametrize("tx_m", [(0.0, 0.0), (0.37, 1.9), (-50.0, 3.0)])
+    def test_nothing_known_gives_nothing(self, tx_m):
+        nothing = PartialMap(np.full((30, 40), UNKNOWN), 0.1, (-1.0, -1.0))
+        assert not transmitter_window(nothing, np.array(tx_m)).any()
+
+    def test_nothing_known_nearby_gives_nothing(self):
+        closet = PartialMap(np.zeros((10, 10), dtype=np.uint8), 0.1)
+        for tx_m in ((HALF_M + 1.1, 0.5), (0.5, -HALF_M - 0.1), (500.0, 500.0)):
+            assert not transmitter_window(closet, np.array(tx_m)).any()
+        assert channel(transmitter_window(closet, np.array([HALF_M + 0.9, 0.5])), "free").sum() > 0.0
+
+    def test_transmitter_is_in_the_middle(self):
+        tile = PartialMap(np.zeros((1, 1), dtype=np.uint8), 2 * CELL_M, (7.0 - CELL_M, -3.0 - CELL_M))
+        free = channel(transmitter_window(tile, np.array([7.0, -3.0])), "free")
+        middle = WINDOW_CELLS // 2
+        assert np.argwhere(free).tolist() == [[middle - 1 + row, middle - 1 + col] for row in (0, 1) for col in (0, 1)]
+
+    def test_row_0_has_the_smallest_y(self):
+        state = np.full((2, 4), UNKNOWN)
+        state[1, 3] = WALL
+        wall = channel(transmitter_window(PartialMap(state, CELL_M), TX_M), "wall")
+        assert np.argwhere(wall).tolist() == [[WINDOW_CELLS // 2 + 1, WINDOW_CELLS // 2 + 3]]
+
+    @pytest.mark.parametrize("resolution_m", [0.05, 0.25, 0.3])
+    @pytest.mark.parametrize("round_place", [0.0, 0.5, None])
+    @pytest.mark.parametrize("padding", [(1, 0, 0, 0), (3, 150, 40, 7)])
+    def test_unknown_cells_around_the_map_change_nothing(self, resolution_m, round_place, padding):
+        """Nor do its lines graze corners to rounding: a transmitter on round numbers has many that meet them."""
+        rng = np.random.default_rng(4)
+        state = rng.choice([FREE, WALL, UNKNOWN], size=(40, 50), p=[0.8, 0.05, 0.15])
+        origin_m = (1.7, -2.3)
+        inner = rng.uniform(size=2) if round_place is None else np.full(2, round_place)
+        tx_m = origin_m + (np.array([21.0, 17.0]) + inner) * resolution_m
+        below, above, left, right = padding
+        grown_state = np.pad(state, ((below, above), (left, right)), constant_values=UNKNOWN)
+        corner_m = (origin_m[0] - left * resolution_m, origin_m[1] - below * resolution_m)
+        one = transmitter_window(PartialMap(state, resolution_m, origin_m), tx_m)
+        two = transmitter_window(PartialMap(grown_state, resolution_m, corner_m), tx_m)
+        assert_alike(two, one)
+
+    @pytest.mark.parametrize("shift_m", [(-3.3, 0.7), (500_000.0, 4_500_000.0)])
+    def test_moving_everything_changes_nothing(self, shift_m):
+        state = np.random.default_rng(5).choice([FREE, WALL, UNKNOWN], size=(60, 60), p=[0.8, 0.05, 0.15])
+        tx_m = np.array([1.525, 1.7])
+        one = transmitter_window(PartialMap(state, 0.05), tx_m)
+        two = transmitter_window(PartialMap(state, 0.05, shift_m), tx_m + shift_m)
+        assert_alike(two, one)
+
+    @pytest.mark.parametrize(("coarse_m", "times"), [(0.5, 2), (0.3, 6)])
+    def test_finer_cells_of_the_same_plan_change_nothing(self, coarse_m, times):
+        state = np.random.default_rng(6).choice([FREE, WALL, UNKNOWN], size=(12, 9), p=[0.7, 0.1, 0.2])
+        fine = np.kron(state, np.ones((times, times), dtype=np.uint8))
+        one = transmitter_window(PartialMap(state, coarse_m), np.array([1.3712, 2.1137]))
+        two = transmitter_window(PartialMap(fine, coarse_m / times), np.array([1.3712, 2.1137]))
+        assert_alike(two, one)
+
+    @pytest.mark.parametrize("resolution_m", [0.05, 0.1, 0.3])
+    @pytest.mark.parametrize("axis", [0, 1])
+    def test_mirrored_map_gives_mirrored_lines(self, resolution_m, axis):
+        state = np.random.default_rng(7).choice([FREE, WALL, UNKNOWN], size=(60, 60), p=[0.9, 0.02, 0.08])
+        corner_m = (-30 * resolution_m, -30 * resolution_m)
+        one = transmitter_window(PartialMap(state, resolution_m, corner_m), TX_M)
+        two = transmitter_window(PartialMap(np.flip(state, axis), resolution_m, corner_m), TX_M)
+        names = [CHANNELS.index(name) for name in ("free", "wall", "seen", "hidden")]
+        assert_alike(np.flip(two, axis)[..., names], one[..., names])
+
+    def test_a_wall_hides_what_is_behind_it_only(self):
+        state = np.full((40, 40), FREE)
+        state[:, 25] = WALL
+        partial = PartialMap(state, CELL_M, (-20 * CELL_M, -20 * CELL_M))
+        window = transmitter_window(partial, TX_M)
+        x = np.arange(WINDOW_CELLS) - WINDOW_CELLS // 2
+        assert not channel(window, "hidden")[:, x < 5].any()
+        near = (x >= -20) & (x < 20)
+        assert channel(window, "hidden")[np.ix_(near, (x >= 5) & near)].all()
+        assert (channel(window, "seen")[np.ix_(near, near)] == 1.0).all()
+
+    def test_detours(self):
+        """None in the open, long out of a closed room, and in between where a way around is known."""
+        state = np.full((WINDOW_CELLS, WINDOW_CELLS), FREE)
+        partial = PartialMap(state, CELL_M, (-HALF_M, -HALF_M))
+        open_detour = channel(transmitter_window(partial, TX_M), "detour")
+        assert not open_detour.any()
+        low, high = WINDOW_CELLS // 2 - 8, WINDOW_CELLS // 2 + 8
+        state[low, low : high + 1] = state[high, low : high + 1] = WALL
+        state[low : high + 1, low] = state[low : high + 1, high] = WALL
+        inside, beyond = np.s_[low + 1 : high, low + 1 : high], np.s_[low + 4 : high - 4, high + 1]
+        shut = channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour")
+        assert not shut[inside].any()
+        assert (shut[beyond] == 1.0).all()
+        state[low + 6 : high - 6, low] = FREE
+        door = channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour")
+        assert not door[inside].any()
+        assert (door[beyond] > 0.0).all()
+        assert (door <= shut).all()
+        assert door.sum() < 0.9 * shut.sum()
+
+
+def context_of(maps, map_index, tx_m, rx_m):
+    count = len(map_index)
+    gains_db = np.full((count, len(REACHES_M)), -90.0)
+    places = (np.array(each, dtype=float).reshape(count, 3) for each in (tx_m, rx_m))
+    return LinkContext(maps, np.array(map_index, dtype=np.int64), *places, gains_db, np.zeros(count))
+
+
+class TestTransmitterWindows:
+    def test_one_for_every_transmitter_on_every_map(self):
+        maps = tuple(PartialMap(np.full((9, 9), state), 0.5) for state in (FREE, WALL))
+        one, other = (1.0, 2.0, 1.5), (3.1, 2.0, 1.5)
+        txs, map_index = [other, one, one, other, (1.0, 2.0, 0.5)], [0, 1, 0, 0, 0]
+        windows, index = transmitter_windows(context_of(maps, map_index, txs, np.zeros((5, 3))))
+        assert windows.shape == (3, *SHAPE)
+        assert windows.dtype == np.uint8
+        assert index.shape == (5,)
+        for number, tx, found in zip(map_index, txs, index, strict=True):
+            np.testing.assert_array_equal(windows[found], transmitter_window(maps[number], np.array(tx[:2])))
+
+    def test_no_links(self):
+        windows, index = transmitter_windows(context_of((), [], [], []))
+        assert windows.shape == (0, *SHAPE)
+        assert index.shape == (0,)
+
+
+class TestPlanWindows:
+    def test_free_and_wall_of_the_windows(self):
+        state = np.random.default_rng(8).choice([FREE, WALL, UNKNOWN], size=(50, 60))
+        maps = (PartialMap(state, 0.1), PartialMap(np.full((2, 2), UNKNOWN), 0.1))
+        context = context_of(maps, [0, 1, 0], [(1.0, 2.0, 1.5), (3.1, 2.0, 1.5), (3.3, 0.1, 1.5)], np.zeros((3, 3)))
+        expected = transmitter_windows(context)[0][..., [CHANNELS.index("free"), CHANNELS.index("wall")]]
+        np.testing.assert_array_equal(plan_windows(context), expected)
+
+    def test_no_links(self):
+        assert plan_windows(context_of((), [], [], [])).shape == (0, WINDOW_CELLS, WINDOW_CELLS, 2)
+
+
+class TestWindowPlaces:
+    def test_by_hand(self):
+        tx = (3.0, -2.0, 1.5)
+        rxs = [tx, (3.0 + CELL_M, -2.0, 0.5), (3.0, -2.0 - 2 * CELL_M, 1.5), (3.0 + 0.3 * CELL_M, -2.0, 1.5)]
+        middle = WINDOW_CELLS / 2
+        found = window_places(context_of(FLOOR, [0] * 4, [tx] * 4, rxs))
+        assert found.dtype == np.float32
+        expected = [(middle, middle), (middle + 1, middle), (middle, middle - 2), (middle + 0.3, middle)]
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+    def test_no_links(self):
+        assert window_places(context_of((), [], [], [])).shape == (0, 2)
+
+    def test_outside_at_the_border(self):
+        rxs = [(100.0, 0.0, 1.5), (-100.0, HALF_M + 0.01, 1.5)]
+        found = window_places(context_of(FLOOR, [0, 0], np.zeros((2, 3)), rxs))
+        assert found.tolist() == [[WINDOW_CELLS - 0.5, WINDOW_CELLS / 2], [0.5, WINDOW_CELLS - 0.5]]
+
+    @settings(max_examples=20, deadline=None)
+    @given(st.floats(-0.98, 0.98), st.floats(-0.98, 0.98))
+    def test_the_cell_is_that_of_the_window(self, x, y):
+        """A wall around a receiver is seen in the cell that holds it."""
+        tx = np.array([5.3, -1.2, 1.5])
+        rx = tx + np.array([x, y, 0.0]) * HALF_M
+        post = PartialMap(np.full((1, 1), WALL), 0.1, tuple(rx[:2] - 0.05))
+        column, row = window_places(context_of((post,), [0], tx, rx))[0]
+        wall = channel(transmitter_window(post, tx[:2]), "wall")
+        assert wall[int(row), int(column)] > 0.0
