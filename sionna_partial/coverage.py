@@ -130,8 +130,8 @@ def predict_map(
         Height of the receivers [m].
     spacing_m : float
         Distance between receivers [m]. Their grid starts half of it inside the lower-left corner of the map.
-    predictor : None, "paper", path or Predictor
-        None is the shipped default, a path one that you saved. On a complete map it is read, but not used.
+    predictor : None, "map", "paper", path or Predictor
+        None is the shipped default, which is "map", a path one that you saved. On a complete map it is read, but not used.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     receivers : {"indoor", "anywhere"}

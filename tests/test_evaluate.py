@@ -8,10 +8,18 @@ from link_tables import fitted_baselines, make_dataset, make_table
 from predictor_links import LOS, OUTAGE, QUIET, quick_predictor
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.predictor import Predictor
+from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.training import evaluate as evaluate_module
 from sionna_partial.training.baselines import Baselines
-from sionna_partial.training.evaluate import ALWAYS_OUTAGE, WITH_INDOOR, WITHOUT_INDOOR, evaluate
+from sionna_partial.training.evaluate import (
+    ALWAYS_OUTAGE,
+    WITH_INDOOR,
+    WITHOUT_INDOOR,
+    evaluate,
+    home_scores,
+    mean_and_error,
+)
+from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.metrics import measure
 
 pytestmark = QUIET
@@ -128,6 +136,37 @@ class TestEvaluate:
         evaluate(trained_on("home 0"), table, baselines=fitted_baselines(), progress=lambda *call: calls.append(call))
         assert calls[0] == (0.0, "measuring on test homes after 0 steps, receivers indoor")
         assert calls[-1] == (0.875, "measuring on train homes after 100 steps, receivers anywhere")
+
+
+class TestHomeScores:
+    def test_each_home_is_measured_by_itself_in_the_order_of_names(self, table):
+        links = table.take(table.home == "home 3")
+        right = dataclasses.replace(links, link_state=links.phi.link_state, gain_db=links.phi.gain_db)
+        third, gain_db = np.arange(len(links)) % 3 == 0, np.full(len(links), -60.0)
+        other = dataclasses.replace(
+            right,
+            home=np.full(len(links), "home 10"),
+            phi=dataclasses.replace(right.phi, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db),
+            link_state=np.where(third, OUTAGE, LOS).astype(np.uint8),
+            gain_db=gain_db + 3.0,
+        )
+        both = LinkTable.concatenate([right, other])
+        accuracies, rmses_db = home_scores(LinkPrediction.of_trace(both.phi), both)
+        expected_db = math.sqrt((90.0**2 + 2 * 3.0**2) / 3)
+        np.testing.assert_allclose(accuracies, [2 / 3, 1.0])
+        np.testing.assert_allclose(rmses_db, [expected_db, 0.0], atol=1e-9)
+
+
+class TestMeanAndError:
+    def test_error_of_a_mean(self):
+        mean, error = mean_and_error(np.array([1.0, 2.0, 3.0, 6.0]))
+        assert mean == 3.0
+        assert error == pytest.approx(math.sqrt(14.0 / 3.0 / 4.0))
+
+    def test_one_home_has_a_mean_without_error(self):
+        mean, error = mean_and_error(np.array([0.5]))
+        assert mean == 0.5
+        assert math.isnan(error)
 
 
 class TestPaper:

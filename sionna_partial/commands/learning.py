@@ -105,7 +105,7 @@ def train(
     networks: Annotated[
         Networks, typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around.")
     ] = Networks.MAP,
-    passes: Annotated[int, typer.Option(help="How many times the networks beside the paper's see the links.")] = 20,
+    passes: Annotated[int, typer.Option(help="How many times the networks beside the paper's see the links.")] = 15,
     seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = 0,
 ) -> None:
     """Train a predictor, and test it on other homes.
@@ -136,7 +136,7 @@ def train(
 def evaluate(
     folder: DatasetArgument,
     out: Annotated[Path, typer.Option(metavar="REPORT", help="Folder for the report.", show_default=False)],
-    predictor: Annotated[str, typer.Option(metavar="NAME|FILE", help="'paper', or a .keras file.")] = "paper",
+    predictor: Annotated[str, typer.Option(metavar="NAME|FILE", help="'map', 'paper', or a .keras file.")] = "map",
 ) -> None:
     """Judge a predictor beside simpler answers.
 

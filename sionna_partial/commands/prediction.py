@@ -39,7 +39,7 @@ def predict(
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
-    predictor: Annotated[str, typer.Option(help="'paper', or a .keras file. Default: the shipped one.")] = "",
+    predictor: Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")] = "",
     receivers: Annotated[
         str, typer.Option(metavar="indoor|anywhere", help="Given that receivers are indoors, or outside in outage.")
     ] = "indoor",

@@ -38,7 +38,7 @@ PLAN_CHANNELS = 2
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
 
-_WIDTHS = (16, 24, 32, 48)
+_WIDTHS = (16, 32, 48, 64)
 _HIDDEN_UNITS = 64
 _LOS_OFFSET_DB, _NLOS_OFFSET_DB = 2.0, -25.0
 _LOS_SCALE_DB, _NLOS_SCALE_DB = 10.0, 20.0

@@ -359,8 +359,8 @@ class Predictor:
 
         Parameters
         ----------
-        name_or_path : None, "paper" or path-like
-            The shipped default, the paper's predictor, or the `.keras` file of your own.
+        name_or_path : None, "map", "paper" or path-like
+            The shipped default, which is "map", the paper's predictor, or the `.keras` file of your own.
 
         Returns
         -------

@@ -1,5 +1,9 @@
 """How much of straight lines has not been observed: the grid integral behind d_unobs (paper, Section III-C)."""
 
+import itertools
+import os
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -14,6 +18,9 @@ _BORDER_CELLS = 1e-6
 
 _ALONG_CELLS = 1e-3
 """Extent along one axis below which a segment may run along the border of cells [cells]."""
+
+_SEGMENTS_OF_CORE = 20_000
+"""Number of segments that are worth another core."""
 
 
 def unobserved_lengths_m(
@@ -44,15 +51,24 @@ def unobserved_lengths_m(
     return unknown_shares(partial.state, starts, ends) * np.linalg.norm(end_m - start_m, axis=1)
 
 
-@njit(cache=True)
 def unknown_shares(
     state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] that are unknown."""
     shares = np.empty(len(ends))
+    bounds = np.linspace(0, len(ends), 1 + min(len(os.sched_getaffinity(0)), 1 + len(ends) // _SEGMENTS_OF_CORE))
+    blocks = [slice(int(low), int(high)) for low, high in itertools.pairwise(bounds)]
+    with ThreadPoolExecutor(len(blocks)) as pool:
+        list(pool.map(lambda block: _fill_shares(state, starts[block], ends[block], shares[block]), blocks))
+    return shares
+
+
+@njit(cache=True, nogil=True)
+def _fill_shares(
+    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64], shares: NDArray[np.float64]
+) -> None:
     for i in range(len(ends)):
         shares[i] = _unknown_share(state, starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
-    return shares
 
 
 @njit(cache=True)

@@ -143,15 +143,18 @@ def _overlaps(edges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
 def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
     """How much longer the way around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR_M`.
 
-    Ways go from cell to cell, also across corners. Walls are crossed at a price.
+    Ways go from the four cells in the middle from cell to cell, also across corners. Walls are crossed at a price.
     """
     ends, lengths = _steps()
-    cost = (1.0 + _WALL_COST * wall).ravel()
-    weights = lengths * 0.5 * (cost[ends[0]] + cost[ends[1]])
+    half = WINDOW_CELLS // 2
+    middle = np.s_[half - 1 : half + 1, half - 1 : half + 1]
+    cost = 1.0 + _WALL_COST * wall
+    cost[middle] = 1.0
+    weights = lengths * 0.5 * (cost.ravel()[ends[0]] + cost.ravel()[ends[1]])
     ways = csr_array((weights, ends), shape=(cost.size, cost.size))
-    middle = WINDOW_CELLS // 2
-    costs = dijkstra(ways, directed=False, indices=middle * WINDOW_CELLS + middle).reshape(wall.shape)
-    offsets = np.abs(np.arange(WINDOW_CELLS) - middle)
+    start = np.arange(cost.size).reshape(cost.shape)[middle].ravel()
+    costs = dijkstra(ways, directed=False, indices=start, min_only=True).reshape(wall.shape)
+    offsets = np.abs(np.arange(WINDOW_CELLS) - half + 0.5) - 0.5
     short, long = np.minimum.outer(offsets, offsets), np.maximum.outer(offsets, offsets)
     straight = long + (math.sqrt(2.0) - 1.0) * short
     return np.clip((costs - straight) * CELL_M / _LONGEST_DETOUR_M, 0.0, 1.0)

@@ -41,8 +41,11 @@ WIDE_M = (1.2, 2.5)
 LOCKED_SHARE = 0.25
 """Share of the rooms at dead ends that stay locked, on average."""
 
-SHUT_SHARE = 0.4
+SHUT_SHARE = 0.9
 """Share of the homes in which locked rooms are free all the same, out of reach, as on scans of real homes."""
+
+SHUT_AREA = 0.2
+"""Largest area of all such rooms of a home, as a share of the area within reach."""
 
 LEAF_SHARE = 0.2
 """Share of the doors whose leaf stands open into a room."""
@@ -137,7 +140,7 @@ class _Plan:
     """One home: free area, locked rooms, wall lines; how far walls and furniture swell [m], its share, and waves."""
 
     free: Polygon
-    shut: shapely.Geometry
+    shut: shapely.GeometryCollection
     lines: shapely.Geometry
     swelling_m: float
     raggedness: float
@@ -168,9 +171,17 @@ def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
         return None
     free = next(part for part in parts_of(free) if part.intersects(walked[0]))
     waves = rng.normal(size=(_WAVES, 3))
-    apart = free.buffer(style.wall, join_style="mitre")
-    shut = union_of(locked if rng.spawn(1)[0].random() < SHUT_SHARE else []).difference(apart, grid_size=GRID_M)
+    shut = _shut(locked if rng.spawn(1)[0].random() < SHUT_SHARE else [], free, style.wall)
     return _Plan(free, shut, lines, style.swelling, style.raggedness, waves)
+
+
+def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.GeometryCollection:
+    """Locked rooms that are free all the same: the smallest ones, as many as may be."""
+    apart = free.buffer(wall_m, join_style="mitre")
+    parts = [part for room in locked for part in parts_of(room.difference(apart, grid_size=GRID_M))]
+    parts.sort(key=shapely.area)
+    few = np.cumsum(shapely.area(parts)) <= SHUT_AREA * free.area
+    return shapely.GeometryCollection([part for part, fits in zip(parts, few, strict=True) if fits])
 
 
 def _varied(rng: np.random.Generator, style: _Style) -> _Style:
@@ -331,7 +342,7 @@ def _leaf(rng: np.random.Generator, opening: LineString) -> LineString:
 
 def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> NDArray[np.uint8]:
     """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
-    x0, y0, x1, y1 = shapely.union(plan.free, plan.shut).bounds
+    x0, y0, x1, y1 = shapely.total_bounds([plan.free, plan.shut])
     margin = _MARGIN_M + wall_cells * resolution_m
     x, y = x0 - margin, y0 - margin
     shape = math.ceil((y1 + margin - y) / resolution_m), math.ceil((x1 + margin - x) / resolution_m)
@@ -341,7 +352,8 @@ def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> 
     inside = _largest(inside & ~_swollen(inside, resolution_m, plan))
     around = ndimage.generate_binary_structure(2, 1 + corners)
     if not plan.shut.is_empty:
-        shut = rasterize([plan.shut], **grid).astype(bool) & ~lines
+        walls = rasterize([room.boundary for room in plan.shut.geoms], all_touched=True, **grid).astype(bool)
+        shut = rasterize(plan.shut.geoms, **grid).astype(bool) & ~lines & ~walls
         inside |= shut & ~_swollen(shut, resolution_m, plan) & ~ndimage.binary_dilation(inside, around)
     beside = ndimage.binary_dilation(inside, around, iterations=wall_cells)
     return np.where(inside, CellState.FREE, np.where(beside, CellState.WALL, CellState.UNKNOWN)).astype(np.uint8)

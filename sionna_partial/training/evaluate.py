@@ -127,7 +127,7 @@ def evaluate(
 
     Parameters
     ----------
-    predictor : None, "paper", path or Predictor
+    predictor : None, "map", "paper", path or Predictor
     dataset : LinkTable or path
         Links, or a folder that `sionna-partial dataset` wrote.
     baselines : Baselines, optional
@@ -170,6 +170,44 @@ def evaluate(
                 calibrations[stage] = calibration(given["predictor"], some.link_state, some.gain_db)
     notes = tuple(contestants.notes(homes["test"]))
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
+
+
+def home_scores(answer: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Measure an answer on each home by itself.
+
+    Parameters
+    ----------
+    answer : LinkPrediction
+        For N links.
+    links : LinkTable
+        These links.
+
+    Returns
+    -------
+    accuracies, rmses_db : (H,) float64 arrays
+        Accuracy and root mean square gain error [dB] of each of the H homes, in the order of their names.
+    """
+    _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
+    right = np.bincount(home, answer.link_state == links.link_state)
+    squares = np.bincount(home, gain_errors_db(answer, links.link_state, links.gain_db) ** 2)
+    return right / count, np.sqrt(squares / count)
+
+
+def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Average over homes.
+
+    Parameters
+    ----------
+    values : (H,) float64 array
+        One of each home.
+
+    Returns
+    -------
+    mean, error : float
+        Their mean, and its standard error; nan for one home.
+    """
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return float(values.mean()), float(error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,24 +280,8 @@ def _differences(
     receivers: str, stage: int, links: LinkTable, given: Mapping[str, LinkPrediction]
 ) -> Iterator[Difference]:
     """Compare the first answer with each of the others."""
-    scores = {answer: _home_scores(prediction, links) for answer, prediction in given.items()}
+    scores = {answer: home_scores(prediction, links) for answer, prediction in given.items()}
     first, *others = scores
     for baseline in others:
         accuracy, rmse_db = (one - other for one, other in zip(scores[first], scores[baseline], strict=True))
-        yield Difference(
-            receivers, stage, baseline, len(accuracy), *_mean_and_error(accuracy), *_mean_and_error(rmse_db)
-        )
-
-
-def _home_scores(answer: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Accuracy and gain RMSE [dB] of each home (H,)."""
-    _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
-    right = np.bincount(home, answer.link_state == links.link_state)
-    squares = np.bincount(home, gain_errors_db(answer, links.link_state, links.gain_db) ** 2)
-    return right / count, np.sqrt(squares / count)
-
-
-def _mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Mean of values (H,), and its standard error; nan for one value."""
-    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-    return float(values.mean()), float(error)
+        yield Difference(receivers, stage, baseline, len(accuracy), *mean_and_error(accuracy), *mean_and_error(rmse_db))

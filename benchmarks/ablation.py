@@ -1,0 +1,211 @@
+"""What each idea of the predictor brings: one after the other is added, trained on the same links, and measured.
+
+Links are those of a data set, most of its homes to train on and the others to measure on. The ideas are measured on the
+homes of further data sets, too, such as real ones. All are trained anew, which takes minutes to hours; --also measures
+predictors that have been trained before, where none of the homes is one of theirs. Printed are Markdown tables:
+accuracy, gain error and calibration at each stage of exploration, and paired differences over homes. Run it with
+
+    sionna-partial dataset homes --homes 300 --first-seed 10000
+    sionna-partial dataset real --homes 0 --map ../shared/gibson
+    python benchmarks/ablation.py homes --test real --also shipped=map --out docs/ablation.md
+"""
+
+import argparse
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from stage_scores import DIFFERENCES, INDOORS, Scores, definitions, difference_tables, publish, say, score, stage_table
+
+import sionna_partial as sp
+from sionna_partial.learning.fitting import NetworkKind
+from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
+from sionna_partial.training.link_table import LinkTable
+from sionna_partial.training.train import split_homes
+
+SEED = 0
+"""Of the split of the homes, and of the trainings."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A predictor to train: its networks, and whether they learn how plans go on from the complete homes."""
+
+    networks: NetworkKind
+    plans: bool
+    idea: str
+
+
+VARIANTS = {
+    "paper": Variant("paper", False, "the paper's networks, which see four features of a link"),
+    "paths": Variant(
+        "paths",
+        False,
+        "a network that also sees what each path crosses, which ends are seen, and the walls on the direct line",
+    ),
+    "map": Variant("map", False, "the same, with a network beside it that sees the map around the transmitter"),
+    "map, plans": Variant("map", True, "the same, which also learns from the complete homes how plans go on"),
+}
+"""What is trained, each with one more idea than the one before."""
+
+BASE = "paper"
+
+
+@dataclass(frozen=True, eq=False)
+class TestSet:
+    """Links of homes that no variant is trained on."""
+
+    title: str
+    links: LinkTable
+    traces: LinkTraces | None
+
+    @property
+    def homes(self) -> set[str]:
+        """Their names."""
+        return set(map(str, self.links.home))
+
+
+def main() -> None:
+    """Train, measure, and print the tables."""
+    arguments = parse_arguments()
+    links, traces = indoor_links(arguments.dataset)
+    names = list(dict.fromkeys(map(str, links.home)))[: arguments.homes]
+    train_homes, test_homes = split_homes(names, arguments.test_share, SEED)
+    if not test_homes:
+        raise SystemExit(f"--test-share {arguments.test_share:g} leaves no home to measure on: give more than 0.")
+    held_out = TestSet("Homes held out", links.take(np.isin(links.home, test_homes)), traces)
+    links = links.take(np.isin(links.home, train_homes))
+    sets = [held_out, *(TestSet(f"Homes of `{folder}`", *indoor_links(folder)) for folder in arguments.test)]
+    known = {name: sp.Predictor.load(path) for name, path in arguments.also}
+    if len(known) < len(arguments.also):
+        raise SystemExit("--also has a name twice: give each predictor a name of its own.")
+    require_unknown_homes(sets, train_homes)
+    require_same_traces(sets, traces, known)
+    scores: list[dict[str, Scores]] = [{} for _ in sets]
+    predictors = itertools.chain(trained(links, traces, arguments.passes), known.items())
+    for name, predictor in predictors:
+        for each, found in zip(sets, scores, strict=True):
+            if each.homes.isdisjoint(predictor.homes):
+                say(f"{name}: measuring, {each.title}")
+                found[name] = score(predictor.predict(each.links.phi), each.links)
+    head = introduction(arguments, links, known)
+    report = "\n\n".join([head, *(section(*pair, list(known)) for pair in zip(sets, scores, strict=True)), legend()])
+    publish(report, arguments.out)
+
+
+def parse_arguments() -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset", type=Path, help="folder that `sionna-partial dataset` wrote")
+    parser.add_argument(
+        "--test", type=Path, action="append", default=[], help="data set of other homes; may be repeated"
+    )
+    parser.add_argument("--passes", type=int, default=6, help="how many times the networks see the links")
+    parser.add_argument("--homes", type=int, help="of the data set, the first; default: all")
+    parser.add_argument("--test-share", type=float, default=0.15, help="share of these homes that is held out")
+    parser.add_argument(
+        "--also", type=named_predictor, nargs="+", default=[], metavar="NAME=PREDICTOR", help=".keras file, or `map`"
+    )
+    parser.add_argument("--out", type=Path, help="Markdown file to write")
+    return parser.parse_args()
+
+
+def named_predictor(text: str) -> tuple[str, str]:
+    """Part NAME=PREDICTOR."""
+    name, _, path = text.partition("=")
+    if not name or not path or name in VARIANTS:
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not NAME=PREDICTOR with a new name: give for example shipped=map."
+        )
+    return name, path
+
+
+def indoor_links(folder: Path) -> tuple[LinkTable, LinkTraces | None]:
+    """Read the links of a data set whose receivers were drawn indoors."""
+    say(f"reading {folder}")
+    links, traces = open_links(folder)
+    return links.take(~links.anywhere), traces
+
+
+def require_unknown_homes(sets: list[TestSet], train_homes: tuple[str, ...]) -> None:
+    """Refuse to measure on homes that are trained on."""
+    for each in sets:
+        known = sorted(each.homes & set(train_homes))
+        if known:
+            raise SystemExit(f"{each.title}: {known[0]!r} is trained on, give a data set of other homes.")
+
+
+def require_same_traces(sets: list[TestSet], traces: LinkTraces | None, known: dict[str, sp.Predictor]) -> None:
+    """Refuse links that were traced otherwise than those of a training."""
+    settings = {"the variants": settings_for(traces)} | {name: each.settings for name, each in known.items()}
+    for (name, trained_on), each in itertools.product(settings.items(), sets):
+        whose, remedy = f"{each.title}: {name} learned from links", "leave it out, or give links with such traces."
+        require_like(each.traces, LinkTraces.of_settings(trained_on), whose, remedy)
+
+
+def trained(links: LinkTable, traces: LinkTraces | None, passes: int) -> Iterator[tuple[str, sp.Predictor]]:
+    """Train each variant in turn on the same links."""
+    homes = list(dict.fromkeys(map(str, links.home)))
+    for name, variant in VARIANTS.items():
+        say(f"{name}: training on {len(links)} links in {len(homes)} homes")
+        predictor = sp.Predictor.fit(
+            links.phi,
+            links.link_state,
+            links.gain_db,
+            homes=homes,
+            settings=settings_for(traces, networks=variant.networks, passes=passes, seed=SEED),
+            complete=links.complete_of_maps if variant.plans else None,
+            progress=lambda share, message, name=name: say(f"{name}: {100 * share:.0f} %, {message}"),
+        )
+        yield name, predictor
+
+
+def introduction(arguments: argparse.Namespace, links: LinkTable, known: dict[str, sp.Predictor]) -> str:
+    """Say what was done, and what the names mean."""
+    homes = len(np.unique(links.home))
+    passes = "1 pass" if arguments.passes == 1 else f"{arguments.passes} passes"
+    ideas = [f"- **{name}**: {variant.idea}" for name, variant in VARIANTS.items()]
+    others = [f"- **{name}**: trained before, on {len(model.homes)} homes" for name, model in known.items()]
+    lines = [
+        "# What each idea of the predictor brings",
+        f"Trained on the same {len(links)} links in {homes} homes of `{arguments.dataset}`, with {passes} "
+        f"of the networks beside the paper's. {INDOORS} Each idea stands on those above it:",
+        "\n".join(ideas + others),
+    ]
+    return "\n\n".join(lines)
+
+
+def section(tests: TestSet, found: dict[str, Scores], known: list[str]) -> str:
+    """Tables of one set of homes."""
+    left_out = [
+        f"{name} is left out here: it was trained on some of these homes." for name in known if name not in found
+    ]
+    parts = [
+        f"## {tests.title}",
+        " ".join([f"{len(tests.homes)} homes, {len(tests.links)} links.", *left_out]),
+        stage_table("accuracy, RMSE [dB]", found.items(), "{accuracy:.3f}, {rmse_db:.2f}"),
+        DIFFERENCES,
+        difference_tables(list(comparisons(found))),
+        "Calibration error of the link state, and share of gains in the 90 % interval:",
+        stage_table("error, in 90 %", found.items(), "{calibration_error:.3f}, {coverage_90:.3f}"),
+    ]
+    return "\n\n".join(parts)
+
+
+def comparisons(found: dict[str, Scores]) -> Iterator[tuple[str, Scores, Scores]]:
+    """Pair each answer with the one before it, and with the paper's."""
+    for before, name in itertools.pairwise(found):
+        for other in dict.fromkeys((before, BASE)):
+            yield f"{name} - {other}", found[name], found[other]
+
+
+def legend() -> str:
+    """Say what the figures of merit are."""
+    names = ("accuracy", "rmse_db", "calibration_error", "coverage_90")
+    return f"## Definitions\n\n{definitions(names)}"
+
+
+if __name__ == "__main__":
+    main()
