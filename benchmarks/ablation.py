@@ -12,12 +12,23 @@ accuracy, gain error and calibration at each stage of exploration, and paired di
 
 import argparse
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from stage_scores import DIFFERENCES, INDOORS, Scores, definitions, difference_tables, publish, say, score, stage_table
+from stage_scores import (
+    DIFFERENCES,
+    INDOORS,
+    NAMES,
+    Scores,
+    definitions,
+    difference_tables,
+    publish,
+    say,
+    score,
+    stage_table,
+)
 
 import sionna_partial as sp
 from sionna_partial.learning.fitting import NetworkKind
@@ -45,12 +56,14 @@ VARIANTS = {
         False,
         "a network that also sees what each path crosses, which ends are seen, and the walls on the direct line",
     ),
-    "map": Variant("map", False, "the same, with a network beside it that sees the map around the transmitter"),
-    "map, plans": Variant("map", True, "the same, which also learns from the complete homes how plans go on"),
+    "map without plans": Variant("map", False, "beside it, a network that sees the map around the transmitter"),
+    "map": Variant("map", True, "the same, and it learns from the complete homes how plans go on"),
 }
 """What is trained, each with one more idea than the one before."""
 
 BASE = "paper"
+
+LEGEND = f"## Definitions\n\n{definitions(NAMES)}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +104,7 @@ def main() -> None:
                 say(f"{name}: measuring, {each.title}")
                 found[name] = score(predictor.predict(each.links.phi), each.links)
     head = introduction(arguments, links, known)
-    report = "\n\n".join([head, *(section(*pair, list(known)) for pair in zip(sets, scores, strict=True)), legend()])
+    report = "\n\n".join([head, *(section(*pair, list(known)) for pair in zip(sets, scores, strict=True)), LEGEND])
     publish(report, arguments.out)
 
 
@@ -157,9 +170,14 @@ def trained(links: LinkTable, traces: LinkTraces | None, passes: int) -> Iterato
             homes=homes,
             settings=settings_for(traces, networks=variant.networks, passes=passes, seed=SEED),
             complete=links.complete_of_maps if variant.plans else None,
-            progress=lambda share, message, name=name: say(f"{name}: {100 * share:.0f} %, {message}"),
+            progress=narrator(name),
         )
         yield name, predictor
+
+
+def narrator(name: str) -> Callable[[float, str], None]:
+    """Return what reports the progress of a training."""
+    return lambda share, message: say(f"{name}: {100 * share:.0f} %, {message}")
 
 
 def introduction(arguments: argparse.Namespace, links: LinkTable, known: dict[str, sp.Predictor]) -> str:
@@ -184,12 +202,11 @@ def section(tests: TestSet, found: dict[str, Scores], known: list[str]) -> str:
     ]
     parts = [
         f"## {tests.title}",
-        " ".join([f"{len(tests.homes)} homes, {len(tests.links)} links.", *left_out]),
+        " ".join([f"Homes: {len(tests.homes)}; links at all stages: {len(tests.links)}.", *left_out]),
         stage_table("accuracy, RMSE [dB]", found.items(), "{accuracy:.3f}, {rmse_db:.2f}"),
         DIFFERENCES,
         difference_tables(list(comparisons(found))),
-        "Calibration error of the link state, and share of gains in the 90 % interval:",
-        stage_table("error, in 90 %", found.items(), "{calibration_error:.3f}, {coverage_90:.3f}"),
+        stage_table("calibration error, in 90 %", found.items(), "{calibration_error:.3f}, {coverage_90:.3f}"),
     ]
     return "\n\n".join(parts)
 
@@ -198,13 +215,7 @@ def comparisons(found: dict[str, Scores]) -> Iterator[tuple[str, Scores, Scores]
     """Pair each answer with the one before it, and with the paper's."""
     for before, name in itertools.pairwise(found):
         for other in dict.fromkeys((before, BASE)):
-            yield f"{name} - {other}", found[name], found[other]
-
-
-def legend() -> str:
-    """Say what the figures of merit are."""
-    names = ("accuracy", "rmse_db", "calibration_error", "coverage_90")
-    return f"## Definitions\n\n{definitions(names)}"
+            yield f"{name} minus {other}", found[name], found[other]
 
 
 if __name__ == "__main__":

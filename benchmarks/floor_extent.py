@@ -122,7 +122,7 @@ def result(scores: dict[Extent, dict[str, Scores]]) -> list[str]:
     """Tabulate scores, and their paired differences over homes."""
     observed, whole = (scores[extent] for extent in EXTENTS)
     rows = [(f"{name}, {extent}", scores[extent][name]) for name in observed for extent in EXTENTS]
-    pairs = [(f"{name}, map - observed", whole[name], observed[name]) for name in observed]
+    pairs = [(f"{name}, map minus observed", whole[name], observed[name]) for name in observed]
     return [
         stage_table("accuracy, RMSE [dB]", rows, "{accuracy:.3f}, {rmse_db:.2f}"),
         DIFFERENCES,

@@ -17,7 +17,8 @@ from sionna_partial.training.metrics import DEFINITIONS, Metrics, measure
 INDOORS = "Receivers were drawn indoors. A stage is the number of steps that the robot has explored."
 
 DIFFERENCES = (
-    "One minus the other on the same links: the mean over homes of the homes' differences ± its standard error."
+    "One minus the other on the same links: the mean over homes of the homes' differences ± its standard error, which "
+    "knows nothing of how another training would have come out."
 )
 
 
@@ -29,6 +30,14 @@ class StageScore:
     accuracies: NDArray[np.float64]
     rmses_db: NDArray[np.float64]
 
+
+NAMES = {
+    "accuracy": "accuracy",
+    "rmse_db": "RMSE",
+    "calibration_error": "calibration error",
+    "coverage_90": "in 90 %",
+}
+"""What tables call the figures of merit."""
 
 Scores = Mapping[int, StageScore]
 """By steps."""
@@ -70,15 +79,16 @@ def stage_header(head: str, scores: Scores) -> list[str]:
 
 def definitions(names: Iterable[str]) -> str:
     """Say what figures of merit are, a line for each."""
-    return "\n".join(f"- {name.replace('_', ' ').replace(' db', '')}: {DEFINITIONS[name]}" for name in names)
+    return "\n".join(f"- {NAMES[name]}: {DEFINITIONS[name]}" for name in names)
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Lay out a Markdown table, its columns aligned for the eye."""
     cells = [list(header), *map(list, rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    head, *lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in cells]
-    return "\n".join([head, "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines])
+    head, *lines = [" | ".join([name.ljust(widths[0]), *map(str.rjust, texts, widths[1:])]) for name, *texts in cells]
+    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+    return "\n".join(f"| {line} |" for line in (head, " | ".join(rule), *lines))
 
 
 def publish(report: str, out: Path | None) -> None:

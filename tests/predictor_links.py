@@ -67,6 +67,12 @@ def make_context(phi):
     )
 
 
+def make_seen_links(count, seed=0):
+    """Return the links of `make_links` with a context."""
+    phi, state, gain_db = make_links(count, seed)
+    return dataclasses.replace(phi, context=make_context(phi)), state, gain_db
+
+
 def p_kept(phi):
     """Probability that the true state is the partial one."""
     return 1.0 / (1.0 + np.exp(0.8 * phi.unobserved_distance_m - 3.0))
@@ -102,3 +108,15 @@ def quick_predictor():
 def trained_predictor():
     settings = PredictorSettings(steps=400, batch_size=512, learning_rate=0.02)
     return Predictor.fit(*make_links(12_000), settings=settings)
+
+
+def fit_context_predictor(networks, seed=0):
+    """Train a predictor that sees where links run, for two steps; its networks of the paper are untrained."""
+    links = make_seen_links(300)
+    settings = PredictorSettings(networks, passes=8, minimum_links=1_000_000, seed=seed)
+    return Predictor.fit(*links, homes=["a", "b"], settings=settings, complete=corridors()[-1:] * 4)
+
+
+@functools.cache
+def context_predictor(networks):
+    return fit_context_predictor(networks)

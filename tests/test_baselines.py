@@ -1,3 +1,4 @@
+import dataclasses
 import math
 import re
 
@@ -9,6 +10,7 @@ from predictor_links import LOS, NLOS, OUTAGE, QUICK, QUIET, assert_valid, make_
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.networks import OUTPUT_WIDTHS
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.training.baselines import (
@@ -22,6 +24,8 @@ from sionna_partial.training.baselines import (
 )
 
 pytestmark = QUIET
+
+UNTRAINED = dataclasses.replace(QUICK, minimum_links=1_000_000)
 
 
 def links_at(distance_m):
@@ -61,6 +65,12 @@ class TestBaselines:
         moved = LinkFeatures(other.link_state, np.zeros(50), one.distance_m, other.gain_db)
         seen = (fitted.distance.predict(nothing_seen(phi, 28e9)) for phi in (one, moved))
         np.testing.assert_array_equal(*(answer.gain_mean_db for answer in seen))
+
+    def test_distance_needs_no_networks_but_the_papers(self):
+        settings = dataclasses.replace(UNTRAINED, networks="map")
+        found = Baselines.fit(make_table(homes=1, links=30, stages=(0,)), settings)
+        assert found.distance.settings == UNTRAINED
+        assert set(found.distance.model.output) == set(OUTPUT_WIDTHS)
 
     def test_homes_are_recorded(self, fitted):
         assert fitted.distance.homes == ("home 0", "home 1")

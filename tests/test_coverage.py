@@ -281,7 +281,7 @@ def test_a_path_is_read(fakes, tmp_path):
         predict_map(tmp_path / "missing.yaml", TX)
 
 
-@pytest.mark.parametrize("name", [None, "paper", "my.keras"])
+@pytest.mark.parametrize("name", [None, "map", "paper", "my.keras"])
 def test_the_predictor_is_loaded_by_its_name(fakes, monkeypatch, name):
     calls = []
     monkeypatch.setattr(FakePredictor, "load", lambda name: calls.append(name) or FakePredictor())

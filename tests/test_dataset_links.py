@@ -4,7 +4,7 @@ import re
 import pytest
 from link_tables import make_dataset, make_table
 
-from sionna_partial.errors import PredictorError
+from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
 
@@ -46,10 +46,23 @@ class TestOpenLinks:
 
 class TestSettingsFor:
     def test_those_of_the_data_set(self):
-        assert settings_for(LinkTraces(60e9, False), steps=7, seed=8) == PredictorSettings(60e9, False, steps=7, seed=8)
+        found = settings_for(LinkTraces(60e9, False), networks="paths", passes=7, seed=8)
+        assert found == PredictorSettings("paths", frequency_hz=60e9, diffraction=False, passes=7, seed=8)
 
-    def test_defaults(self):
-        assert settings_for(None) == PredictorSettings()
+    def test_by_default_it_sees_the_map(self):
+        assert settings_for(None) == PredictorSettings("map")
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"networks": "plan"}, "networks = 'plan' is not allowed: choose one of ('paper', 'paths', 'map')."),
+            ({"passes": 0}, "passes = 0 is not allowed: give a whole number in [1, 1000000]."),
+            ({"seed": 0.5}, "seed = 0.5 is not allowed: give a whole number in [0, 1000000000]."),
+        ],
+    )
+    def test_bad_values(self, change, message):
+        with pytest.raises(SettingsError, match=re.escape(message)):
+            settings_for(None, **change)
 
 
 class TestRequireLike:

@@ -127,10 +127,14 @@ def test_diverging_training():
     [
         ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed"),
         ({"learning_rate": 0.0}, "learning_rate = 0.0 is not allowed: give a number in (0, 1]"),
-        ({"steps": 1.5}, "steps = 1.5 is not allowed: give a whole number"),
-        ({"batch_size": 0}, "batch_size = 0 is not allowed: give a number in [1, 1e+06]"),
-        ({"minimum_links": True}, "minimum_links = True is not allowed: give a whole number"),
-        ({"seed": -1}, "seed = -1 is not allowed: give a number in [0, 1e+09]"),
+        ({"networks": "Map"}, "networks = 'Map' is not allowed: choose one of ('paper', 'paths', 'map')."),
+        ({"networks": None}, "networks = None is not allowed: choose one of"),
+        ({"diffraction": 1}, "diffraction = 1 is not allowed: give True or False."),
+        ({"passes": 0}, "passes = 0 is not allowed: give a whole number in [1, 1000000]."),
+        ({"steps": 1.5}, "steps = 1.5 is not allowed: give a whole number in [1, 1000000]."),
+        ({"batch_size": 0}, "batch_size = 0 is not allowed: give a whole number in [1, 1000000]."),
+        ({"minimum_links": True}, "minimum_links = True is not allowed: give a whole number in [1, 1000000]."),
+        ({"seed": -1}, "seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
     ],
 )
 def test_bad_settings(change, message):

@@ -18,7 +18,8 @@ pytestmark = [QUIET, pytest.mark.usefixtures("command_line")]
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_dataset(tmp_path_factory.mktemp("dataset"), make_table(homes=3, links=120))
+    """Homes with too few links for the networks of the paper to be trained."""
+    return make_dataset(tmp_path_factory.mktemp("dataset"), make_table(homes=3, links=40))
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +36,11 @@ def run(*args: object) -> Result:
 
 
 class TestTrain:
-    def test_what_it_writes_and_says(self, dataset: Path, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("networks", ["paper", "map"])
+    def test_what_it_writes_and_says(self, networks: str, dataset: Path, tmp_path: Path) -> None:
         out = tmp_path / "run"
-        result = run("train", dataset, "--out", out, "--test-share", 0.5, "--steps", 2, "--seed", 3)
+        options = ["--test-share", 0.5, "--networks", networks, "--passes", 2, "--seed", 3]
+        result = run("train", dataset, "--out", out, *options)
         assert result.exit_code == 0, result.output
         names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
         assert sorted(path.name for path in out.iterdir()) == names
@@ -45,8 +48,8 @@ class TestTrain:
         assert lines[-6:] == [f"wrote {out / name}" for name in names]
         assert hint.endswith(f"sionna-partial evaluate {dataset} --predictor {out / 'predictor.keras'} --out REPORT")
         assert "### Test homes (2), receivers indoors" in result.stdout
-        card = Predictor.load(out / "predictor.keras")
-        assert (card.settings.steps, card.settings.seed, card.settings.frequency_hz) == (2, 3, 28e9)
+        found = Predictor.load(out / "predictor.keras").settings
+        assert (found.networks, found.passes, found.seed, found.frequency_hz) == (networks, 2, 3, 28e9)
         split = json.loads((out / "split.json").read_text())
         assert (split["test_share"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
 
@@ -60,14 +63,15 @@ class TestTrain:
 
         monkeypatch.setattr("sionna_partial.training.train.train", train)
         run("train", folder, "--out", tmp_path / "run")
-        assert seen["settings"] == PredictorSettings(frequency_hz=60e9, diffraction=False)
+        assert seen["settings"] == PredictorSettings("map", frequency_hz=60e9, diffraction=False)
         assert seen["test_share"] == 0.3
 
     @pytest.mark.parametrize(
         ("words", "message"),
         [
             (["--test-share", 1], "error: test_share = 1.0 is not allowed: give a number in [0, 0.99]."),
-            (["--steps", 0], "error: steps = 0 is not allowed: give a number in [1, 1e+06]."),
+            (["--passes", 0], "error: passes = 0 is not allowed: give a whole number in [1, 1000000]."),
+            (["--seed", -1], "error: seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
         ],
     )
     def test_bad_options(self, words: list[object], message: str, dataset: Path, tmp_path: Path) -> None:
@@ -99,7 +103,7 @@ class TestEvaluate:
         assert json.loads((out / "report.json").read_text())["predictor"] == str(predictor)
         assert f"# Evaluation of predictor `{predictor}`" in (out / "report.md").read_text()
 
-    def test_the_papers_by_default(self, dataset: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def test_the_shipped_default(self, dataset: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         seen: list[Any] = []
 
         def evaluate(*arguments: Any, progress: Any) -> Any:
@@ -108,7 +112,7 @@ class TestEvaluate:
 
         monkeypatch.setattr("sionna_partial.training.evaluate.evaluate", evaluate)
         run("evaluate", dataset, "--out", tmp_path / "report")
-        assert seen == ["paper", dataset]
+        assert seen == ["map", dataset]
 
     def test_unknown_predictor(self, dataset: Path, tmp_path: Path) -> None:
         result = run("evaluate", dataset, "--predictor", "nobody", "--out", tmp_path / "report")
@@ -116,7 +120,7 @@ class TestEvaluate:
         assert result.stderr.strip().endswith("error: path = 'nobody' is no predictor: give the path of a .keras file.")
 
     def test_trained_on_all_homes(self, dataset: Path, tmp_path: Path) -> None:
-        trained = run("train", dataset, "--out", tmp_path / "run", "--test-share", 0, "--steps", 1)
+        trained = run("train", dataset, "--out", tmp_path / "run", "--test-share", 0, "--networks", "paper")
         assert "all homes were trained on: nothing was measured" in trained.stdout
         result = run("evaluate", dataset, "--predictor", tmp_path / "run/predictor.keras", "--out", tmp_path / "report")
         assert result.exit_code == 2

@@ -4,7 +4,18 @@ from predictor_links import FREQUENCY_HZ, LOS, NLOS, QUIET, arrays, assert_valid
 
 from sionna_partial.constants import LinkState
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.networks import GAIN_NETWORKS, free_space_gain_db
+from sionna_partial.learning.networks import (
+    FEATURES,
+    GAIN_NETWORKS,
+    OUTPUT_WIDTHS,
+    assemble,
+    evaluate_networks,
+    free_space_gain_db,
+    import_keras,
+    network_ranges,
+    own_input,
+    parts,
+)
 
 pytestmark = QUIET
 
@@ -75,3 +86,34 @@ def test_sane_far_beyond_the_training_links(quick, partial_state):
         for gain_db in (-150.0, -40.0, 1e300):
             states, gains_db = np.full(9, partial_state), np.full(9, gain_db)
             assert_valid(quick.predict(LinkFeatures(states, share * distance_m, distance_m, gains_db)))
+
+
+@pytest.fixture(scope="module")
+def model(quick):
+    """The networks of the paper, and one that doubles five numbers, put together."""
+    keras = import_keras()
+    place = keras.Input((5,), name="five")
+    double = keras.Model(place, keras.layers.Rescaling(2.0, name="twice")(place), name="double")
+    return assemble(parts(quick.model) | {"double": double})
+
+
+class TestAssemble:
+    def test_others_have_inputs_and_outputs_of_their_own(self, model):
+        assert own_input("double") == "input_of_double"
+        assert set(model.input) == {*FEATURES, "input_of_double"}
+        assert set(model.output) == {*OUTPUT_WIDTHS, "double"} == set(parts(model))
+        inputs = {name: np.ones((3, 1), dtype=np.float32) for name in FEATURES}
+        five = np.arange(15, dtype=np.float32).reshape(3, 5)
+        np.testing.assert_array_equal(model(inputs | {"input_of_double": five})["double"], 2.0 * five)
+        np.testing.assert_array_equal(parts(model)["double"](five), 2.0 * five)
+
+    def test_evaluation_of_the_papers_leaves_others_out(self, quick, model):
+        phi = make_links(30, seed=3)[0]
+        alone, found = (evaluate_networks(each, phi) for each in (quick.model, model))
+        assert set(found) == set(alone) == set(OUTPUT_WIDTHS)
+        for name, values in found.items():
+            np.testing.assert_array_equal(values, alone[name])
+
+    def test_ranges_are_those_of_the_papers_in_their_order(self, quick, model):
+        assert network_ranges(model) == network_ranges(quick.model)
+        assert list(network_ranges(model)) == list(OUTPUT_WIDTHS)

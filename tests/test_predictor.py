@@ -3,12 +3,25 @@ import re
 
 import numpy as np
 import pytest
-from predictor_links import LOS, OUTAGE, QUIET, arrays, assert_valid, make_links, quick_predictor
+from predictor_links import (
+    LOS,
+    OUTAGE,
+    QUIET,
+    arrays,
+    assert_valid,
+    context_predictor,
+    corridors,
+    make_links,
+    make_seen_links,
+    quick_predictor,
+)
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning import predictor as predictor_module
-from sionna_partial.learning.networks import STD_RANGE_DB
-from sionna_partial.learning.predictor import LinkPrediction, Predictor
+from sionna_partial.learning.context_networks import LINK_NETWORK, MAP_NETWORK, evaluate_context_networks
+from sionna_partial.learning.networks import STD_RANGE_DB, parts
+from sionna_partial.learning.predictor import SHIPPED, LinkPrediction, Predictor
+from sionna_partial.maps.partial_map import PartialMap
 
 pytestmark = QUIET
 
@@ -16,6 +29,12 @@ pytestmark = QUIET
 @pytest.fixture(scope="module")
 def quick():
     return quick_predictor()
+
+
+@pytest.fixture(params=["paths", "map"])
+def seeing(request):
+    """A predictor that sees where links run."""
+    return context_predictor(request.param)
 
 
 @pytest.fixture
@@ -106,9 +125,11 @@ def test_bad_probability_of_being_indoors(p_indoor, message):
         LinkPrediction.of_trace(make_links(2)[0]).anywhere(p_indoor)
 
 
-def test_save_and_load(quick, saved):
-    phi, _, _ = make_links(500, seed=5)
-    model = quick.fit_indoor(phi, phi.unobserved_distance_m < 4.0)
+@pytest.mark.parametrize("networks", ["paper", "paths", "map"])
+def test_save_and_load(networks, saved):
+    phi, _, _ = make_seen_links(500, seed=5)
+    model = quick_predictor() if networks == "paper" else context_predictor(networks)
+    model = model.fit_indoor(phi, phi.unobserved_distance_m < 4.0)
     model = dataclasses.replace(model, metrics={"accuracy": 0.5})
     model.save(saved)
     loaded = Predictor.load(saved)
@@ -127,20 +148,125 @@ def test_save_and_load(quick, saved):
 def test_shipped_names(quick, tmp_path, monkeypatch):
     monkeypatch.setattr(predictor_module, "PREDICTORS_FOLDER", tmp_path)
     quick.save(tmp_path / "paper.keras")
-    assert Predictor.load().name == Predictor.load("paper").name == "paper"
-    assert Predictor.load().fingerprint == quick.fingerprint
+    context_predictor("map").save(tmp_path / "map.keras")
+    assert Predictor.load("paper").name == "paper"
+    assert Predictor.load("paper").fingerprint == quick.fingerprint
+    assert Predictor.load().name == Predictor.load("map").name == "map"
+    assert Predictor.load().fingerprint == context_predictor("map").fingerprint
 
 
-def test_shipped_predictor():
-    model = Predictor.load()
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_predictor(name):
+    model = Predictor.load(name)
+    assert model.settings.networks == name
+    assert len(model.archive) < 20_000_000
     assert len(model.homes) >= 10
     assert not set(model.homes) & set(model.metrics["held_out_homes"])
-    phi, _, _ = make_links(500)
+    phi, _, _ = make_seen_links(500)
     assert_valid(model.predict(phi))
     assert model.predict_indoor(phi).min() < 0.999
     for stage in model.metrics["exploration_steps"].values():
         assert 0.8 < stage["predictor"]["coverage_90"] < 0.98
         assert stage["predictor"]["rmse_db"] < stage["majority"]["rmse_db"]
+
+
+class TestWhatSeesWhereLinksRun:
+    def test_valid_on_other_links(self, seeing):
+        answer = seeing.predict(make_seen_links(500, seed=2)[0])
+        assert_valid(answer)
+        for std_db in (answer.gain_los_std_db, answer.gain_nlos_std_db):
+            assert std_db.min() >= STD_RANGE_DB[0] - 1e-5
+            assert std_db.max() <= STD_RANGE_DB[1] + 1e-4
+
+    def test_its_networks_answer_where_maps_are_partial(self, seeing):
+        phi = make_seen_links(100, seed=3)[0]
+        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, 28e9))
+        for name, values in arrays(seeing.predict(phi)).items():
+            np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
+
+    @pytest.mark.parametrize("complete", [range(4), [], [1, 3]], ids=str)
+    def test_the_trace_answers_where_maps_are_complete(self, seeing, complete):
+        phi = make_seen_links(200, seed=3)[0]
+        whole = PartialMap(np.zeros((2, 32), dtype=np.uint8), 0.5, (-0.25, -0.25))
+        assert whole.is_complete
+        maps = tuple(whole if number in complete else each for number, each in enumerate(corridors()))
+        mixed = dataclasses.replace(phi, context=dataclasses.replace(phi.context, maps=maps))
+        sure = np.isin(phi.context.map_index, [*complete])
+        assert sure.mean() == len(complete) / 4 or len(complete) == 2
+        answer, traced, unsure = seeing.predict(mixed), LinkPrediction.of_trace(phi), seeing.predict(phi)
+        assert_valid(answer)
+        for name, values in arrays(answer).items():
+            np.testing.assert_array_equal(values[sure], getattr(traced, name)[sure], err_msg=name)
+            np.testing.assert_allclose(values[~sure], getattr(unsure, name)[~sure], rtol=1e-5, err_msg=name)
+        assert answer.gain_std_db[~sure].min(initial=1.0) > 0.1
+
+    def test_without_a_context_the_papers_networks_answer(self, seeing):
+        """They are fitted to the same links, and know nothing of the networks beside them."""
+        phi, state, gain_db = make_seen_links(300)
+        settings = dataclasses.replace(seeing.settings, networks="paper")
+        paper = Predictor.fit(phi, state, gain_db, settings=settings)
+        blind = dataclasses.replace(phi, context=None)
+        for name, values in arrays(seeing.predict(blind)).items():
+            np.testing.assert_array_equal(values, getattr(paper.predict(blind), name), err_msg=name)
+            np.testing.assert_array_equal(values, getattr(paper.predict(phi), name), err_msg=name)
+        assert abs(seeing.predict(phi).p_los - seeing.predict(blind).p_los).max() > 0.05
+
+    def test_links_do_not_depend_on_each_other(self, seeing):
+        phi = make_seen_links(300, seed=3)[0]
+        together = seeing.predict(phi)
+        for index in ([7], [200, 3, 41], np.arange(150)):
+            for name, values in arrays(seeing.predict(phi.take(np.array(index)))).items():
+                np.testing.assert_allclose(values, getattr(together, name)[index], rtol=1e-5, err_msg=name)
+
+    def test_no_links(self, seeing):
+        empty = make_seen_links(0)[0]
+        assert all(values.shape == (0,) for values in arrays(seeing.predict(empty)).values())
+        assert seeing.predict_indoor(empty).shape == (0,)
+
+    def test_fit_indoor_keeps_its_networks(self, seeing):
+        phi = make_seen_links(400, seed=4)[0]
+        settings = dataclasses.replace(seeing.settings, minimum_links=50)
+        able = dataclasses.replace(seeing, settings=settings)
+        model = able.fit_indoor(phi, phi.unobserved_distance_m < 4.0)
+        assert set(parts(model.model)) == set(parts(seeing.model))
+        for name, values in arrays(model.predict(phi)).items():
+            np.testing.assert_array_equal(values, getattr(seeing.predict(phi), name), err_msg=name)
+        assert model.predict_indoor(phi).min() < 0.5 < 0.999 < seeing.predict_indoor(phi).min()
+        assert model.fingerprint != seeing.fingerprint
+
+    def test_networks_by_settings(self, quick):
+        own = {name: set(parts(context_predictor(name).model)) - set(parts(quick.model)) for name in ("paths", "map")}
+        assert own == {"paths": {LINK_NETWORK}, "map": {LINK_NETWORK, MAP_NETWORK}}
+
+    def test_progress(self):
+        calls = []
+        settings = dataclasses.replace(context_predictor("paths").settings, passes=1)
+        Predictor.fit(*make_seen_links(20), settings=settings, progress=lambda *call: calls.append(call))
+        ((share, message),) = calls
+        assert share == 0.0
+        assert message.startswith("step 0 of 1, loss ")
+
+    def test_links_that_cannot_train_it(self, seeing):
+        phi, state, gain_db = make_seen_links(5)
+        message = (
+            "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
+            "or PredictorSettings(networks='paper')."
+        )
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            Predictor.fit(make_links(5)[0], state, gain_db, settings=seeing.settings)
+        message = "complete has 3 maps: give one for each of the 4 maps of the features' context."
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            Predictor.fit(phi, state, gain_db, settings=seeing.settings, complete=corridors()[:3])
+        with pytest.raises(PredictorError, match="features has no links: give at least one"):
+            Predictor.fit(make_seen_links(0)[0], [], [], settings=seeing.settings)
+
+
+def test_where():
+    one, other = (LinkPrediction.of_trace(make_links(6, seed=seed)[0]) for seed in (1, 2))
+    taken = np.array([True, False, False, True, True, False])
+    for name, values in arrays(one.where(taken, other)).items():
+        np.testing.assert_array_equal(values[taken], getattr(other, name)[taken], err_msg=name)
+        np.testing.assert_array_equal(values[~taken], getattr(one, name)[~taken], err_msg=name)
 
 
 def test_bad_training_data(quick):

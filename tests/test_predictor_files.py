@@ -1,16 +1,31 @@
+import dataclasses
 import io
 import json
 import re
+import subprocess
+import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
-from predictor_links import LOS, OUTAGE, QUICK, QUIET, make_links, quick_predictor
+from predictor_links import (
+    LOS,
+    OUTAGE,
+    QUICK,
+    QUIET,
+    context_predictor,
+    fit_context_predictor,
+    make_links,
+    make_seen_links,
+    quick_predictor,
+)
 
 from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.learning.networks import FEATURES, import_keras
+from sionna_partial.learning.context_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORK
+from sionna_partial.learning.networks import FEATURES, assemble, import_keras, parts
 from sionna_partial.learning.predictor import Predictor
-from sionna_partial.learning.predictor_files import FORMAT, digest
+from sionna_partial.learning.predictor_files import FORMAT, digest, pack
 
 pytestmark = QUIET
 
@@ -49,9 +64,56 @@ def test_stock_keras_loads_it(quick, saved):
     np.testing.assert_allclose(probabilities[:, LOS], quick.predict(phi).p_los[phi.link_state == LOS], rtol=1e-5)
 
 
+def test_stock_keras_loads_networks_that_see_where_links_run(tmp_path):
+    context_predictor("map").save(tmp_path / "mine.keras")
+    model = import_keras().saving.load_model(tmp_path / "mine.keras", safe_mode=True)
+    mine = dataclasses.replace(context_predictor("map"), model=model)
+    phi = make_seen_links(20)[0]
+    np.testing.assert_array_equal(mine.predict(phi).p_los, context_predictor("map").predict(phi).p_los)
+
+
 def test_same_bytes_however_many_were_made_before(quick):
     again = Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
     assert again.archive == quick.archive
+
+
+class TestSameBytes:
+    """Of a training by seed, however many were before it, and in a process of its own."""
+
+    def test_in_this_process(self):
+        assert fit_context_predictor("map").archive == context_predictor("map").archive
+
+    def test_in_another_process(self):
+        code = (
+            "from predictor_links import fit_context_predictor\n"
+            "print(*(fit_context_predictor(name).fingerprint for name in ('map', 'paths')))"
+        )
+        result = subprocess.run(
+            [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=300
+        )
+        assert result.returncode == 0, result.stderr
+        assert result.stdout.split() == [context_predictor(name).fingerprint for name in ("map", "paths")]
+
+    def test_other_seeds_give_others(self):
+        assert fit_context_predictor("paths", seed=1).archive != context_predictor("paths").archive
+
+
+@pytest.mark.parametrize("networks", ["paths", "map"])
+def test_card_of_networks_that_see_where_links_run(networks, tmp_path):
+    context_predictor(networks).save(tmp_path / "mine.keras")
+    card = json.loads((tmp_path / "mine.json").read_text())
+    assert (card["settings"]["networks"], card["settings"]["passes"]) == (networks, 8)
+    assert card["sha256"] == digest((tmp_path / "mine.keras").read_bytes())
+    assert card["links"]["NLOS given NLOS"] > 0
+
+
+def test_cards_from_before_there_were_others_are_of_the_papers(saved):
+    path = saved.with_suffix(".json")
+    card = json.loads(path.read_text())
+    for name in ("networks", "passes"):
+        del card["settings"][name]
+    path.write_text(json.dumps(card))
+    assert Predictor.load(saved).settings.networks == "paper"
 
 
 def _repack(archive, change):
@@ -78,7 +140,7 @@ def test_missing_file(tmp_path):
 
 def test_name_that_is_no_path():
     with pytest.raises(
-        PredictorError, match=r"name_or_path = 3 is not a path: give 'paper'.*, or the path of a \.keras"
+        PredictorError, match=r"name_or_path = 3 is not a path: give 'map' or 'paper', or the path of a \.keras"
     ):
         Predictor.load(3)
 
@@ -124,6 +186,50 @@ def test_foreign_code_is_refused(saved):
         with pytest.raises(PredictorError, match=f"{found}.* which no predictor of ours has: it may run foreign code"):
             Predictor.load(saved)
         _forge(saved, original)
+
+
+@pytest.mark.parametrize("old", ["Conv2D", "MaxPooling2D", "UpSampling2D", "Concatenate"])
+def test_foreign_code_beside_the_papers_networks_is_refused(saved, old):
+    archive = context_predictor("map").archive
+    _forge(saved, _repack(archive, lambda text: text.replace(f'"class_name": "{old}"', '"class_name": "TFSMLayer"')))
+    with pytest.raises(PredictorError, match=r"holds TFSMLayer, which no predictor of ours has: it may run foreign"):
+        Predictor.load(saved)
+
+
+def _dense(inputs, outputs, name=LINK_NETWORK):
+    keras = import_keras()
+    place = keras.Input((inputs,), name="link")
+    return keras.Model(place, keras.layers.Dense(outputs, name="outputs")(place), name=name)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {LINK_NETWORK: lambda: _dense(LINK_INPUTS, LINK_OUTPUTS)},
+        {LINK_NETWORK: None},
+        {MAP_NETWORK: None},
+        {"third_network": lambda: _dense(LINK_INPUTS, LINK_OUTPUTS, "third_network")},
+    ],
+    ids=["link network without what the map says", "map alone", "reader of a map alone", "one too many"],
+)
+def test_foreign_networks_are_refused(saved, change):
+    networks = parts(context_predictor("map").model)
+    for name, build in change.items():
+        if build is None:
+            del networks[name]
+        else:
+            networks[name] = build()
+    _forge(saved, pack(assemble(networks)))
+    with pytest.raises(PredictorError, match=r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"):
+        Predictor.load(saved)
+
+
+def test_link_network_of_other_shape_is_refused(saved):
+    for inputs, outputs in ((LINK_INPUTS + 1, LINK_OUTPUTS), (LINK_INPUTS, LINK_OUTPUTS + 1)):
+        networks = parts(quick_predictor().model) | {LINK_NETWORK: _dense(inputs, outputs)}
+        _forge(saved, pack(assemble(networks)))
+        with pytest.raises(PredictorError, match=r"has inputs .*'input_of_link_network'.* and outputs"):
+            Predictor.load(saved)
 
 
 def test_zip_bomb_is_refused(saved):

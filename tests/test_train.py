@@ -10,8 +10,11 @@ from predictor_links import QUICK, QUIET
 from sionna_partial.errors import OutputError, PredictorError, SettingsError
 from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.predictor import Predictor
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.training.baselines import Baselines
 from sionna_partial.training.evaluate import evaluate
+from sionna_partial.training.link_table import LinkTable
+from sionna_partial.training.metrics import measure
 from sionna_partial.training.train import split_homes, train
 
 pytestmark = QUIET
@@ -95,6 +98,47 @@ class TestTrain:
         assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
         assert "paper" not in run.predictor.metrics["exploration_steps"]["0"]
 
+    def test_test_homes_alone_are_measured(self, run):
+        assert run.evaluation.homes == {"test": tuple(sorted(run.test_homes))}
+        assert {row.homes for row in run.evaluation.rows} == {"test"}
+
+    def test_networks_that_see_where_links_run(self):
+        table, calls = make_table(homes=3, links=60, stages=(0,)), []
+        settings = dataclasses.replace(UNTRAINED, networks="map", passes=1)
+        seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
+        assert seeing.predictor.settings == settings
+        assert {"map_network", "link_network"} <= set(seeing.predictor.model.output)
+        assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")
+        links = table.take(~table.anywhere & np.isin(table.home, seeing.test_homes))
+        (row,) = seeing.evaluation.select(receivers="indoor", ends_seen="all", answer="predictor")
+        expected = measure(seeing.predictor.predict(links.phi), links.link_state, links.gain_db)
+        assert row.metrics.as_json() == pytest.approx(expected.as_json(), rel=1e-6)
+        assert [share for share, _ in calls] == sorted(share for share, _ in calls)
+        assert any(message.startswith("step 0 of 1, loss ") for _, message in calls)
+
+    def test_complete_homes_are_learned_from(self, table, monkeypatch):
+        homes = {
+            name: PartialMap(np.zeros((1, size), dtype=np.uint8), 0.5)
+            for size, name in enumerate(dict.fromkeys(table.home), 1)
+        }
+        taken = []
+
+        def fit(*arguments, complete, **options):
+            taken.extend(complete)
+            raise KeyboardInterrupt
+
+        parts = []
+        for name, home in homes.items():
+            links = table.take(table.home == name)
+            maps = tuple(dataclasses.replace(each) for each in links.context.maps)
+            context = dataclasses.replace(links.context, maps=maps)
+            phi = dataclasses.replace(links.phi, context=context)
+            parts.append(dataclasses.replace(links, phi=phi, complete_maps={name: home}))
+        monkeypatch.setattr(Predictor, "fit", fit)
+        with pytest.raises(KeyboardInterrupt):
+            train(LinkTable.concatenate(parts), test_share=0.0, settings=UNTRAINED)
+        assert taken == [home for home in homes.values() for _ in range(4)]
+
     def test_no_test_homes(self, table):
         alone = train(table, test_share=0.0, settings=UNTRAINED)
         assert alone.evaluation is None
@@ -142,7 +186,8 @@ class TestSave:
         run.save(tmp_path)
         found = evaluate(tmp_path / "predictor.keras", table)
         assert found.homes == {"test": tuple(sorted(run.test_homes)), "train": tuple(sorted(run.train_homes))}
-        assert [row.metrics.as_json() for row in found.rows] == [row.metrics.as_json() for row in run.evaluation.rows]
+        measured = [row.metrics.as_json() for row in run.evaluation.rows]
+        assert [row.metrics.as_json() for row in found.select(homes="test")] == measured
         assert Predictor.load(tmp_path / "predictor.keras").metrics == run.predictor.metrics
         assert Baselines.load(tmp_path).majority == run.baselines.majority
 

@@ -105,7 +105,7 @@ def train(
     networks: Annotated[
         Networks, typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around.")
     ] = Networks.MAP,
-    passes: Annotated[int, typer.Option(help="How many times the networks beside the paper's see the links.")] = 15,
+    passes: Annotated[int, typer.Option(help="How many times the networks beside the paper's see the links.")] = 13,
     seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = 0,
 ) -> None:
     """Train a predictor, and test it on other homes.

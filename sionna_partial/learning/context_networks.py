@@ -44,6 +44,7 @@ _LOS_OFFSET_DB, _NLOS_OFFSET_DB = 2.0, -25.0
 _LOS_SCALE_DB, _NLOS_SCALE_DB = 10.0, 20.0
 _SCALE_M, _SCALE_DB = 15.0, 100.0
 _NEAREST_M = 0.1
+_LINKS_AT_ONCE = 65_536
 
 
 def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
@@ -208,9 +209,11 @@ def evaluate_context_networks(
     inputs, places = link_inputs(phi, frequency_hz), window_places(context)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for number, window in enumerate(windows):
-        here = np.flatnonzero(index == number)
-        found, _ = look(networks, window[None].astype(np.float32), inputs[None, here], places[None, here])
-        outputs[here] = found[0]
+        links = np.flatnonzero(index == number)
+        for start in range(0, len(links), _LINKS_AT_ONCE):
+            here = links[start : start + _LINKS_AT_ONCE]
+            found, _ = look(networks, window[None].astype(np.float32), inputs[None, here], places[None, here])
+            outputs[here] = found[0]
     log_p, gains_db, log_variances = decode(outputs, free_space_gain_db(phi.distance_m, frequency_hz))
     probabilities = np.exp(log_p).T
     means_db, stds_db = np.full_like(probabilities, GAIN_FLOOR_DB), np.zeros_like(probabilities)

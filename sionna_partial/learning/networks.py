@@ -226,11 +226,10 @@ def evaluate_networks(model: "keras.Model", phi: LinkFeatures) -> dict[str, NDAr
 
 
 def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
-    """Return the range [low, high] to which each network clamps and scales its inputs, by network and feature."""
+    """Return the range [low, high] to which each network of the paper clamps and scales its inputs, by feature."""
     ranges = {}
-    for name, network in parts(model).items():
-        if name not in OUTPUT_WIDTHS:
-            continue
+    for name in OUTPUT_WIDTHS:
+        network = model.get_layer(name)
         scaling = network.get_layer("scaled").get_config()
         names = [key for key in FEATURES if key in network.input]
         spans = zip(names, scaling["scale"], scaling["offset"], strict=True)

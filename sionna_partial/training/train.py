@@ -177,8 +177,9 @@ def train(
     run = TrainingRun(predictor, baselines, train_homes, test_homes, test_share, None)
     if not test_homes:
         return run
+    tests = table.take(np.isin(table.home, test_homes))
     result = evaluate(
-        predictor, table, baselines=baselines, progress=lambda share, message: report(0.7 + 0.3 * share, message)
+        predictor, tests, baselines=baselines, progress=lambda share, message: report(0.7 + 0.3 * share, message)
     )
     return replace(run, predictor=replace(predictor, metrics=_card_metrics(result)), evaluation=result)
 

@@ -1,0 +1,291 @@
+"""Training of the networks that see where links run, on links of known rules that only they can see."""
+
+import dataclasses
+import functools
+import logging
+import math
+
+import numpy as np
+import pytest
+from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, corridors, make_seen_links
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import PredictorError
+from sionna_partial.learning import context_fitting as module
+from sionna_partial.learning.context_fitting import fit_context_networks
+from sionna_partial.learning.context_networks import (
+    LINK_INPUTS,
+    LINK_NETWORK,
+    context_networks,
+    evaluate_context_networks,
+    link_inputs,
+    look,
+)
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.learning.networks import free_space_gain_db
+from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, plan_windows, transmitter_windows
+from sionna_partial.maps.partial_map import PartialMap
+
+pytestmark = QUIET
+
+FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+ROOMS, ROOM_CELLS, RESOLUTION_M = 4, 8, 0.5
+HALF_M = ROOMS * ROOM_CELLS * RESOLUTION_M / 2
+DISTANCE_M, GAIN_DB, STD_DB = 5.0, -100.0, 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Links:
+    """Links that differ in nothing but the rooms that their receivers are in, and the last column of indirect gains.
+
+    Half of the rooms of each map are seen, and are free on the complete map; the others are all wall there. The
+    transmitter, and receivers in rooms of both kinds, stand in cells that are not seen.
+    """
+
+    phi: LinkFeatures
+    in_seen_room: np.ndarray
+    path_seen: np.ndarray
+    complete: tuple[PartialMap, ...]
+
+    def truth(self, linked):
+        """Return true states and gains where some links (N,) are NLOS, and the others in outage."""
+        noise = np.random.default_rng(0).normal(GAIN_DB, STD_DB, len(linked))
+        return np.where(linked, NLOS, OUTAGE).astype(np.uint8), np.where(linked, noise, -150.0)
+
+
+@functools.cache
+def make_room_links(maps, links, seed):
+    rng = np.random.default_rng(seed)
+    partial, complete, in_seen_room, rx_m = [], [], [], []
+    for _ in range(maps):
+        seen = np.kron(rng.permutation(ROOMS**2).reshape(ROOMS, ROOMS) % 2, np.ones((ROOM_CELLS, ROOM_CELLS))) > 0
+        place = rng.permutation(seen.size)[:links]
+        state = np.where(seen, FREE, UNKNOWN)
+        state.ravel()[place] = state[len(seen) // 2, len(seen) // 2] = UNKNOWN
+        grid = (RESOLUTION_M, (-HALF_M, -HALF_M))
+        partial.append(PartialMap(state, *grid))
+        complete.append(PartialMap(np.where(seen, FREE, WALL), *grid))
+        in_seen_room.append(seen.ravel()[place])
+        cells = np.column_stack(np.divmod(place, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
+        rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
+    count = maps * links
+    full, path_seen = np.ones(count), rng.uniform(size=count) < 0.5
+    gains_db = np.full((count, len(REACHES_M)), -90.0)
+    gains_db[~path_seen, -1] = -150.0
+    where = (np.repeat(np.arange(maps), links), np.tile([0.01, 0.01, 1.5], (count, 1)), np.concatenate(rx_m))
+    context = LinkContext(tuple(partial), *where, gains_db, 3.0 * full)
+    phi = LinkFeatures(NLOS * full, 3.0 * full, DISTANCE_M * full, -90.0 * full, context)
+    return Links(phi, np.concatenate(in_seen_room), path_seen, tuple(complete))
+
+
+TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
+"""Arguments of `make_room_links` for links to learn from, and for links on other maps."""
+
+
+@functools.cache
+def trained(networks, rule, complete):
+    """Return networks trained by a rule, and the losses on the way: few small steps, of greater rate, are enough."""
+    links, losses = make_room_links(*TRAINING), []
+    settings = PredictorSettings(networks, passes=100 if networks == "paths" else 16)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("LEARNING_RATE", 0.01), ("WINDOWS_AT_ONCE", 8), ("_REPORT_STEPS", 8)):
+            patch.setattr(module, name, value)
+        found = fit_context_networks(
+            links.phi,
+            *links.truth(getattr(links, rule)),
+            settings,
+            complete=links.complete if complete else None,
+            progress=lambda share, message: losses.append(float(message.rpartition(" ")[2])),
+        )
+    return found, losses
+
+
+def judge(networks, rule):
+    """Return accuracy, cross-entropy and mean NLOS gain [dB] on other maps."""
+    links = make_room_links(*OTHERS)
+    state, _ = links.truth(getattr(links, rule))
+    probabilities, means_db, _ = evaluate_context_networks(networks, links.phi, FREQUENCY_HZ)
+    accuracy = (probabilities.argmax(axis=0) == state).mean()
+    entropy = -np.log(probabilities[state, np.arange(len(state))]).mean()
+    return accuracy, entropy, means_db[NLOS][state == NLOS].mean()
+
+
+def plan_entropy(networks):
+    """Return the cross-entropy of what networks say that the complete plans of other maps show."""
+    links = make_room_links(*OTHERS)
+    context = dataclasses.replace(links.phi.context, maps=links.complete)
+    plans, windows = plan_windows(context) / 255.0, transmitter_windows(links.phi.context)[0].astype(np.float32)
+    nowhere = (np.zeros((len(windows), 1, LINK_INPUTS), dtype=np.float32), np.full((len(windows), 1, 2), 32.0))
+    logits = np.asarray(look(networks, windows, nowhere[0], nowhere[1].astype(np.float32))[1], dtype=np.float64)
+    return (np.logaddexp(0.0, logits) - plans * logits).mean()
+
+
+def few_links():
+    """Return the arguments of a training that takes no time: four windows."""
+    return make_seen_links(200)
+
+
+class TestFitContextNetworks:
+    def test_links_of_the_rules_look_alike(self):
+        """The rooms are seen on the map alone, the paths in one column and what is made of it alone."""
+        links = make_room_links(*OTHERS)
+        assert np.flatnonzero(np.ptp(link_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [20, 26]
+        assert not links.phi.context.rx_seen.any()
+        assert 0.4 < links.in_seen_room.mean() < 0.6
+
+    def test_paths(self):
+        accuracy, entropy, gain_db = judge(trained("paths", "path_seen", False)[0], "path_seen")
+        assert accuracy == 1.0
+        assert entropy < 0.01
+        assert gain_db == pytest.approx(GAIN_DB, abs=1.0)
+
+    def test_paths_do_not_show_where_receivers_are(self):
+        accuracy, entropy, _ = judge(trained("paths", "in_seen_room", False)[0], "in_seen_room")
+        assert accuracy < 0.6
+        assert entropy > math.log(2.0) - 0.01
+
+    @pytest.mark.parametrize("complete", [False, True])
+    def test_map(self, complete):
+        accuracy, entropy, gain_db = judge(trained("map", "in_seen_room", complete)[0], "in_seen_room")
+        assert accuracy > 0.9
+        assert entropy < 0.5 * math.log(2.0)
+        assert gain_db == pytest.approx(GAIN_DB, abs=4.0)
+
+    def test_complete_homes_teach_how_plans_go_on(self):
+        untaught, taught = (plan_entropy(trained("map", "in_seen_room", each)[0]) for each in (False, True))
+        assert taught < 0.6 < untaught
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [("paths", "path_seen", False), ("map", "in_seen_room", False), ("map", "in_seen_room", True)],
+        ids=str,
+    )
+    def test_the_loss_falls(self, arguments):
+        found, losses = trained(*arguments)
+        assert losses[-1] < 0.6 * losses[0]
+        untrained = context_networks(0, with_map=arguments[0] == "map")
+        assert found.keys() == untrained.keys()
+        for name, network in found.items():
+            assert network.input_shape == untrained[name].input_shape
+            assert all(np.isfinite(weight).all() for weight in network.get_weights())
+
+    def test_same_links_same_weights_and_other_seeds_others(self):
+        one, again, other = (
+            fit_context_networks(*few_links(), PredictorSettings("paths", passes=8, seed=seed))[LINK_NETWORK]
+            for seed in (0, 0, 1)
+        )
+        for weight, same, different in zip(*(each.get_weights() for each in (one, again, other)), strict=True):
+            np.testing.assert_array_equal(weight, same)
+            assert (weight != different).any()
+
+    def test_paths_need_no_complete_homes(self):
+        settings = PredictorSettings("paths", passes=2)
+        one, other = (
+            fit_context_networks(*few_links(), settings, complete=complete)[LINK_NETWORK].get_weights()
+            for complete in (None, corridors())
+        )
+        assert all(np.array_equal(*weights) for weights in zip(one, other, strict=True))
+
+    def test_progress(self, monkeypatch, caplog):
+        monkeypatch.setattr(module, "_REPORT_STEPS", 2)
+        calls = []
+        with caplog.at_level(logging.INFO, module.__name__):
+            fit_context_networks(
+                *few_links(), PredictorSettings("paths", passes=18), progress=lambda *call: calls.append(call)
+            )
+        assert [share for share, _ in calls] == [0.0, 0.4, 0.8]
+        assert [message.partition(", loss ")[0] for _, message in calls] == [f"step {n} of 5" for n in (0, 2, 4)]
+        (message,) = caplog.messages
+        assert message.startswith("5 steps on 4 windows: loss ")
+
+    def test_diverging_training(self):
+        phi, state, gain_db = few_links()
+        with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
+            fit_context_networks(phi, state, gain_db + 1e25, PredictorSettings("paths", passes=1))
+
+
+class TestTurning:
+    def test_eight_ways_keep_each_place_in_its_cell(self):
+        image = np.arange(3 * WINDOW_CELLS**2).reshape(WINDOW_CELLS, WINDOW_CELLS, 3)
+        places = np.random.default_rng(3).uniform(0.5, WINDOW_CELLS - 0.5, (200, 2)).astype(np.float32)
+        expected = image[*places.T[::-1].astype(int)]
+        ways = []
+        for turn in range(8):
+            turned, moved = module._turned(image, turn), module._turned_places(places, turn)
+            np.testing.assert_array_equal(turned[*moved.T[::-1].astype(int)], expected)
+            np.testing.assert_allclose(*(abs(each - 32.0).sum(axis=1) for each in (moved, places)), rtol=1e-5)
+            ways.append(turned[:, :, 0].ravel())
+        assert len(np.unique(ways, axis=0)) == 8
+
+
+@pytest.fixture(scope="module")
+def links():
+    return make_room_links(*OTHERS)
+
+
+@pytest.fixture(scope="module")
+def examples(links):
+    """Gains are the numbers of the links."""
+    numbers = np.arange(len(links.phi), dtype=np.float64)
+    state = links.truth(links.in_seen_room)[0]
+    return module._Examples.of_links(links.phi, state, numbers, PredictorSettings("map"), links.complete)
+
+
+class TestExamples:
+    def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
+        phi, context = links.phi, links.phi.context
+        windows, index = transmitter_windows(context)
+        plans = plan_windows(dataclasses.replace(context, maps=links.complete))
+        inputs, state = link_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
+        turns = []
+        for batch in examples.batches(4, np.random.default_rng(4)):
+            for number, drawn in enumerate(batch["gain_db"].astype(int)):
+                (window,) = set(index[drawn])
+                (turn,) = (
+                    way
+                    for way in range(8)
+                    if np.array_equal(module._turned(windows[window], way), batch["windows"][number])
+                )
+                turns.append(turn)
+                np.testing.assert_array_equal(batch["plans"][number], module._turned(plans[window], turn))
+                places = (context.rx_m - context.tx_m)[drawn, :2] / CELL_M + WINDOW_CELLS / 2
+                expected = module._turned_places(places.astype(np.float32), turn)
+                np.testing.assert_allclose(batch["places"][number], expected, atol=1e-4)
+                np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
+                np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
+                free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
+                np.testing.assert_allclose(batch["free_db"][number], free_db, rtol=1e-6)
+        assert set(turns) == set(range(8))
+
+    def test_shapes_of_a_batch(self, examples):
+        (batch,) = examples.batches(1, np.random.default_rng(5))
+        size, links, square = module.WINDOWS_AT_ONCE, module.LINKS_OF_WINDOW, (WINDOW_CELLS, WINDOW_CELLS)
+        shapes = {
+            "windows": (size, *square, len(CHANNELS)),
+            "plans": (size, *square, 2),
+            "links": (size, links, LINK_INPUTS),
+            "places": (size, links, 2),
+            **dict.fromkeys(("free_db", "link_state", "gain_db"), (size, links)),
+        }
+        assert {name: values.shape for name, values in batch.items()} == shapes
+        assert {str(values.dtype) for values in batch.values()} == {"float32", "int32"}
+
+    def test_each_pass_has_every_window_once(self, links, examples):
+        index = transmitter_windows(links.phi.context)[1]
+        drawn = [
+            index[int(numbers[0])]
+            for batch in examples.batches(3, np.random.default_rng(6))
+            for numbers in batch["gain_db"]
+        ]
+        count = len(examples.windows)
+        passes = [sorted(drawn[start : start + count]) for start in range(0, len(drawn) - count, count)]
+        assert passes == [list(range(count))] * 7
+
+    def test_without_complete_homes_or_a_map_network_there_are_no_plans(self, links):
+        for networks, complete in (("map", None), ("paths", links.complete)):
+            settings = PredictorSettings(networks)
+            found = module._Examples.of_links(links.phi, *links.truth(links.path_seen), settings, complete)
+            (batch,) = found.batches(1, np.random.default_rng(7))
+            assert "plans" not in batch

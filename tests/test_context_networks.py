@@ -1,0 +1,424 @@
+"""The networks that see where links run: what goes in, what comes out, and what an empty map cannot say."""
+
+import dataclasses
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from predictor_links import FREQUENCY_HZ, LOS, NLOS, OUTAGE, QUIET, make_seen_links
+
+from sionna_partial.constants import CellState, LinkState
+from sionna_partial.learning import context_networks as module
+from sionna_partial.learning.context_networks import (
+    CONTEXT_SHAPES,
+    LINK_INPUTS,
+    LINK_NETWORK,
+    LINK_OUTPUTS,
+    MAP_FEATURES,
+    MAP_NETWORK,
+    PLAN_CHANNELS,
+    context_networks,
+    decode,
+    evaluate_context_networks,
+    link_inputs,
+    look,
+)
+from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, own_input
+from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, transmitter_windows
+from sionna_partial.maps.partial_map import PartialMap
+
+pytestmark = QUIET
+
+FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+
+COLUMNS = (
+    *("outage", "los", "nlos", "tx_seen", "rx_seen", "certain", "los_through_wall", "walled"),
+    *("distance", "log_distance", "unobserved", "unobserved_share", "observed", "strongest_unobserved"),
+    *("gain", "free_gain", *(f"indirect_{reach:g}" for reach in REACHES_M)),
+    *("gain_above_free", *(f"indirect_{reach:g}_above_free" for reach in REACHES_M)),
+)
+"""What the columns of `link_inputs` are called here."""
+
+
+def features(partial, rx_m, *, tx_m=(0.0, 0.0, 1.5), unobserved_m=0.0, state=LOS, gain_db=-70.0, indirect_db=-150.0):
+    """Return features of links on one map; all paths but the direct one have `indirect_db`, however seen they are."""
+    rx_m = np.atleast_2d(np.asarray(rx_m, dtype=np.float64))
+    count = len(rx_m)
+    tx_m = np.broadcast_to(np.asarray(tx_m, dtype=np.float64), (count, 3))
+    full = np.ones(count)
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    gains_db = np.broadcast_to(np.asarray(indirect_db, dtype=np.float64), (count, len(REACHES_M)))
+    context = LinkContext((partial,), np.zeros(count, dtype=np.int64), tx_m, rx_m, gains_db, unobserved_m * full)
+    return LinkFeatures(state * full, unobserved_m * full, distance_m, gain_db * full, context)
+
+
+def inputs(phi):
+    """Return the columns of `link_inputs` by name."""
+    return dict(zip(COLUMNS, link_inputs(phi, FREQUENCY_HZ).T, strict=True))
+
+
+def shaken(networks, seed=0):
+    """Give networks random weights everywhere, biases included, so that they say about 1, and return them."""
+    rng = np.random.default_rng(seed)
+    for network in networks.values():
+        shapes = [weight.shape for weight in network.get_weights()]
+        spreads = [1.4 / math.sqrt(math.prod(shape[:-1])) if len(shape) > 1 else 0.3 for shape in shapes]
+        network.set_weights([rng.normal(0.0, spread, shape) for spread, shape in zip(spreads, shapes, strict=True)])
+    return networks
+
+
+@pytest.fixture(scope="module")
+def networks():
+    return shaken(context_networks(0))
+
+
+@pytest.fixture(scope="module")
+def home():
+    """A map of all three kinds of cells, 16 m wide, the origin in its middle."""
+    state = np.random.default_rng(1).choice([FREE, WALL, UNKNOWN], size=(16, 16), p=[0.5, 0.1, 0.4])
+    return PartialMap(state, 1.0, (-8.0, -8.0))
+
+
+@pytest.fixture(scope="module")
+def nothing():
+    return PartialMap(np.full((80, 80), UNKNOWN), 0.5, (-20.0, -20.0))
+
+
+class TestLinkInputs:
+    def test_every_column_is_there_and_finite(self):
+        found = link_inputs(make_seen_links(500)[0], FREQUENCY_HZ)
+        assert found.shape == (500, LINK_INPUTS) == (500, len(COLUMNS))
+        assert found.dtype == np.float32
+        assert np.isfinite(found).all()
+        same = {name for name, spread in zip(COLUMNS, np.ptp(found, axis=0), strict=True) if spread == 0.0}
+        assert same == {"certain", "los_through_wall", "walled"}
+
+    @settings(max_examples=30, deadline=None)
+    @given(st.sampled_from(LinkState), st.floats(0.0, 900.0), st.floats(0.0, 1.0), st.floats(-150.0, 30.0))
+    def test_a_few_units_whatever_the_link(self, state, distance_m, share, gain_db):
+        """Only lengths beyond a building give more, and the transmitter's own place is no exception."""
+        floor = PartialMap(np.zeros((1, 100), dtype=np.uint8), 10.0, (-5.0, -5.0))
+        place = (distance_m, 0.0, 1.5)
+        phi = features(floor, place, unobserved_m=share * distance_m, state=state, gain_db=gain_db)
+        found = inputs(phi)
+        assert all(np.isfinite(column).all() for column in found.values())
+        lengths = ("distance", "unobserved", "observed", "strongest_unobserved")
+        assert max(abs(column[0]) for name, column in found.items() if name not in lengths) < 7.0
+        assert all(found[name][0] <= distance_m / 15.0 * 1.001 for name in lengths)
+
+    def test_link_states(self, home):
+        phi = features(home, np.tile([1.0, 2.0, 1.5], (3, 1)), state=np.array([OUTAGE, LOS, NLOS]))
+        found = inputs(phi)
+        np.testing.assert_array_equal([found["outage"], found["los"], found["nlos"]], np.eye(3))
+
+    def test_which_ends_are_seen(self):
+        maps = PartialMap(np.array([[FREE, UNKNOWN, WALL]]), 1.0)
+        ends = [(x, 0.5, 1.5) for x in (0.5, 1.5, 2.5)]
+        for (tx_m, tx_seen), (rx_m, rx_seen) in itertools.product(zip(ends, (1, 0, 1), strict=True), repeat=2):
+            found = inputs(features(maps, rx_m, tx_m=tx_m))
+            assert (found["tx_seen"], found["rx_seen"]) == (tx_seen, rx_seen)
+
+    @pytest.mark.parametrize("state", LinkState)
+    @pytest.mark.parametrize("unobserved_m", [0.0, 0.1])
+    @pytest.mark.parametrize("cell", [FREE, WALL, UNKNOWN])
+    def test_line_of_sight_is_certain_where_all_of_it_is_seen_to_be_free(self, state, unobserved_m, cell):
+        partial = PartialMap(np.array([[FREE, cell, FREE]]), 0.5)
+        phi = features(partial, (1.3, 0.2, 1.5), tx_m=(0.1, 0.2, 1.5), unobserved_m=unobserved_m, state=state)
+        found = inputs(phi)
+        assert found["certain"] == (state == LOS and unobserved_m == 0.0 and cell != WALL)
+        assert found["los_through_wall"] == (state == LOS and cell == WALL)
+        assert found["walled"] == (0.5 if cell == WALL else 0.0)
+
+    def test_length_in_walls(self):
+        """Along the line, on the link's own map, no more than 1 m."""
+        thin, thick = (PartialMap(np.array([[FREE] * 2 + [WALL] * cells + [FREE] * 2] * 4), 0.25) for cells in (1, 8))
+        tx_m, rx_m = np.array([0.1, 0.1, 1.5]), np.array([1.1, 0.9, 1.5])
+        slant = math.hypot(1.0, 0.8)
+        phi = features(thin, [rx_m, (0.4, 0.9, 1.5), (2.9, 0.9, 1.5)], tx_m=tx_m)
+        context = dataclasses.replace(phi.context, maps=(thin, thick), map_index=np.array([0, 0, 1]))
+        found = inputs(dataclasses.replace(phi, context=context))
+        np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 1.0], rtol=1e-6)
+
+    def test_lengths(self, home):
+        found = inputs(features(home, (3.0, 4.0, 1.5), unobserved_m=2.0, state=NLOS))
+        for name, expected in {
+            "distance": 5.0 / 15.0,
+            "log_distance": math.log(5.0),
+            "unobserved": 2.0 / 15.0,
+            "unobserved_share": 0.4,
+            "observed": 3.0 / 15.0,
+            "strongest_unobserved": 2.0 / 15.0,
+        }.items():
+            assert found[name] == pytest.approx(expected), name
+
+    def test_gains(self, home):
+        indirect_db = np.array([-80.0, -85.0, -95.0, -120.0, -150.0])
+        found = inputs(features(home, (3.0, 4.0, 1.5), gain_db=-76.0, indirect_db=indirect_db))
+        free_db = float(free_space_gain_db(5.0, FREQUENCY_HZ))
+        assert free_db == pytest.approx(-75.37, abs=0.01)
+        for name, gain_db in (
+            *(("gain", -76.0), ("free_gain", free_db)),
+            *((f"indirect_{reach:g}", gain_db) for reach, gain_db in zip(REACHES_M, indirect_db, strict=True)),
+        ):
+            assert found[name] == pytest.approx((gain_db + 150.0) / 100.0), name
+            if name != "free_gain":
+                above = min(max((gain_db - free_db) / 30.0, -2.0), 0.5)
+                assert found[f"{name}_above_free"] == pytest.approx(above, abs=1e-6), name
+
+    def test_frequency_sets_free_space_alone(self, home):
+        phi = features(home, (3.0, 4.0, 1.5), gain_db=-90.0, indirect_db=-100.0)
+        low, high = (link_inputs(phi, frequency_hz)[0] for frequency_hz in (FREQUENCY_HZ, 10.0 * FREQUENCY_HZ))
+        changed = {name for name, one, other in zip(COLUMNS, low, high, strict=True) if one != other}
+        assert changed == {"free_gain", *(name for name in COLUMNS if name.endswith("_above_free"))}
+
+    def test_moving_turning_and_mirroring_everything_changes_nothing(self, home):
+        rx_m = np.random.default_rng(2).uniform(-7.9, 7.9, (60, 3))
+        phi = features(home, rx_m, tx_m=(0.31, -0.17, 1.5), unobserved_m=0.0)
+        expected = inputs(phi)
+        assert np.ptp(expected["walled"]) > 0.5
+        assert np.ptp(expected["rx_seen"]) == 1.0
+        moved = PartialMap(home.state, 1.0, (492.0, -8.0))
+        turned = PartialMap(np.rot90(home.state, -1), 1.0, (-8.0, -8.0))
+        mirrored = PartialMap(home.state[:, ::-1], 1.0, (-8.0, -8.0))
+        for partial, where in (
+            (moved, lambda at_m: at_m + np.array([500.0, 0.0, 0.0])),
+            (turned, lambda at_m: at_m[:, [1, 0, 2]] * (-1.0, 1.0, 1.0)),
+            (mirrored, lambda at_m: at_m * (-1.0, 1.0, 1.0)),
+        ):
+            ends = {"tx_m": where(phi.context.tx_m), "rx_m": where(phi.context.rx_m)}
+            context = dataclasses.replace(phi.context, maps=(partial,), **ends)
+            for name, column in inputs(dataclasses.replace(phi, context=context)).items():
+                np.testing.assert_allclose(column, expected[name], atol=1e-6, err_msg=name)
+
+    def test_links_do_not_depend_on_each_other(self):
+        phi = make_seen_links(50)[0]
+        together = link_inputs(phi, FREQUENCY_HZ)
+        index = np.array([7, 3, 41])
+        np.testing.assert_array_equal(link_inputs(phi.take(index), FREQUENCY_HZ), together[index])
+        assert link_inputs(phi.take(slice(0)), FREQUENCY_HZ).shape == (0, LINK_INPUTS)
+
+
+class TestContextNetworks:
+    @pytest.mark.parametrize("with_map", [False, True])
+    def test_shapes_are_those_that_are_documented(self, with_map):
+        found = context_networks(0, with_map=with_map)
+        shapes = CONTEXT_SHAPES[1 + with_map]
+        assert {own_input(name): network.input_shape for name, network in found.items()} == shapes.inputs
+        assert {name: network.output_shape for name, network in found.items()} == shapes.outputs
+
+    def test_the_seed_sets_every_first_weight_that_is_not_0(self):
+        one, again, other = (context_networks(seed) for seed in (3, 3, 4))
+        for name, network in one.items():
+            weights = (each[name].get_weights() for each in (one, again, other))
+            for weight, same, different in zip(*weights, strict=True):
+                np.testing.assert_array_equal(weight, same)
+                assert np.any(weight != different) == np.any(weight != 0.0), name
+            assert sum(weight.any() for weight in network.get_weights()) >= 2
+
+    def test_single_precision_whatever_the_policy(self):
+        keras = import_keras()
+        keras.config.set_dtype_policy("float64")
+        try:
+            found = context_networks(0)
+        finally:
+            keras.config.set_dtype_policy("float32")
+        assert {str(weight.dtype) for network in found.values() for weight in network.weights} == {"float32"}
+
+
+class TestLook:
+    """With a map network that says where a cell is, and a link network that says what it is told of the map."""
+
+    MAPS = (1, WINDOW_CELLS, WINDOW_CELLS, 1)
+
+    @staticmethod
+    def told(links):
+        return links[:, LINK_INPUTS : LINK_INPUTS + LINK_OUTPUTS]
+
+    def values(self, windows):
+        """Return a window's first two channels, then x, y and x y of its cells, and 100 in an empty window, too."""
+        import tensorflow as tf
+
+        y, x = np.meshgrid(*2 * [np.arange(WINDOW_CELLS, dtype=np.float32)], indexing="ij")
+        count = windows.shape[0]
+        shares = windows / 255.0
+        known = tf.cast(tf.reduce_any(windows > 0, axis=(1, 2, 3), keepdims=True), tf.float32)
+        places = np.tile(np.stack([x, y, x * y], axis=-1), (count, 1, 1, 1)) * known
+        rest = np.full((count, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES + PLAN_CHANNELS - 5), 100.0, dtype=np.float32)
+        return tf.concat([shares[..., :2], places, rest], axis=-1)
+
+    def seen(self, windows, places):
+        links = np.zeros((*np.shape(places)[:2], LINK_INPUTS), dtype=np.float32)
+        network = {MAP_NETWORK: self.values, LINK_NETWORK: self.told}
+        outputs, plan = look(network, windows.astype(np.float32), links, np.asarray(places, dtype=np.float32))
+        return np.asarray(outputs), np.asarray(plan)
+
+    @pytest.fixture
+    def windows(self):
+        return np.random.default_rng(3).integers(1, 256, (2, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)))
+
+    def test_exact_at_the_middles_of_cells(self, windows):
+        rows, columns = np.random.default_rng(4).integers(0, WINDOW_CELLS, (2, 2, 300))
+        found, _ = self.seen(windows, np.stack([columns, rows], axis=-1) + 0.5)
+        for number in range(2):
+            row, column = rows[number], columns[number]
+            expected = windows[number, row, column, :2] / 255.0
+            np.testing.assert_allclose(found[number, :, :2], expected, atol=1e-6)
+            np.testing.assert_array_equal(found[number, :, 2:5], np.stack([column, row, column * row], axis=-1))
+
+    def test_linear_between_them(self, windows):
+        """x, y and x y are bilinear, so they are met everywhere; the noise of the windows is, from side to side."""
+        places = np.random.default_rng(5).uniform(0.5, WINDOW_CELLS - 0.5, (2, 300, 2))
+        x, y = np.moveaxis(places - 0.5, -1, 0)
+        found, _ = self.seen(windows, places)
+        np.testing.assert_allclose(found[..., 2:5], np.stack([x, y, x * y], axis=-1), rtol=1e-5, atol=1e-4)
+        start = np.array([20.5, 31.5])
+        for step in ((1.0, 0.0), (0.0, 1.0)):
+            way = np.stack([start + share * np.array(step) for share in (0.0, 0.3, 1.0)])
+            one, between, other = self.seen(windows[:1], way[None])[0][0]
+            np.testing.assert_allclose(between, 0.7 * one + 0.3 * other, atol=1e-5)
+            assert abs(one - other)[:2].min() > 0.01
+
+    def test_what_an_empty_window_says_is_taken_off(self, windows):
+        found, _ = self.seen(windows, np.full((2, 1, 2), 32.0))
+        assert (found[..., 5:] == 0.0).all()
+        empty, _ = self.seen(np.zeros_like(windows), np.full((2, 1, 2), 32.0))
+        assert not empty.any()
+
+    def test_plan_is_the_rest_of_what_the_map_network_says(self, windows):
+        plan = self.seen(windows, np.full((2, 1, 2), 32.0))[1]
+        assert plan.shape == (2, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS)
+        assert (plan == 100.0).all()
+
+    def test_without_a_map_network_links_alone_are_read(self):
+        links = np.random.default_rng(6).normal(size=(2, 3, LINK_INPUTS)).astype(np.float32)
+        outputs, plan = look(
+            {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]},
+            np.zeros((2, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), dtype=np.float32),
+            links,
+            np.zeros((2, 3, 2), dtype=np.float32),
+        )
+        np.testing.assert_array_equal(outputs, links[..., :LINK_OUTPUTS])
+        assert plan is None
+
+
+class TestDecode:
+    @pytest.fixture(autouse=True)
+    def llvm_before_tensorflow(self):
+        import_keras()
+
+    @settings(max_examples=50, deadline=None)
+    @given(st.lists(st.floats(-1e4, 1e4), min_size=LINK_OUTPUTS, max_size=LINK_OUTPUTS), st.floats(-120.0, -20.0))
+    def test_a_distribution_whatever_the_network_says(self, outputs, free_db):
+        log_p, means_db, log_variances = decode(np.array([outputs]), np.array([free_db]))
+        assert np.exp(log_p).sum() == pytest.approx(1.0)
+        assert np.isfinite(means_db).all()
+        std_db = np.exp(0.5 * np.asarray(log_variances))
+        assert (std_db >= STD_RANGE_DB[0] * (1 - 1e-9)).all()
+        assert (std_db <= STD_RANGE_DB[1] * (1 + 1e-9)).all()
+
+    def test_by_hand(self):
+        """Logits by LinkState; LOS near the gain of free space, NLOS 25 dB below it, in steps of 10 and 20 dB."""
+        outputs = [[0.0] * 7, [math.log(2.0), math.log(6.0), 0.0, 0.3, -0.5, 40.0, -40.0]]
+        log_p, means_db, log_variances = decode(np.array(outputs), np.array([-70.0, -80.0]))
+        np.testing.assert_allclose(np.exp(log_p), [[1 / 3] * 3, [2 / 9, 6 / 9, 1 / 9]])
+        np.testing.assert_allclose(means_db, [[-68.0, -95.0], [-75.0, -115.0]])
+        middle = math.sqrt(STD_RANGE_DB[0] * STD_RANGE_DB[1])
+        np.testing.assert_allclose(np.exp(0.5 * log_variances), [[middle] * 2, STD_RANGE_DB[::-1]])
+
+    def test_any_number_of_axes(self):
+        outputs = np.random.default_rng(7).normal(size=(2, 3, LINK_OUTPUTS))
+        free_db = np.random.default_rng(8).normal(-80.0, 5.0, (2, 3))
+        for found, rows in zip(decode(outputs, free_db), decode(outputs.reshape(6, -1), free_db.ravel()), strict=True):
+            np.testing.assert_allclose(found, np.reshape(rows, np.shape(found)))
+
+
+class TestEvaluateContextNetworks:
+    def test_on_an_empty_map_the_distance_is_all(self, networks, nothing):
+        """Whatever the direction, wherever the transmitter is, and whatever is known beyond its window."""
+        state = nothing.state.copy()
+        state[:, :3] = FREE
+        angles = np.linspace(0.0, 2.0 * math.pi, 9)[:-1]
+        circle = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
+        answers = {}
+        for distance_m in (2.3, 9.1):
+            for partial, tx_m in (
+                (nothing, (0.0, 0.0, 1.5)),
+                (nothing, (3.17, -4.4, 1.5)),
+                (PartialMap(state, 0.5, nothing.origin_m), (3.17, -4.4, 1.5)),
+            ):
+                phi = features(partial, tx_m + distance_m * circle, tx_m=tx_m, unobserved_m=0.9 * distance_m)
+                found = np.stack(evaluate_context_networks(networks, phi, FREQUENCY_HZ))
+                one = answers.setdefault(distance_m, found[..., :1])
+                np.testing.assert_allclose(found, np.repeat(one, 8, axis=-1), rtol=1e-5, atol=1e-5)
+        near, far = answers.values()
+        assert abs(near - far)[0].max() > 0.01
+
+    def test_on_a_map_the_place_counts(self, networks, home):
+        """The links are equal in all but where the receivers are: the map network says so."""
+        place = np.array([[2.5, 0.5, 1.5], [0.5, 2.5, 1.5]])
+        state = home.state.copy()
+        state[8:12, 8:12] = FREE
+        phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), place, tx_m=(0.5, 0.5, 1.5))
+        one, other = link_inputs(phi, FREQUENCY_HZ)
+        np.testing.assert_array_equal(one, other)
+        probabilities, *_ = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
+        assert abs(probabilities[:, 0] - probabilities[:, 1]).max() > 1e-3
+
+    def test_links_of_several_windows_keep_their_order(self, networks, home, nothing):
+        rng = np.random.default_rng(9)
+        rx_m = rng.uniform(-7.5, 7.5, (40, 3))
+        phi = features(home, rx_m, unobserved_m=0.0)
+        context = dataclasses.replace(
+            phi.context,
+            maps=(home, nothing),
+            map_index=rng.integers(0, 2, 40),
+            tx_m=rng.integers(-3, 3, (40, 3)) + 0.4,
+        )
+        phi = dataclasses.replace(phi, context=context)
+        assert len(transmitter_windows(phi.context)[0]) > 20
+        together = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
+        for number in range(0, 40, 7):
+            alone = evaluate_context_networks(networks, phi.take(slice(number, number + 1)), FREQUENCY_HZ)
+            for one, all_of_them in zip(alone, together, strict=True):
+                np.testing.assert_allclose(one[:, 0], all_of_them[:, number], rtol=1e-5, atol=1e-5)
+
+    def test_many_links_of_one_window(self, networks, home, monkeypatch):
+        phi = features(home, np.random.default_rng(10).uniform(-7.5, 7.5, (50, 3)))
+        at_once = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
+        monkeypatch.setattr(module, "_LINKS_AT_ONCE", 7)
+        for one, other in zip(evaluate_context_networks(networks, phi, FREQUENCY_HZ), at_once, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+
+    def test_they_are_what_the_networks_say(self, networks, home):
+        phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)])
+        windows, _ = transmitter_windows(phi.context)
+        places = (phi.context.rx_m - phi.context.tx_m)[:, :2] / CELL_M + WINDOW_CELLS / 2
+        arguments = (windows, link_inputs(phi, FREQUENCY_HZ)[None], places[None])
+        outputs, _ = look(networks, *(np.asarray(each, dtype=np.float32) for each in arguments))
+        free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
+        log_p, means_db, log_variances = decode(np.asarray(outputs, dtype=np.float64)[0], free_db)
+        found_p, found_db, found_std_db = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
+        np.testing.assert_allclose(found_p, np.exp(log_p).T, rtol=1e-5)
+        expected_db = [[-150.0] * 2, *np.maximum(np.transpose(means_db), -150.0)]
+        np.testing.assert_allclose(found_db, expected_db, rtol=1e-5)
+        np.testing.assert_allclose(found_std_db, [[0.0] * 2, *np.exp(0.5 * np.transpose(log_variances))], rtol=1e-5)
+        np.testing.assert_allclose(found_p.sum(axis=0), 1.0, atol=1e-12)
+
+    def test_gains_stay_above_the_floor(self, home):
+        def low(links):
+            return np.full((len(links), LINK_OUTPUTS), -50.0, dtype=np.float32)
+
+        phi = features(home, (1.0, 2.0, 1.5))
+        probabilities, means_db, stds_db = evaluate_context_networks({LINK_NETWORK: low}, phi, FREQUENCY_HZ)
+        assert (means_db == -150.0).all()
+        np.testing.assert_allclose(probabilities, 1 / 3)
+        np.testing.assert_allclose(stds_db[1:], STD_RANGE_DB[0])
+
+    def test_no_links(self, networks, home):
+        phi = features(home, (1.0, 2.0, 1.5)).take(slice(0))
+        assert [each.shape for each in evaluate_context_networks(networks, phi, FREQUENCY_HZ)] == [(3, 0)] * 3
