@@ -131,7 +131,8 @@ def predict_map(
     spacing_m : float
         Distance between receivers [m]. Their grid starts half of it inside the lower-left corner of the map.
     predictor : None, "map", "paper", path or Predictor
-        None is the shipped default, which is "map", a path one that you saved. On a complete map it is read, but not used.
+        None is the shipped default, which is "map", a path one that you saved. On a complete map it is read, but not
+        used.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     receivers : {"indoor", "anywhere"}

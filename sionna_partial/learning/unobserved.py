@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
@@ -55,28 +56,47 @@ def unknown_shares(
     state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] that are unknown."""
-    shares = np.empty(len(ends))
+    shares, alike = np.empty(len(ends)), _alike_cells(state == _UNKNOWN)
     bounds = np.linspace(0, len(ends), 1 + min(len(os.sched_getaffinity(0)), 1 + len(ends) // _SEGMENTS_OF_CORE))
     blocks = [slice(int(low), int(high)) for low, high in itertools.pairwise(bounds)]
     with ThreadPoolExecutor(len(blocks)) as pool:
-        list(pool.map(lambda block: _fill_shares(state, starts[block], ends[block], shares[block]), blocks))
+        list(pool.map(lambda block: _fill_shares(state, alike, starts[block], ends[block], shares[block]), blocks))
     return shares
+
+
+def _alike_cells(unknown: NDArray[np.bool_]) -> NDArray[np.int32]:
+    """Return how many cells in every direction, corners included, are unknown or known as the cell is."""
+    alike = np.full(unknown.shape, max(unknown.shape), dtype=np.int32)
+    for kind in (unknown, ~unknown):
+        if not kind.all():
+            alike[kind] = ndimage.distance_transform_cdt(kind, "chessboard")[kind] - 1
+    return alike
 
 
 @njit(cache=True, nogil=True)
 def _fill_shares(
-    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64], shares: NDArray[np.float64]
+    state: NDArray[np.uint8],
+    alike: NDArray[np.int32],
+    starts: NDArray[np.float64],
+    ends: NDArray[np.float64],
+    shares: NDArray[np.float64],
 ) -> None:
     for i in range(len(ends)):
-        shares[i] = _unknown_share(state, starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
+        start_x, start_y, end_x, end_y = starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1]
+        if min(abs(end_x - start_x), abs(end_y - start_y)) < _ALONG_CELLS:
+            shares[i] = _share_along_axis(state, start_x, start_y, end_x, end_y)
+        else:
+            shares[i] = _share_across(state, alike, start_x, start_y, end_x, end_y)
 
 
 @njit(cache=True)
-def _unknown_share(state: NDArray[np.uint8], start_x: float, start_y: float, end_x: float, end_y: float) -> float:
-    """Return the share of a segment that is unknown.
+def _share_across(
+    state: NDArray[np.uint8], alike: NDArray[np.int32], start_x: float, start_y: float, end_x: float, end_y: float
+) -> float:
+    """Return the share of a segment that is unknown, where it runs along no border of cells.
 
-    The grid is walked from line to line (Amanatides and Woo 1987). The distance to each line is computed afresh, so
-    that rounding does not add up. Only a segment along an axis can run along the border of cells for a while.
+    The grid is walked from line to line (Amanatides and Woo 1987), and over cells that are all alike at once. The
+    distance to each line is computed afresh, so that rounding does not add up.
     """
     ny, nx = state.shape
     step_x, step_y = end_x - start_x, end_y - start_y
@@ -84,33 +104,54 @@ def _unknown_share(state: NDArray[np.uint8], start_x: float, start_y: float, end
     enter_y, leave_y = _inside(start_y, step_y, ny)
     here, leave = max(enter_x, enter_y), min(leave_x, leave_y)
     share = 1.0 - max(0.0, leave - here)
-    turn_x, turn_y = int(np.sign(step_x)), int(np.sign(step_y))
-    pace_x = 1.0 / step_x if turn_x else 0.0
-    pace_y = 1.0 / step_y if turn_y else 0.0
-    line_x = _first_line(start_x + here * step_x, step_x)
-    line_y = _first_line(start_y + here * step_y, step_y)
-    reach_x = (line_x - start_x) * pace_x if turn_x else np.inf
-    reach_y = (line_y - start_y) * pace_y if turn_y else np.inf
-    column = int(line_x) - 1 if turn_x > 0 else int(line_x)
-    row = int(line_y) - 1 if turn_y > 0 else int(line_y)
-    along = min(abs(step_x), abs(step_y)) < _ALONG_CELLS
+    turn_x, turn_y = (1 if step_x > 0.0 else -1), (1 if step_y > 0.0 else -1)
+    pace_x, pace_y = 1.0 / step_x, 1.0 / step_y
+    line_x = int(_first_line(start_x + here * step_x, step_x))
+    line_y = int(_first_line(start_y + here * step_y, step_y))
     while here < leave:
+        column = line_x - 1 if turn_x > 0 else line_x
+        row = line_y - 1 if turn_y > 0 else line_y
+        within = 0 <= row < ny and 0 <= column < nx
+        over = alike[row, column] if within else 0
+        reach_x = (line_x + turn_x * over - start_x) * pace_x
+        reach_y = (line_y + turn_y * over - start_y) * pace_y
         there = min(max(here, min(reach_x, reach_y)), leave)
-        if along:
-            middle = 0.5 * (here + there)
-            unknown = _is_unknown(state, start_x + middle * step_x, start_y + middle * step_y)
-        else:
-            unknown = not (0 <= row < ny and 0 <= column < nx) or state[row, column] == _UNKNOWN
-        if unknown:
+        if not within or state[row, column] == _UNKNOWN:
             share += there - here
         if reach_x <= there:
-            line_x += turn_x
-            column += turn_x
-            reach_x = (line_x - start_x) * pace_x
+            line_x += turn_x * (over + 1)
+        elif over:
+            line_x = int(_first_line(start_x + there * step_x, step_x))
         if reach_y <= there:
-            line_y += turn_y
-            row += turn_y
-            reach_y = (line_y - start_y) * pace_y
+            line_y += turn_y * (over + 1)
+        elif over:
+            line_y = int(_first_line(start_y + there * step_y, step_y))
+        here = there
+    return min(max(share, 0.0), 1.0)
+
+
+@njit(cache=True)
+def _share_along_axis(state: NDArray[np.uint8], start_x: float, start_y: float, end_x: float, end_y: float) -> float:
+    """Return the share of a segment along an axis that is unknown: it may run along the border of cells for a while."""
+    ny, nx = state.shape
+    step_x, step_y = end_x - start_x, end_y - start_y
+    enter_x, leave_x = _inside(start_x, step_x, nx)
+    enter_y, leave_y = _inside(start_y, step_y, ny)
+    here, leave = max(enter_x, enter_y), min(leave_x, leave_y)
+    share = 1.0 - max(0.0, leave - here)
+    line_x = _first_line(start_x + here * step_x, step_x)
+    line_y = _first_line(start_y + here * step_y, step_y)
+    while here < leave:
+        reach_x = (line_x - start_x) / step_x if step_x != 0.0 else np.inf
+        reach_y = (line_y - start_y) / step_y if step_y != 0.0 else np.inf
+        there = min(max(here, min(reach_x, reach_y)), leave)
+        middle = 0.5 * (here + there)
+        if _is_unknown(state, start_x + middle * step_x, start_y + middle * step_y):
+            share += there - here
+        if reach_x <= there:
+            line_x += np.sign(step_x)
+        if reach_y <= there:
+            line_y += np.sign(step_y)
         here = there
     return min(max(share, 0.0), 1.0)
 
