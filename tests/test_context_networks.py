@@ -139,10 +139,10 @@ class TestLinkInputs:
         thin, thick = (PartialMap(np.array([[FREE] * 2 + [WALL] * cells + [FREE] * 2] * 4), 0.25) for cells in (1, 8))
         tx_m, rx_m = np.array([0.1, 0.1, 1.5]), np.array([1.1, 0.9, 1.5])
         slant = math.hypot(1.0, 0.8)
-        phi = features(thin, [rx_m, (0.4, 0.9, 1.5), (2.9, 0.9, 1.5)], tx_m=tx_m)
-        context = dataclasses.replace(phi.context, maps=(thin, thick), map_index=np.array([0, 0, 1]))
+        phi = features(thin, [rx_m, (0.4, 0.9, 1.5), rx_m, (2.9, 0.9, 1.5)], tx_m=tx_m)
+        context = dataclasses.replace(phi.context, maps=(thin, thick), map_index=np.array([0, 0, 1, 1]))
         found = inputs(dataclasses.replace(phi, context=context))
-        np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 1.0], rtol=1e-6)
+        np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 0.6 * slant, 1.0], rtol=1e-6)
 
     def test_lengths(self, home):
         found = inputs(features(home, (3.0, 4.0, 1.5), unobserved_m=2.0, state=NLOS))
