@@ -33,7 +33,7 @@ pytestmark = QUIET
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 ROOMS, ROOM_CELLS, RESOLUTION_M = 4, 8, 0.5
 HALF_M = ROOMS * ROOM_CELLS * RESOLUTION_M / 2
-DISTANCE_M, GAIN_DB, STD_DB = 5.0, -100.0, 3.0
+DISTANCE_M, GAIN_DB, STD_DB = 5.0, -90.0, 3.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +77,8 @@ def make_room_links(maps, links, seed):
     where = (np.repeat(np.arange(maps), links), np.tile([0.01, 0.01, 1.5], (count, 1)), np.concatenate(rx_m))
     context = LinkContext(tuple(partial), *where, gains_db, 3.0 * full)
     phi = LinkFeatures(NLOS * full, 3.0 * full, DISTANCE_M * full, -90.0 * full, context)
-    return Links(phi, np.concatenate(in_seen_room), path_seen, tuple(complete))
+    order = rng.permutation(count)
+    return Links(phi.take(order), np.concatenate(in_seen_room)[order], path_seen[order], tuple(complete))
 
 
 TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
@@ -179,6 +180,13 @@ class TestFitContextNetworks:
         for weight, same, different in zip(*(each.get_weights() for each in (one, again, other)), strict=True):
             np.testing.assert_array_equal(weight, same)
             assert (weight != different).any()
+
+    def test_the_seed_is_that_of_the_first_weights(self, monkeypatch):
+        monkeypatch.setattr(module, "LEARNING_RATE", 0.0)
+        found = fit_context_networks(*few_links(), PredictorSettings("paths", passes=1, seed=7))[LINK_NETWORK]
+        first = context_networks(7, with_map=False)[LINK_NETWORK]
+        for weight, expected in zip(found.get_weights(), first.get_weights(), strict=True):
+            np.testing.assert_array_equal(weight, expected)
 
     def test_paths_need_no_complete_homes(self):
         settings = PredictorSettings("paths", passes=2)

@@ -88,24 +88,32 @@ def test_sane_far_beyond_the_training_links(quick, partial_state):
             assert_valid(quick.predict(LinkFeatures(states, share * distance_m, distance_m, gains_db)))
 
 
-@pytest.fixture(scope="module")
-def model(quick):
-    """The networks of the paper, and one that doubles five numbers, put together."""
+def times(factor, name):
+    """Return a network that multiplies five numbers."""
     keras = import_keras()
     place = keras.Input((5,), name="five")
-    double = keras.Model(place, keras.layers.Rescaling(2.0, name="twice")(place), name="double")
-    return assemble(parts(quick.model) | {"double": double})
+    return keras.Model(place, keras.layers.Rescaling(factor, name="times")(place), name=name)
+
+
+@pytest.fixture(scope="module")
+def model(quick):
+    """The networks of the paper, and others, put together."""
+    factors = {"twice": 2.0, "never": 0.0, "once": 1.0, "double": 2.0}
+    return assemble(parts(quick.model) | {name: times(factor, name) for name, factor in factors.items()})
 
 
 class TestAssemble:
     def test_others_have_inputs_and_outputs_of_their_own(self, model):
+        others = ["double", "never", "once", "twice"]
         assert own_input("double") == "input_of_double"
-        assert set(model.input) == {*FEATURES, "input_of_double"}
-        assert set(model.output) == {*OUTPUT_WIDTHS, "double"} == set(parts(model))
+        assert list(model.input) == [*FEATURES, *map(own_input, others)]
+        assert list(model.output) == [*OUTPUT_WIDTHS, *others] == list(parts(model))
         inputs = {name: np.ones((3, 1), dtype=np.float32) for name in FEATURES}
-        five = np.arange(15, dtype=np.float32).reshape(3, 5)
-        np.testing.assert_array_equal(model(inputs | {"input_of_double": five})["double"], 2.0 * five)
-        np.testing.assert_array_equal(parts(model)["double"](five), 2.0 * five)
+        inputs |= {own_input(name): np.full((3, 5), number, dtype=np.float32) for number, name in enumerate(others)}
+        outputs = model(inputs)
+        for name, expected in {"double": 0.0, "never": 0.0, "once": 2.0, "twice": 6.0}.items():
+            np.testing.assert_array_equal(outputs[name], np.full((3, 5), expected))
+        np.testing.assert_array_equal(parts(model)["double"](np.ones((2, 5))), np.full((2, 5), 2.0))
 
     def test_evaluation_of_the_papers_leaves_others_out(self, quick, model):
         phi = make_links(30, seed=3)[0]
