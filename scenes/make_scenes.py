@@ -28,7 +28,7 @@ HOMES: dict[str, dict[str, Any]] = {
 
 README = """# Homes
 
-Procedural homes, written by `make_scenes.py` from the seeds below. `complete` holds the whole home, `step050` to
+Procedural homes, written by `make_scenes.py` from the seeds below, without locked rooms. `complete` holds the whole home, `step050` to
 `step200` what a simulated robot has seen after so many steps. Each is a scene folder: `scene.xml` loads in stock
 `sionna.rt.load_scene`, and `map.yaml` is a ROS map. `homes.json` holds the same as this table, for programs.
 
@@ -42,7 +42,7 @@ def main(folder: Path) -> None:
     """Write all homes and their descriptions into `folder`."""
     rows = []
     for name, recipe in HOMES.items():
-        home = make_home(recipe["seed"], recipe["kind"])
+        home = make_home(recipe["seed"], recipe["kind"], locked_rooms=False)
         stages = explore(home, STEPS, seed=recipe["exploration_seed"])
         export_scene(home, folder / name / "complete")
         for steps, partial in zip(STEPS, stages, strict=True):

@@ -295,6 +295,18 @@ def test_a_predictor_is_used_as_it_is(fakes):
     assert predict_map(map_of(PICTURE), TX, spacing_m=0.5, predictor=predictor).attrs["predictor"] == "mine"
 
 
+def test_the_predictor_is_told_where_links_run(fakes, monkeypatch):
+    predictor, seen = FakePredictor(), []
+    monkeypatch.setattr(predictor, "predict", lambda phi: seen.append(phi) or FakePredictor().predict(phi))
+    partial = map_of(PICTURE)
+    coverage = predict_map(partial, TX, spacing_m=0.5, predictor=predictor)
+    (phi,) = seen
+    assert phi.context.maps == (partial,)
+    receivers = np.stack(np.meshgrid(coverage["x"], coverage["y"]), axis=-1)[coverage["valid"].to_numpy()]
+    np.testing.assert_allclose(phi.context.rx_m, np.column_stack([receivers, np.full(len(receivers), 1.5)]))
+    np.testing.assert_allclose(phi.context.tx_m, np.tile([*TX, 1.5], (len(receivers), 1)))
+
+
 def test_a_predictor_trained_at_another_frequency_is_warned_about(fakes, caplog):
     predict_map(map_of(PICTURE), TX, spacing_m=0.5)
     assert not caplog.messages

@@ -194,7 +194,7 @@ def test_resolution_keeps_the_plan():
 @pytest.mark.parametrize("name", ["apartment", "house", "office"])
 def test_shipped_homes_are_what_their_seeds_make(name):
     recipe = json.loads((SCENES / "homes.json").read_text())[name]
-    home = make_home(recipe["seed"], recipe["kind"])
+    home = make_home(recipe["seed"], recipe["kind"], locked_rooms=False)
     assert load_map(SCENES / name / "complete") == home
     stages = explore(home, seed=recipe["exploration_seed"])
     assert [load_map(SCENES / name / f"step{steps:03d}") for steps in (50, 100, 150, 200)] == stages
@@ -216,3 +216,16 @@ def test_kind_must_be_known():
 def test_resolution_must_be_in_range(resolution_m):
     with pytest.raises(SettingsError, match=r"resolution_m = .* is not allowed: give a number in \[0\.01, 0\.2\]"):
         make_home(0, resolution_m=resolution_m)
+
+
+def test_without_locked_rooms_all_is_within_reach_and_the_rest_is_the_same():
+    apart = 0
+    for seed in range(40):
+        home, within = make_home(seed, resolution_m=0.1), make_home(seed, resolution_m=0.1, locked_rooms=False)
+        assert ndimage.label(within.state == CellState.FREE)[1] == 1
+        if ndimage.label(home.state == CellState.FREE)[1] == 1:
+            assert home == within
+        else:
+            apart += 1
+            assert (home.state == CellState.FREE).sum() > (within.state == CellState.FREE).sum()
+    assert apart

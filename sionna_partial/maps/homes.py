@@ -94,7 +94,9 @@ STYLES: dict[str, _Style] = {
 """The kinds of homes that can be made; areas are those of the outline."""
 
 
-def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 0.05) -> PartialMap:
+def make_home(
+    seed: int, kind: HomeKind | None = None, *, resolution_m: float = 0.05, locked_rooms: bool = True
+) -> PartialMap:
     """Make a complete floor plan.
 
     Parameters
@@ -105,6 +107,8 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
         Kind of home; None draws one.
     resolution_m : float
         Edge of a cell [m], 0.01 to 0.2.
+    locked_rooms : bool
+        Whether the home may have free rooms that are out of reach; the rest of it does not depend on it.
 
     Returns
     -------
@@ -124,9 +128,9 @@ def make_home(seed: int, kind: HomeKind | None = None, *, resolution_m: float = 
     require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)
     style = STYLES[kind or str(rng.choice(list(STYLES), p=[each.share for each in STYLES.values()]))]
-    plan = _draw(rng, style)
+    plan = _draw(rng, style, locked_rooms=locked_rooms)
     while plan is None:
-        plan = _draw(rng, style)
+        plan = _draw(rng, style, locked_rooms=locked_rooms)
     thickness_m = rng.choice([0.0, rng.uniform(0.13, 0.25)], p=[0.85, 0.15])
     corners = bool(thickness_m > 0 or rng.random() < 0.3)
     angle_deg = float(rng.choice([0.0, rng.uniform(-45, 45)], p=[0.3, 0.7]))
@@ -150,7 +154,7 @@ class _Plan:
 _SHAPES = ("free", "shut", "lines")
 
 
-def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
+def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
     """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
     outline = _outline(rng, _log_uniform(rng, style.area))
@@ -171,7 +175,7 @@ def _draw(rng: np.random.Generator, kind: _Style) -> _Plan | None:
         return None
     free = next(part for part in parts_of(free) if part.intersects(walked[0]))
     waves = rng.normal(size=(_WAVES, 3))
-    shut = _shut(locked if rng.spawn(1)[0].random() < SHUT_SHARE else [], free, style.wall)
+    shut = _shut(locked if locked_rooms and rng.spawn(1)[0].random() < SHUT_SHARE else [], free, style.wall)
     return _Plan(free, shut, lines, style.swelling, style.raggedness, waves)
 
 
