@@ -124,7 +124,7 @@ def train(
     settings: PredictorSettings | None = None,
     progress: Progress | None = None,
 ) -> TrainingRun:
-    """Train the paper's predictor and the fitted baselines on some homes, and measure them on the others.
+    """Train a predictor and the fitted baselines on some homes, and measure them on the others.
 
     Homes are split at random (see `split_homes`), links of one home never are. Link state and gain are learned from
     links with receivers drawn indoors; P(indoor) from receivers drawn anywhere on the map that are not in an observed
@@ -137,7 +137,8 @@ def train(
     test_share : float
         Share of the homes that is kept for testing, in [0, 1).
     settings : PredictorSettings, optional
-        Frequency and diffraction must be those of the data set, and are by default; the seed splits the homes, too.
+        Networks "map" by default. Frequency and diffraction must be those of the data set, and are by default; the seed
+        splits the homes, too.
     progress : callable, optional
         Called as ``progress(share_done, message)``.
 
