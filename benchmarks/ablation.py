@@ -31,7 +31,7 @@ from stage_scores import (
 )
 
 import sionna_partial as sp
-from sionna_partial.learning.fitting import NetworkKind
+from sionna_partial.settings import NetworkKind
 from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
 from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.train import split_homes

@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
 from sionna_partial.files import atomic_files
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.maps.homes import HomeKind
 from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.figures import BLUE, RED, figure_png
+from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import trace_each
 from sionna_partial.training.home_links import home_links, map_area
 from sionna_partial.training.home_sources import home_sources

@@ -13,6 +13,7 @@ from sionna_partial.files import atomic_write
 from sionna_partial.training.evaluate import home_scores, mean_and_error
 from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.metrics import DEFINITIONS, Metrics, measure
+from sionna_partial.training.report import markdown_table
 
 INDOORS = "Receivers were drawn indoors. A stage is the number of steps that the robot has explored."
 
@@ -80,15 +81,6 @@ def stage_header(head: str, scores: Scores) -> list[str]:
 def definitions(names: Iterable[str]) -> str:
     """Say what figures of merit are, a line for each."""
     return "\n".join(f"- {NAMES[name]}: {DEFINITIONS[name]}" for name in names)
-
-
-def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Lay out a Markdown table, its columns aligned for the eye."""
-    cells = [list(header), *map(list, rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    head, *lines = [" | ".join([name.ljust(widths[0]), *map(str.rjust, texts, widths[1:])]) for name, *texts in cells]
-    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-    return "\n".join(f"| {line} |" for line in (head, " | ".join(rule), *lines))
 
 
 def publish(report: str, out: Path | None) -> None:

@@ -1,7 +1,7 @@
 """The demo: what a half-explored home that ships with the package tells, beside the truth."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial as bind
 from os import PathLike
 from pathlib import Path
@@ -78,13 +78,7 @@ def run_demo(
     """
     report = progress or (lambda share, message: None)
     complete, known, tx = demo_scene(home, step)
-    nothing = PartialMap(
-        np.full_like(complete.state, CellState.UNKNOWN),
-        complete.resolution_m,
-        complete.origin_m,
-        complete.wall_height_m,
-        complete.interior_cells,
-    )
+    nothing = replace(complete, state=np.full_like(complete.state, CellState.UNKNOWN))
     report(0.0, "loading the predictor")
     predictor = Predictor.load()
     coverages = {}

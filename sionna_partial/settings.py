@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, field
 from numbers import Integral, Real
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, get_args
 
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
@@ -16,56 +16,17 @@ from sionna_partial.errors import SettingsError
 
 ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
     "vacuum": ((0.001, 100.0),),
-    "concrete": (
-        (1.0, 100.0),
-        (110.0, 330.0),
-    ),
-    "brick": (
-        (1.0, 40.0),
-        (110.0, 330.0),
-    ),
-    "plasterboard": (
-        (1.0, 100.0),
-        (110.0, 330.0),
-        (100.0, 400.0),
-    ),
-    "wood": (
-        (0.001, 100.0),
-        (110.0, 330.0),
-        (100.0, 400.0),
-    ),
-    "glass": (
-        (0.1, 100.0),
-        (220.0, 450.0),
-        (100.0, 400.0),
-    ),
+    "concrete": ((1.0, 100.0), (110.0, 330.0)),
+    "brick": ((1.0, 40.0), (110.0, 330.0)),
+    "plasterboard": ((1.0, 100.0), (110.0, 330.0), (100.0, 400.0)),
+    "wood": ((0.001, 100.0), (110.0, 330.0), (100.0, 400.0)),
+    "glass": ((0.1, 100.0), (220.0, 450.0), (100.0, 400.0)),
     "clear_acrylic": ((110.0, 330.0),),
-    "ceiling_board": (
-        (1.0, 100.0),
-        (220.0, 450.0),
-        (100.0, 400.0),
-    ),
-    "chipboard": (
-        (1.0, 100.0),
-        (100.0, 200.0),
-    ),
-    "plywood": (
-        (1.0, 40.0),
-        (110.0, 330.0),
-        (100.0, 400.0),
-    ),
-    "marble": (
-        (1.0, 60.0),
-        (110.0, 330.0),
-        (100.0, 400.0),
-    ),
-    "floorboard": (
-        (50.0, 100.0),
-        (220.0, 300.0),
-        (300.0, 400.0),
-        (400.0, 450.0),
-        (100.0, 400.0),
-    ),
+    "ceiling_board": ((1.0, 100.0), (220.0, 450.0), (100.0, 400.0)),
+    "chipboard": ((1.0, 100.0), (100.0, 200.0)),
+    "plywood": ((1.0, 40.0), (110.0, 330.0), (100.0, 400.0)),
+    "marble": ((1.0, 60.0), (110.0, 330.0), (100.0, 400.0)),
+    "floorboard": ((50.0, 100.0), (220.0, 300.0), (300.0, 400.0), (400.0, 450.0), (100.0, 400.0)),
     "vinyl_tile": ((1.0, 40.0),),
     "carpet_tile": ((1.0, 40.0),),
     "asphalt_concrete": ((1.0, 40.0),),
@@ -79,6 +40,9 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 
 FREQUENCIES_HZ = (1e6, 1e12)
 """Lowest and highest carrier frequency [Hz]."""
+
+NetworkKind = Literal["paper", "paths", "map"]
+"""What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
 
 _Settings = TypeVar("_Settings")
 
@@ -94,6 +58,11 @@ def require_number(name: str, value: object, low: float, high: float, *, open_lo
     number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
     inside = (low < number if open_low else low <= number) and number <= high
     require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].")
+
+
+def is_whole(value: object) -> bool:
+    """Whether `value` is a whole number of 0 or more."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> None:
@@ -143,6 +112,8 @@ class Material:
         require_number("relative_permittivity", self.relative_permittivity, 1.0, 1e6)
         require_number("conductivity_s_m", self.conductivity_s_m, 0.0, 1e9)
         require_number("thickness_m", self.thickness_m, 0.0, 10.0, open_low=True)
+        for name in ("relative_permittivity", "conductivity_s_m", "thickness_m"):
+            object.__setattr__(self, name, float(getattr(self, name)))  # files hold no numbers of NumPy
         known = ", ".join(ITU_BANDS_GHZ)
         require(self.itu is None or self.itu in tuple(ITU_BANDS_GHZ), "itu", self.itu, f"choose one of {known}.")
 
@@ -347,8 +318,7 @@ class DatasetSettings:
         remedy = f"give at least {self.transmitters_per_home}, one for each of the transmitters_per_home."
         require(enough, "links_per_home", self.links_per_home, remedy)
         remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200)."
-        require(isinstance(self.stages, tuple) and len(self.stages) > 0, "stages", self.stages, remedy)
-        whole = all(isinstance(steps, Integral) and not isinstance(steps, bool) and steps >= 0 for steps in self.stages)
+        whole = isinstance(self.stages, tuple) and len(self.stages) > 0 and all(map(is_whole, self.stages))
         require(whole and list(self.stages) == sorted(set(self.stages)), "stages", self.stages, remedy)
         for name in ("tx_height_m", "rx_height_m"):
             require_number(name, getattr(self, name), 0.0, 1000.0, open_low=True)
@@ -356,3 +326,58 @@ class DatasetSettings:
         require(isinstance(self.scene, SceneSettings), "scene", self.scene, "give SceneSettings(...).")
         require(isinstance(self.trace, TraceSettings), "trace", self.trace, "give TraceSettings(...).")
         self.scene.material.require_frequency(self.trace.frequency_hz)
+
+
+@dataclass(frozen=True)
+class PredictorSettings:
+    """How a predictor is trained.
+
+    Parameters
+    ----------
+    networks : {"paper", "paths", "map"}
+        "paper" has the networks of the paper alone. "paths" has one beside them that sees what each path crosses, "map"
+        two, of which one sees the map around the transmitter; both need features with a context, as `link_features`
+        gives them.
+    frequency_hz : float
+        Carrier frequency of the links [Hz]; it sets the gain of free space.
+    diffraction : bool
+        Whether the links were traced with diffraction.
+    passes : int
+        How many times the networks beside those of the paper see each transmitter on each map.
+    steps : int
+        Gradient steps of each of the paper's networks.
+    batch_size : int
+        Links in such a step.
+    learning_rate : float
+        Of Adam at the first such step; it falls to 0 along a cosine.
+    minimum_links : int
+        A network of the paper with fewer links is not trained: it says mean and spread of those it has and of prior
+        knowledge.
+    seed : int
+        Of first weights and batches.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+    """
+
+    networks: NetworkKind = "paper"
+    frequency_hz: float = CARRIER_FREQUENCY_HZ
+    diffraction: bool = True
+    passes: int = 13
+    steps: int = 4000
+    batch_size: int = 1024
+    learning_rate: float = 0.01
+    minimum_links: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        kinds = get_args(NetworkKind)
+        require(self.networks in kinds, "networks", self.networks, f"choose one of {kinds}.")
+        require_number("frequency_hz", self.frequency_hz, *FREQUENCIES_HZ)
+        require(isinstance(self.diffraction, bool), "diffraction", self.diffraction, "give True or False.")
+        require_number("learning_rate", self.learning_rate, 0.0, 1.0, open_low=True)
+        for name in ("passes", "steps", "batch_size", "minimum_links"):
+            require_whole(name, getattr(self, name), 1, 1_000_000)
+        require_whole("seed", self.seed, 0, 1_000_000_000)

@@ -168,9 +168,9 @@ class TestTr38901Indoor:
 class TestAnswers:
     def test_all_answer_for_all_links(self, fitted):
         phi = make_links(30)[0]
-        found = answers(fitted.distance, fitted, fitted.distance, phi)
+        found = answers(fitted, fitted.distance, phi, 28e9)
         assert list(found) == [
-            *("predictor", "paper", "distance only", "majority", "partial trace"),
+            *("paper", "distance only", "majority", "partial trace"),
             *("TR 38.901 mixed office", "TR 38.901 open office"),
         ]
         for answer in found.values():
@@ -178,4 +178,4 @@ class TestAnswers:
             assert len(answer.p_los) == 30
 
     def test_without_the_papers(self, fitted):
-        assert "paper" not in answers(fitted.distance, fitted, None, make_links(3)[0])
+        assert "paper" not in answers(fitted, None, make_links(3)[0], 28e9)

@@ -22,11 +22,11 @@ from sionna_partial.learning.context_networks import (
     look,
 )
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import free_space_gain_db
 from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, plan_windows, transmitter_windows
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -287,7 +287,7 @@ class TestExamples:
             for batch in examples.batches(3, np.random.default_rng(6))
             for numbers in batch["gain_db"]
         ]
-        count = len(examples.windows)
+        count = len(examples)
         passes = [sorted(drawn[start : start + count]) for start in range(0, len(drawn) - count, count)]
         assert passes == [list(range(count))] * 7
 
@@ -297,3 +297,4 @@ class TestExamples:
             found = module._Examples.of_links(links.phi, *links.truth(links.path_seen), settings, complete)
             (batch,) = found.batches(1, np.random.default_rng(7))
             assert "plans" not in batch
+            assert ("windows" in batch) == (networks == "map")

@@ -19,7 +19,6 @@ from sionna_partial.learning.context_networks import (
     LINK_OUTPUTS,
     MAP_FEATURES,
     MAP_NETWORK,
-    PLAN_CHANNELS,
     context_networks,
     decode,
     evaluate_context_networks,
@@ -29,7 +28,7 @@ from sionna_partial.learning.context_networks import (
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, own_input
-from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, transmitter_windows
+from sionna_partial.learning.windows import CELL_M, CHANNELS, PLAN_CHANNELS, WINDOW_CELLS, transmitter_windows
 from sionna_partial.maps.partial_map import PartialMap
 
 pytestmark = QUIET
@@ -143,6 +142,11 @@ class TestLinkInputs:
         context = dataclasses.replace(phi.context, maps=(thin, thick), map_index=np.array([0, 0, 1, 1]))
         found = inputs(dataclasses.replace(phi, context=context))
         np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 0.6 * slant, 1.0], rtol=1e-6)
+
+    def test_no_wall_is_known_beyond_the_map(self):
+        floor = PartialMap(np.zeros((4, 4), dtype=np.uint8), 0.25)
+        found = inputs(features(floor, (9.0, 0.3, 1.5), tx_m=(-3.0, 0.4, 1.5), unobserved_m=11.0))
+        assert (found["walled"], found["los_through_wall"]) == (0.0, 0.0)
 
     def test_lengths(self, home):
         found = inputs(features(home, (3.0, 4.0, 1.5), unobserved_m=2.0, state=NLOS))
@@ -297,10 +301,7 @@ class TestLook:
     def test_without_a_map_network_links_alone_are_read(self):
         links = np.random.default_rng(6).normal(size=(2, 3, LINK_INPUTS)).astype(np.float32)
         outputs, plan = look(
-            {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]},
-            np.zeros((2, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), dtype=np.float32),
-            links,
-            np.zeros((2, 3, 2), dtype=np.float32),
+            {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]}, None, links, np.zeros((2, 3, 2), dtype=np.float32)
         )
         np.testing.assert_array_equal(outputs, links[..., :LINK_OUTPUTS])
         assert plan is None
@@ -408,6 +409,19 @@ class TestEvaluateContextNetworks:
         np.testing.assert_allclose(found_db, expected_db, rtol=1e-5)
         np.testing.assert_allclose(found_std_db, [[0.0] * 2, *np.exp(0.5 * np.transpose(log_variances))], rtol=1e-5)
         np.testing.assert_allclose(found_p.sum(axis=0), 1.0, atol=1e-12)
+
+    @pytest.mark.parametrize("with_map", [False, True])
+    def test_windows_are_drawn_for_a_map_network_alone(self, home, monkeypatch, with_map):
+        drawn = []
+
+        def counted(context):
+            drawn.append(len(context))
+            return transmitter_windows(context)
+
+        monkeypatch.setattr(module, "transmitter_windows", counted)
+        phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)])
+        evaluate_context_networks(context_networks(0, with_map=with_map), phi, FREQUENCY_HZ)
+        assert drawn == ([2] if with_map else [])
 
     def test_gains_stay_above_the_floor(self, home):
         def low(links):

@@ -5,7 +5,7 @@ import pytest
 from link_tables import make_dataset, make_table
 
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.learning.fitting import PredictorSettings
+from sionna_partial.settings import PredictorSettings
 from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
 
 

@@ -5,10 +5,11 @@ import re
 import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
-from predictor_links import LOS, OUTAGE, QUIET, quick_predictor
+from predictor_links import LOS, OUTAGE, QUIET, context_predictor, quick_predictor
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
+from sionna_partial.learning.windows import transmitter_windows
 from sionna_partial.training import evaluate as evaluate_module
 from sionna_partial.training.baselines import Baselines
 from sionna_partial.training.evaluate import (
@@ -131,11 +132,24 @@ class TestEvaluate:
         assert {(row.metrics.accuracy, row.metrics.rmse_db, row.metrics.nll_state) for row in rows} == {(1.0, 0.0, 0.0)}
         assert set(right.link_state) >= {LOS, OUTAGE}
 
+    def test_windows_of_a_stage_are_drawn_once(self, table, monkeypatch):
+        """For the test homes and for the training homes."""
+        drawn = []
+
+        def counted(context):
+            drawn.append(len(context))
+            return transmitter_windows(context)
+
+        monkeypatch.setattr("sionna_partial.learning.context_networks.transmitter_windows", counted)
+        predictor = dataclasses.replace(context_predictor("map"), homes=("home 0",))
+        evaluate(predictor, table, baselines=fitted_baselines())
+        assert drawn == [3 * 600, 3 * 600, 600, 600]
+
     def test_progress(self, table):
         calls = []
         evaluate(trained_on("home 0"), table, baselines=fitted_baselines(), progress=lambda *call: calls.append(call))
-        assert calls[0] == (0.0, "measuring on test homes after 0 steps, receivers indoor")
-        assert calls[-1] == (0.875, "measuring on train homes after 100 steps, receivers anywhere")
+        assert calls[0] == (0.0, "measuring on test homes after 0 steps")
+        assert calls[-1] == (0.75, "measuring on train homes after 100 steps")
 
 
 class TestHomeScores:

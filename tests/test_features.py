@@ -1,26 +1,20 @@
 import dataclasses
+import functools
 import re
 
+import extruded
 import numpy as np
 import pytest
 
-from sionna_partial.constants import CellState, LinkState
+from sionna_partial.constants import LinkState
 from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.learning.features import LinkFeatures, link_features, unobserved_distance_m
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.unobserved import unobserved_lengths_m
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import TracedLinks
 
-SYMBOLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
-
-
-def drawn(text, resolution_m=1.0, origin_m=(0.0, 0.0)):
-    """Return the map of an ASCII drawing, top line = largest y."""
-    rows = [[SYMBOLS[symbol] for symbol in line.strip()] for line in text.split()][::-1]
-    return PartialMap(np.array(rows), resolution_m, origin_m)
-
+drawn = functools.partial(extruded.drawn, resolution_m=1.0)
 
 HALF = drawn("""
     ##########

@@ -1,5 +1,4 @@
 import dataclasses
-import re
 
 import numpy as np
 import pytest
@@ -18,11 +17,11 @@ from predictor_links import (
 )
 
 from sionna_partial.constants import LinkState
-from sionna_partial.errors import PredictorError, SettingsError
+from sionna_partial.errors import PredictorError
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.networks import free_space_gain_db
 from sionna_partial.learning.predictor import Predictor
+from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -120,23 +119,3 @@ def test_diverging_training():
         PredictorError, match=r"training of gain_\w+ diverged: learning_rate = 0.01, give a smaller one"
     ):
         Predictor.fit(phi, state, np.where(gain_db > -150.0, gain_db + 1e30, gain_db), settings=settings)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed"),
-        ({"learning_rate": 0.0}, "learning_rate = 0.0 is not allowed: give a number in (0, 1]"),
-        ({"networks": "Map"}, "networks = 'Map' is not allowed: choose one of ('paper', 'paths', 'map')."),
-        ({"networks": None}, "networks = None is not allowed: choose one of"),
-        ({"diffraction": 1}, "diffraction = 1 is not allowed: give True or False."),
-        ({"passes": 0}, "passes = 0 is not allowed: give a whole number in [1, 1000000]."),
-        ({"steps": 1.5}, "steps = 1.5 is not allowed: give a whole number in [1, 1000000]."),
-        ({"batch_size": 0}, "batch_size = 0 is not allowed: give a whole number in [1, 1000000]."),
-        ({"minimum_links": True}, "minimum_links = True is not allowed: give a whole number in [1, 1000000]."),
-        ({"seed": -1}, "seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
-    ],
-)
-def test_bad_settings(change, message):
-    with pytest.raises(SettingsError, match=re.escape(message)):
-        PredictorSettings(**change)

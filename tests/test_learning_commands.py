@@ -10,8 +10,8 @@ from predictor_links import QUIET, quick_predictor
 from typer.testing import CliRunner, Result
 
 from sionna_partial import cli
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.predictor import Predictor
+from sionna_partial.settings import PredictorSettings
 
 pytestmark = [QUIET, pytest.mark.usefixtures("command_line")]
 

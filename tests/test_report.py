@@ -9,7 +9,7 @@ from predictor_links import QUIET, quick_predictor
 from sionna_partial.errors import OutputError
 from sionna_partial.training.evaluate import WITH_INDOOR, evaluate
 from sionna_partial.training.metrics import DEFINITIONS
-from sionna_partial.training.report import REPORT_FILES, as_json, markdown, save_report, summary
+from sionna_partial.training.report import REPORT_FILES, as_json, markdown, markdown_table, save_report, summary
 
 pytestmark = QUIET
 
@@ -105,6 +105,18 @@ class TestMarkdown:
         whole, less = (tables(markdown(each)) for each in (evaluation, dataclasses.replace(evaluation, rows=rows)))
         title = "Test homes, receivers indoors"
         assert len(less[title]) == len(whole[title]) - 1
+
+
+class TestMarkdownTable:
+    def test_names_to_the_left_and_figures_to_the_right(self):
+        rows = [["a", "long name", "1.5"], ["bb", "b", "100.25"]]
+        assert markdown_table(["x", "name", "figure"], rows, names=2).splitlines() == [
+            "| x  | name      | figure |",
+            "| -- | --------- | -----: |",
+            "| a  | long name |    1.5 |",
+            "| bb | b         | 100.25 |",
+        ]
+        assert markdown_table(["x", "figure"], []).splitlines() == ["| x | figure |", "| - | -----: |"]
 
 
 class TestAsJson:

@@ -18,6 +18,7 @@ from sionna_partial.settings import (
     ITU_BANDS_GHZ,
     DatasetSettings,
     Material,
+    PredictorSettings,
     SceneSettings,
     SensorSettings,
     TraceSettings,
@@ -240,3 +241,24 @@ class TestDatasetSettings:
     def test_material_that_the_frequency_does_not_suit(self) -> None:
         with pytest.raises(SettingsError, match=r"ITU material 'carpet_tile' is defined for 1-40 GHz"):
             DatasetSettings(scene=SceneSettings(Material(itu="carpet_tile")), trace=TraceSettings(frequency_hz=60e9))
+
+
+class TestPredictorSettings:
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed"),
+            ({"learning_rate": 0.0}, "learning_rate = 0.0 is not allowed: give a number in (0, 1]"),
+            ({"networks": "Map"}, "networks = 'Map' is not allowed: choose one of ('paper', 'paths', 'map')."),
+            ({"networks": None}, "networks = None is not allowed: choose one of"),
+            ({"diffraction": 1}, "diffraction = 1 is not allowed: give True or False."),
+            ({"passes": 0}, "passes = 0 is not allowed: give a whole number in [1, 1000000]."),
+            ({"steps": 1.5}, "steps = 1.5 is not allowed: give a whole number in [1, 1000000]."),
+            ({"batch_size": 0}, "batch_size = 0 is not allowed: give a whole number in [1, 1000000]."),
+            ({"minimum_links": True}, "minimum_links = True is not allowed: give a whole number in [1, 1000000]."),
+            ({"seed": -1}, "seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
+        ],
+    )
+    def test_refused(self, change: dict[str, object], message: str) -> None:
+        with pytest.raises(SettingsError, match=re.escape(message)):
+            PredictorSettings(**change)

@@ -8,9 +8,9 @@ from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET
 
 from sionna_partial.errors import OutputError, PredictorError, SettingsError
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import PredictorSettings
 from sionna_partial.training.baselines import Baselines
 from sionna_partial.training.evaluate import evaluate
 from sionna_partial.training.link_table import LinkTable

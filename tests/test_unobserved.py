@@ -1,8 +1,10 @@
 """How much of segments runs through unknown cells: by hand, in exact fractions, and by its properties."""
 
+import functools
 from fractions import Fraction
 from itertools import pairwise, product
 
+import extruded
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -10,18 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState
-from sionna_partial.learning.unobserved import unknown_shares, unobserved_lengths_m
+from sionna_partial.learning.unobserved import unknown_shares, unobserved_lengths_m, wall_shares, walled_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
 
-SYMBOLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
 FREE, WALL, UNKNOWN = (int(state) for state in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
 
 
-def drawn(text, resolution_m=1.0, origin_m=(0.0, 0.0)):
-    """Return the map of an ASCII drawing, top line = largest y."""
-    rows = [[SYMBOLS[symbol] for symbol in line.strip()] for line in text.split()][::-1]
-    return PartialMap(np.array(rows), resolution_m, origin_m)
-
+drawn = functools.partial(extruded.drawn, resolution_m=1.0)
 
 HALF = drawn("""
     ##########
@@ -75,7 +72,7 @@ def test_diagonal_through_corners_by_hand():
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0), (0.1, 0.7)])
 @pytest.mark.parametrize("upright", [False, True])
 def test_segment_along_a_border_is_in_the_freest_cell(below, above, expected_m, origin_m, upright):
-    partial = drawn(f"?{above}?\n?{below}?", 0.1, origin_m)
+    partial = drawn(f"?{above}?\n?{below}?", resolution_m=0.1, origin_m=origin_m)
     ends = np.array([[0.1, 0.1], [0.2, 0.1]])
     if upright:
         partial, ends = PartialMap(partial.state.T, 0.1, origin_m), ends[:, ::-1]
@@ -103,9 +100,19 @@ def test_everything_on_an_unknown_map():
     np.testing.assert_allclose(unobserved_lengths_m(nothing, starts, ends), lengths_m, rtol=1e-12)
 
 
-def test_no_segments():
-    assert unobserved_lengths_m(HALF, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
-    assert unobserved_lengths_m(HALF, np.zeros(3), np.zeros((0, 3))).shape == (0,)
+@pytest.mark.parametrize("measure", [unobserved_lengths_m, walled_lengths_m])
+def test_no_segments(measure):
+    assert measure(HALF, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+    assert measure(HALF, np.zeros(3), np.zeros((0, 3))).shape == (0,)
+
+
+def test_many_segments_are_measured_as_few(monkeypatch):
+    """By several threads."""
+    starts, ends = np.random.default_rng(2).uniform(-1.0, 11.0, (2, 100, 2))
+    expected = unknown_shares(HALF.state, starts, ends)
+    monkeypatch.setattr("sionna_partial.learning.unobserved._SEGMENTS_OF_CORE", 1)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: range(3))
+    assert unknown_shares(HALF.state, starts, ends).tolist() == expected.tolist()
 
 
 def test_segments_do_not_know_of_each_other():
@@ -150,6 +157,45 @@ def exact_share(state, start, end):
         if is_unknown(state, *(place + (here + there) / 2 * step for place, step in zip(places, steps, strict=True))):
             share += there - here
     return float(share)
+
+
+class TestWalls:
+    @pytest.mark.parametrize(
+        ("start", "end", "expected_m"),
+        [
+            ((1.5, 2.5, 1.5), (8.5, 2.5, 1.5), 0.0),
+            ((1.5, 2.5, 1.5), (9.5, 2.5, 1.5), 0.5),
+            ((-5.0, 2.5, 1.5), (12.0, 2.5, 1.5), 2.0),
+            ((0.5, 2.5, 0.5), (0.5, 2.5, 2.0), 1.5),
+            ((0.0, 2.0, 0.5), (2.0, 3.0, 2.5), 1.5),
+            ((1.0, 1.5, 1.5), (1.0, 3.5, 1.5), 0.0),
+            ((1.0, 0.5, 1.5), (9.0, 0.5, 1.5), 8.0),
+            ((1.0, 0.0, 1.5), (9.0, 0.0, 1.5), 0.0),
+            ((0.0, 0.5, 1.5), (-9.0, 0.5, 1.5), 0.0),
+            ((-9.0, -1.0, 1.5), (9.0, -1.0, 1.5), 0.0),
+            ((-1.0, -2.0, 1.5), (-1.0, -2.0, 2.5), 0.0),
+        ],
+        ids=str,
+    )
+    def test_by_hand(self, start, end, expected_m):
+        found_m = walled_lengths_m(HALF, np.array(start), np.array([end]))
+        assert found_m[0] == pytest.approx(expected_m, abs=1e-12)
+
+    @given(st.data())
+    def test_what_is_known_and_outside_is_no_wall(self, data):
+        """Not a rounding of it: the networks are told of any length at all."""
+        state = data.draw(hnp.arrays(np.uint8, (3, 4), elements=st.sampled_from([FREE, UNKNOWN])))
+        start, end = (np.array([data.draw(cells)]) / 1_000 for _ in range(2))
+        assert wall_shares(state, start, end) == 0.0
+
+    @given(grids, cells, cells)
+    def test_inside_the_grid_as_if_walls_alone_were_unknown(self, state, start, end):
+        place = np.clip([start, end], 0, 1_000 * np.array(state.shape[::-1]))
+        padded = np.pad(state, 1, constant_values=FREE)
+        walls = np.where(padded == WALL, UNKNOWN, FREE).astype(np.uint8)
+        starts, ends = place[:1] / 1_000, place[1:] / 1_000
+        expected = unknown_shares(walls, starts + 1.0, ends + 1.0)
+        assert wall_shares(state, starts, ends)[0] == pytest.approx(expected[0], abs=1e-9)
 
 
 @settings(max_examples=1000)

@@ -11,10 +11,12 @@ from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.windows import (
     CELL_M,
     CHANNELS,
+    PLAN_CHANNELS,
     WINDOW_CELLS,
     plan_windows,
     transmitter_window,
     transmitter_windows,
+    window_index,
     window_places,
 )
 from sionna_partial.maps.partial_map import PartialMap
@@ -225,12 +227,14 @@ class TestTransmitterWindows:
         maps = tuple(PartialMap(np.full((9, 9), state), 0.5) for state in (FREE, WALL))
         one, other = (1.0, 2.0, 1.5), (3.1, 2.0, 1.5)
         txs, map_index = [other, one, one, other, (1.0, 2.0, 0.5)], [0, 1, 0, 0, 0]
-        windows, index = transmitter_windows(context_of(maps, map_index, txs, np.zeros((5, 3))))
+        context = context_of(maps, map_index, txs, np.zeros((5, 3)))
+        windows, index = transmitter_windows(context)
         assert windows.shape == (3, *SHAPE)
         assert windows.dtype == np.uint8
         assert index.shape == (5,)
         for number, tx, found in zip(map_index, txs, index, strict=True):
             np.testing.assert_array_equal(windows[found], transmitter_window(maps[number], np.array(tx[:2])))
+        np.testing.assert_array_equal(window_index(context), index)
 
     def test_no_links(self):
         windows, index = transmitter_windows(context_of((), [], [], []))
@@ -243,7 +247,8 @@ class TestPlanWindows:
         state = np.random.default_rng(8).choice([FREE, WALL, UNKNOWN], size=(50, 60))
         maps = (PartialMap(state, 0.1), PartialMap(np.full((2, 2), UNKNOWN), 0.1))
         context = context_of(maps, [0, 1, 0], [(1.0, 2.0, 1.5), (3.1, 2.0, 1.5), (3.3, 0.1, 1.5)], np.zeros((3, 3)))
-        expected = transmitter_windows(context)[0][..., [CHANNELS.index("free"), CHANNELS.index("wall")]]
+        assert CHANNELS[:PLAN_CHANNELS] == ("free", "wall")
+        expected = transmitter_windows(context)[0][..., :PLAN_CHANNELS]
         np.testing.assert_array_equal(plan_windows(context), expected)
 
     def test_no_links(self):

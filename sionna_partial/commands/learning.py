@@ -1,6 +1,5 @@
 """Subcommands of learning: dataset, train, evaluate."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,19 +15,11 @@ from sionna_partial.commands.shell import (
 )
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.files import require_writable
-from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import DatasetSettings, NetworkKind, PredictorSettings, SceneSettings, TraceSettings
 
 DatasetArgument = Annotated[
     Path, typer.Argument(metavar="DATASET", help="Folder that `dataset` wrote.", show_default=False)
 ]
-
-
-class Networks(StrEnum):
-    """The choices of `PredictorSettings.networks`."""
-
-    MAP = "map"
-    PATHS = "paths"
-    PAPER = "paper"
 
 
 DEFAULT_HOMES = 100
@@ -103,10 +94,13 @@ def train(
     out: Annotated[Path, typer.Option(metavar="RUN", help="Folder for predictor and baselines.", show_default=False)],
     test_share: Annotated[float, typer.Option(help="Share of the homes that is kept for testing.")] = 0.3,
     networks: Annotated[
-        Networks, typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around.")
-    ] = Networks.MAP,
-    passes: Annotated[int, typer.Option(help="How many times the networks beside the paper's see the links.")] = 13,
-    seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = 0,
+        NetworkKind,
+        typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around."),
+    ] = "map",
+    passes: Annotated[
+        int, typer.Option(help="How many times the networks beside the paper's see the links.")
+    ] = PredictorSettings.passes,
+    seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = PredictorSettings.seed,
 ) -> None:
     """Train a predictor, and test it on other homes.
 
@@ -122,7 +116,7 @@ def train(
         from sionna_partial.training.train import train as train_predictor
 
         links, traces = open_links(folder)
-        settings = settings_for(traces, networks=networks.value, passes=passes, seed=seed)
+        settings = settings_for(traces, networks=networks, passes=passes, seed=seed)
         run = train_predictor(links, test_share=test_share, settings=settings, progress=report)
         files = run.save(out)
     typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")

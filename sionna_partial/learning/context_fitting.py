@@ -13,10 +13,10 @@ from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.context_networks import context_networks, decode, link_inputs, look
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.networks import free_space_gain_db, import_keras
-from sionna_partial.learning.windows import WINDOW_CELLS, plan_windows, transmitter_windows, window_places
+from sionna_partial.learning.windows import WINDOW_CELLS, plan_windows, transmitter_windows, window_index, window_places
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def fit_context_networks(
     """
     networks = context_networks(settings.seed, with_map=settings.networks == "map")
     examples = _Examples.of_links(phi, link_state, gain_db, settings, complete)
-    steps = math.ceil(settings.passes * len(examples.windows) / WINDOWS_AT_ONCE)
+    steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
     step = _gradient_step(networks, steps)
     report = progress or (lambda share, message: None)
     losses = []
@@ -85,7 +85,7 @@ def fit_context_networks(
         if number % _REPORT_STEPS == 0:
             recent = np.mean(losses[-_REPORT_STEPS:])
             report(number / steps, f"step {number} of {steps}, loss {recent:.4f}")
-    _log.info("%d steps on %d windows: loss %.4f", steps, len(examples.windows), np.mean(losses[-_REPORT_STEPS:]))
+    _log.info("%d steps on %d windows: loss %.4f", steps, len(examples), np.mean(losses[-_REPORT_STEPS:]))
     if not np.isfinite(losses).all():
         raise PredictorError(f"training diverged in step {int(np.argmin(np.isfinite(losses)))}: give another seed.")
     return networks
@@ -97,17 +97,15 @@ class _Examples:
 
     Parameters
     ----------
-    windows : (W, S, S, C) uint8 array
-    plans : (W, S, S, 2) uint8 array or None
-        What the complete map shows, in 255ths.
+    images : mapping of str to (W, S, S, ...) uint8 arrays
+        Of the windows, by the names of the arguments of a gradient step; none without a map network.
     first : (W + 1,) int array
         Where the links of each window begin.
     columns : mapping of str to (N, ...) arrays
         Of the links, by the names of the arguments of a gradient step.
     """
 
-    windows: NDArray[np.uint8]
-    plans: NDArray[np.uint8] | None
+    images: Mapping[str, NDArray[np.uint8]]
     first: NDArray[np.intp]
     columns: Mapping[str, NDArray[np.generic]]
 
@@ -122,7 +120,11 @@ class _Examples:
     ) -> "_Examples":
         context = phi.context
         assert context is not None
-        windows, index = transmitter_windows(context)
+        index, images = window_index(context), {}
+        if settings.networks == "map":
+            images["windows"] = transmitter_windows(context)[0]
+            if complete is not None:
+                images["plans"] = plan_windows(replace(context, maps=tuple(complete)))
         order = np.argsort(index, kind="stable")
         columns = {
             "links": link_inputs(phi, settings.frequency_hz),
@@ -131,19 +133,19 @@ class _Examples:
             "link_state": link_state.astype(np.int32),
             "gain_db": gain_db.astype(np.float32),
         }
-        plans = None
-        if complete is not None and settings.networks == "map":
-            whole = replace(context, maps=tuple(complete))
-            plans = plan_windows(whole)
-        first = np.searchsorted(index[order], np.arange(len(windows) + 1))
-        return cls(windows, plans, first, {name: column[order] for name, column in columns.items()})
+        first = np.searchsorted(index[order], np.arange(index.max() + 2))
+        return cls(images, first, {name: column[order] for name, column in columns.items()})
+
+    def __len__(self) -> int:
+        """Return the number of windows W."""
+        return len(self.first) - 1
 
     def batches(self, steps: int, rng: np.random.Generator) -> Iterator[dict[str, NDArray[np.generic]]]:
         """Yield the arguments of so many gradient steps."""
         order = np.zeros(0, dtype=np.intp)
         for _ in range(steps):
             while len(order) < WINDOWS_AT_ONCE:
-                order = np.concatenate([order, rng.permutation(len(self.windows))])
+                order = np.concatenate([order, rng.permutation(len(self))])
             chosen, order = order[:WINDOWS_AT_ONCE], order[WINDOWS_AT_ONCE:]
             yield self._batch(chosen, rng)
 
@@ -151,12 +153,9 @@ class _Examples:
         low, high = self.first[chosen], self.first[chosen + 1]
         links = rng.integers(low[:, None], high[:, None], (len(chosen), LINKS_OF_WINDOW))
         batch = {name: column[links] for name, column in self.columns.items()}
-        batch["windows"] = self.windows[chosen]
-        if self.plans is not None:
-            batch["plans"] = self.plans[chosen]
         turns = rng.integers(8, size=len(chosen))
-        for name in batch.keys() & {"windows", "plans"}:
-            turned = [_turned(image, turn) for image, turn in zip(batch[name], turns, strict=True)]
+        for name, images in self.images.items():
+            turned = [_turned(image, turn) for image, turn in zip(images[chosen], turns, strict=True)]
             batch[name] = np.stack(turned).astype(np.float32)
         places = zip(batch["places"], turns, strict=True)
         batch["places"] = np.stack([_turned_places(place, turn) for place, turn in places])
@@ -188,7 +187,13 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
 
     def step(
-        windows: Any, links: Any, places: Any, free_db: Any, link_state: Any, gain_db: Any, plans: Any = None
+        links: Any,
+        places: Any,
+        free_db: Any,
+        link_state: Any,
+        gain_db: Any,
+        windows: Any = None,
+        plans: Any = None,
     ) -> Any:
         with tf.GradientTape() as tape:
             outputs, plan = look(networks, windows, links, places)

@@ -2,24 +2,26 @@
 
 The map network reads the window around the transmitter and writes `MAP_FEATURES` numbers into each of its cells: a
 U-Net (Ronneberger, Fischer and Brox 2015). What it makes of an empty window is taken off, so that a map says nothing
-where nothing was observed. The link network reads what the trace knows of a link, and the numbers at its receiver. It
-says P(link state), and mean and log-variance of the gain in line of sight and without.
+where nothing was observed. For training, it also says what the complete map shows. The link network reads what the
+trace knows of a link, and the numbers at its receiver. It says P(link state), and mean and log-variance of the gain in
+line of sight and without.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
-from sionna_partial.learning.unobserved import unknown_shares
-from sionna_partial.learning.windows import CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
+from sionna_partial.learning.unobserved import walled_lengths_m
+from sionna_partial.learning.windows import CHANNELS, PLAN_CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
 
 if TYPE_CHECKING:
     import keras
@@ -31,9 +33,6 @@ MAP_NETWORK, LINK_NETWORK = "map_network", "link_network"
 
 MAP_FEATURES = 16
 """Number of values of a cell that the link network reads."""
-
-PLAN_CHANNELS = 2
-"""Number of further values of a cell: logits of "free" and "wall" on the complete map, which only training uses."""
 
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
@@ -47,39 +46,101 @@ _NEAREST_M = 0.1
 _LINKS_AT_ONCE = 65_536
 
 
-def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
-    """Return what the trace knows of N links, scaled to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
+@dataclass(frozen=True)
+class LinkNumbers:
+    """The numbers among what the trace knows of N links; every one (N,) unless said otherwise, an array or a tensor.
+
+    Parameters
+    ----------
+    distance_m, unobserved_distance_m : float64
+        Length of the direct line, and of its unobserved part [m].
+    walled_m : float64
+        Its length in cells of known walls [m]: outlines of walls may leave them open.
+    gain_db : float64
+        Of the partial trace [dB].
+    indirect_gain_db : (N, len(REACHES_M)) float64
+    strongest_unobserved_m : float64
+        See `LinkContext`.
+    """
+
+    distance_m: Any
+    unobserved_distance_m: Any
+    walled_m: Any
+    gain_db: Any
+    indirect_gain_db: Any
+    strongest_unobserved_m: Any
+
+    @classmethod
+    def of(cls, phi: LinkFeatures) -> "LinkNumbers":
+        """Take them from features with a context."""
+        context = context_of(phi)
+        return cls(
+            phi.distance_m,
+            phi.unobserved_distance_m,
+            _walled_m(context),
+            phi.gain_db,
+            context.indirect_gain_db,
+            context.strongest_unobserved_m,
+        )
+
+
+def context_of(phi: LinkFeatures) -> LinkContext:
+    """Return the context that features must have here."""
+    assert phi.context is not None
+    return phi.context
+
+
+def link_marks(phi: LinkFeatures, walled_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what is either so or not of N links (N, `LINK_MARKS`): 0 or 1.
 
     Parameters
     ----------
     phi : LinkFeatures
         With a context.
+    walled_m : (N,) float64 array
+        Length of the direct lines in cells of known walls [m].
+    """
+    context, los = context_of(phi), phi.link_state == LinkState.LOS
+    certain = los & (phi.unobserved_distance_m == 0.0) & (walled_m == 0.0)
+    states = (phi.link_state == state for state in LinkState)
+    return np.stack([*states, context.tx_seen, context.rx_seen, certain, los & (walled_m > 0.0)], axis=1) * 1.0
+
+
+def input_columns(marks: Any, numbers: LinkNumbers, frequency_hz: float, ops: ModuleType = np) -> Any:
+    """Scale what the trace knows of N links to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
+
+    Parameters
+    ----------
+    marks : (N, LINK_MARKS) float64 array or tensor
+    numbers : LinkNumbers
     frequency_hz : float
         Carrier frequency [Hz].
-
-    Returns
-    -------
-    (N, LINK_INPUTS) float32 array
+    ops : module
+        NumPy, or keras.ops for tensors.
     """
-    context = phi.context
-    assert context is not None
-    distance_m, unobserved_m, state = phi.distance_m, phi.unobserved_distance_m, phi.link_state
-    free_db, walled_m = free_space_gain_db(distance_m, frequency_hz), _walled_m(context, distance_m)
-    near_m, los = np.maximum(distance_m, _NEAREST_M), state == LinkState.LOS
-    indirect_db = context.indirect_gain_db.T
-    certain = los & (unobserved_m == 0.0) & (walled_m == 0.0)
+    distance_m, unobserved_m = numbers.distance_m, numbers.unobserved_distance_m
+    free_db, near_m = free_space_gain_db(distance_m, frequency_hz, ops), ops.maximum(distance_m, _NEAREST_M)
+    indirect_db = [numbers.indirect_gain_db[:, reach] for reach in range(len(REACHES_M))]
     columns = [
-        *(state == each for each in LinkState),
-        *(context.tx_seen, context.rx_seen, certain, los & (walled_m > 0.0), np.minimum(walled_m, 1.0)),
-        *(distance_m / _SCALE_M, np.log(near_m), unobserved_m / _SCALE_M, unobserved_m / near_m),
-        *((distance_m - unobserved_m) / _SCALE_M, context.strongest_unobserved_m / _SCALE_M),
-        *((gain_db - GAIN_FLOOR_DB) / _SCALE_DB for gain_db in (phi.gain_db, free_db, *indirect_db)),
-        *(np.clip((gain_db - free_db) / 30.0, -2.0, 0.5) for gain_db in (phi.gain_db, *indirect_db)),
+        *(ops.minimum(numbers.walled_m, 1.0), distance_m / _SCALE_M, ops.log(near_m)),
+        *(unobserved_m / _SCALE_M, unobserved_m / near_m, (distance_m - unobserved_m) / _SCALE_M),
+        numbers.strongest_unobserved_m / _SCALE_M,
+        *((gain_db - GAIN_FLOOR_DB) / _SCALE_DB for gain_db in (numbers.gain_db, free_db, *indirect_db)),
+        *(ops.clip((gain_db - free_db) / 30.0, -2.0, 0.5) for gain_db in (numbers.gain_db, *indirect_db)),
     ]
-    return np.stack(columns, axis=1).astype(np.float32)
+    return ops.concatenate([marks, ops.stack(columns, axis=1)], axis=1)
 
 
-LINK_INPUTS = 14 + 2 + len(REACHES_M) + 1 + len(REACHES_M)
+def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
+    """Return the inputs (N, `LINK_INPUTS`) of the link network for the features of N links, which have a context."""
+    numbers = LinkNumbers.of(phi)
+    return input_columns(link_marks(phi, numbers.walled_m), numbers, frequency_hz).astype(np.float32)
+
+
+LINK_MARKS = len(LinkState) + 4
+"""Number of values that `link_marks` gives of a link."""
+
+LINK_INPUTS = LINK_MARKS + 7 + 2 + len(REACHES_M) + 1 + len(REACHES_M)
 """Number of values that `link_inputs` gives of a link."""
 
 
@@ -138,7 +199,7 @@ def look(networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places
     networks : mapping of str to keras.Model
         By name.
     windows : (B, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) float32 tensor
-        In [0, 255].
+        In [0, 255]; without a map network they are not read, and may be None.
     links : (B, R, LINK_INPUTS) float32 tensor
     places : (B, R, 2) float32 tensor
         Of the receivers: x, y in cells of the window.
@@ -149,15 +210,51 @@ def look(networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places
     plan : (B, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS) float32 tensor
         Logits of what the complete map shows; None without a map network.
     """
+    known, plan = read_maps(networks, windows) if MAP_NETWORK in networks else (None, None)
+    return read_links(networks, known, links, places), plan
+
+
+def read_maps(networks: Mapping[str, "keras.Model"], windows: Any) -> tuple[Any, Any]:
+    """Let the map network read windows.
+
+    Parameters
+    ----------
+    networks : mapping of str to keras.Model
+        By name.
+    windows : (B, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) float32 tensor
+        In [0, 255].
+
+    Returns
+    -------
+    known : (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor
+        What each cell says beyond what one of an empty window does.
+    plan : (B, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS) float32 tensor
+        Logits of what the complete map shows.
+    """
     import tensorflow as tf
 
-    plan = None
-    if MAP_NETWORK in networks:
-        maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0))
-        known, plan = maps[:-1, ..., :MAP_FEATURES], maps[:-1, ..., MAP_FEATURES:]
-        links = tf.concat([links, _between(known - maps[-1:, ..., :MAP_FEATURES], places)], axis=-1)
+    maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0))
+    return maps[:-1, ..., :MAP_FEATURES] - maps[-1:, ..., :MAP_FEATURES], maps[:-1, ..., MAP_FEATURES:]
+
+
+def read_links(networks: Mapping[str, "keras.Model"], known: Any, links: Any, places: Any) -> Any:
+    """Let the link network read R links of each of B windows: (B, R, LINK_OUTPUTS) float32 tensor.
+
+    Parameters
+    ----------
+    networks : mapping of str to keras.Model
+        By name.
+    known : (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor or None
+        From `read_maps`; None without a map network.
+    links, places : tensors
+        See `look`.
+    """
+    import tensorflow as tf
+
+    if known is not None:
+        links = tf.concat([links, _between(known, places)], axis=-1)
     outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
-    return tf.reshape(outputs, (tf.shape(places)[0], -1, LINK_OUTPUTS)), plan
+    return tf.reshape(outputs, (tf.shape(places)[0], -1, LINK_OUTPUTS))
 
 
 def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
@@ -203,23 +300,39 @@ def evaluate_context_networks(
     probabilities, means_db, stds_db : (3, N) float64 arrays
         Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
     """
-    context = phi.context
-    assert context is not None
-    windows, index = transmitter_windows(context)
+    context = context_of(phi)
     inputs, places = link_inputs(phi, frequency_hz), window_places(context)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
-    for number, window in enumerate(windows):
-        links = np.flatnonzero(index == number)
+    for windows, links in _by_window(networks, context):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
-            found, _ = look(networks, window[None].astype(np.float32), inputs[None, here], places[None, here])
+            found, _ = look(networks, windows, inputs[None, here], places[None, here])
             outputs[here] = found[0]
-    log_p, gains_db, log_variances = decode(outputs, free_space_gain_db(phi.distance_m, frequency_hz))
-    probabilities = np.exp(log_p).T
-    means_db, stds_db = np.full_like(probabilities, GAIN_FLOOR_DB), np.zeros_like(probabilities)
-    means_db[1:] = np.maximum(np.transpose(gains_db), GAIN_FLOOR_DB)
-    stds_db[1:] = np.exp(0.5 * np.transpose(log_variances))
-    return probabilities, means_db, stds_db
+    probabilities, means_db, stds_db = distribution(outputs, free_space_gain_db(phi.distance_m, frequency_hz))
+    return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
+
+
+def distribution(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
+    """Read the outputs of the link network for N links.
+
+    Parameters
+    ----------
+    outputs : (N, LINK_OUTPUTS) float64 tensor
+    free_db : (N,) float64 tensor
+        Gain of free space [dB].
+
+    Returns
+    -------
+    probabilities, means_db, stds_db : (3, N) float64 tensors
+        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+    """
+    import tensorflow as tf
+
+    log_probabilities, gains_db, log_variances = decode(outputs, free_db)
+    outage = tf.fill([1, len(free_db)], tf.constant(GAIN_FLOOR_DB, tf.float64))
+    means_db = tf.concat([outage, tf.transpose(tf.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
+    stds_db = tf.concat([tf.zeros_like(outage), tf.transpose(tf.exp(0.5 * log_variances))], axis=0)
+    return tf.transpose(tf.exp(log_probabilities)), means_db, stds_db
 
 
 class _Seeds:
@@ -264,19 +377,25 @@ def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
     return keras.Model(link, outputs, name=LINK_NETWORK)
 
 
-def _walled_m(context: LinkContext, distance_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _by_window(
+    networks: Mapping[str, Any], context: LinkContext
+) -> Iterator[tuple[NDArray[np.float32] | None, NDArray[np.intp]]]:
+    """Yield each window (1, ...) and the links of it; without a map network no window and all links."""
+    if MAP_NETWORK not in networks:
+        yield None, np.arange(len(context))
+        return
+    windows, index = transmitter_windows(context)
+    for number, window in enumerate(windows):
+        yield window[None].astype(np.float32), np.flatnonzero(index == number)
+
+
+def _walled_m(context: LinkContext) -> NDArray[np.float64]:
     """Length of the direct lines (N,) in cells of known walls [m]: outlines of walls may leave them open."""
     walled_m = np.zeros(len(context))
     for number in np.unique(context.map_index):
-        partial, here = context.maps[number], context.map_index == number
-        walls = np.where(partial.state == CellState.WALL, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
-        ends = (np.round((at_m[here, :2] - partial.origin_m) / partial.resolution_m, 6) for at_m in _ends(context))
-        walled_m[here] = unknown_shares(walls, *ends) * distance_m[here]
+        here = context.map_index == number
+        walled_m[here] = walled_lengths_m(context.maps[number], context.tx_m[here], context.rx_m[here])
     return walled_m
-
-
-def _ends(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return context.tx_m, context.rx_m
 
 
 def _between(maps: Any, places: Any) -> Any:

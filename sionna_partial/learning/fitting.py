@@ -4,15 +4,14 @@ import itertools
 import logging
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.networks import (
@@ -30,7 +29,7 @@ from sionna_partial.learning.networks import (
     network_inputs,
     parts,
 )
-from sionna_partial.settings import require, require_number, require_whole
+from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
     import keras
@@ -40,65 +39,7 @@ _PRIOR_LINKS = 10
 _WEIGHT_PENALTY = 0.01
 _INDOORS = 20.0
 
-NetworkKind = Literal["paper", "paths", "map"]
-"""What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
-
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class PredictorSettings:
-    """How a predictor is trained.
-
-    Parameters
-    ----------
-    networks : {"paper", "paths", "map"}
-        "paper" has the networks of the paper alone. "paths" has one beside them that sees what each path crosses, "map"
-        two, of which one sees the map around the transmitter; both need features with a context, as `link_features`
-        gives them.
-    frequency_hz : float
-        Carrier frequency of the links [Hz]; it sets the gain of free space.
-    diffraction : bool
-        Whether the links were traced with diffraction.
-    passes : int
-        How many times the networks beside those of the paper see each transmitter on each map.
-    steps : int
-        Gradient steps of each of the paper's networks.
-    batch_size : int
-        Links in such a step.
-    learning_rate : float
-        Of Adam at the first such step; it falls to 0 along a cosine.
-    minimum_links : int
-        A network of the paper with fewer links is not trained: it says mean and spread of those it has and of prior
-        knowledge.
-    seed : int
-        Of first weights and batches.
-
-    Raises
-    ------
-    SettingsError
-        For a value out of range.
-    """
-
-    networks: NetworkKind = "paper"
-    frequency_hz: float = CARRIER_FREQUENCY_HZ
-    diffraction: bool = True
-    passes: int = 13
-    steps: int = 4000
-    batch_size: int = 1024
-    learning_rate: float = 0.01
-    minimum_links: int = 100
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        kinds = get_args(NetworkKind)
-        require(self.networks in kinds, "networks", self.networks, f"choose one of {kinds}.")
-        require_number("frequency_hz", self.frequency_hz, 1e6, 1e12)
-        require(isinstance(self.diffraction, bool), "diffraction", self.diffraction, "give True or False.")
-        require_number("learning_rate", self.learning_rate, 0.0, 1.0, open_low=True)
-        for name in ("passes", "steps", "batch_size", "minimum_links"):
-            require_whole(name, getattr(self, name), 1, 1_000_000)
-        require_whole("seed", self.seed, 0, 1_000_000_000)
 
 
 def fit_networks(

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.unobserved import unobserved_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.tracing.trace import TracedLinks
+from sionna_partial.tracing.trace import TracedLinks, path_gain_db
 
 REACHES_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """How far paths are taken to get through unobserved space [m]: a path that crosses u of it counts exp(-u / reach)."""
@@ -138,35 +138,62 @@ def link_context(partial: PartialMap, links: TracedLinks) -> LinkContext:
     indirect = np.any(links.interactions > 0, axis=1)
     link = (links.path_tx.astype(np.int64) * receivers + links.path_rx)[indirect]
     power = np.abs(links.a[indirect]) ** 2
-    unobserved_m = _path_unobserved_m(partial, links, indirect)
-    gains_db = np.stack([_gain_db(link, power * _kept(unobserved_m, reach), len(tx_m)) for reach in REACHES_M], axis=1)
+    unobserved_m = path_unobserved_m(
+        partial,
+        links.tx.reshape(-1, 3)[links.path_tx[indirect]],
+        links.interactions[indirect],
+        links.vertices_m[indirect],
+        links.rx[links.path_rx[indirect]],
+    )
+    gains_db = np.stack(
+        [_gain_db(link, power * kept_shares(unobserved_m, reach), len(tx_m)) for reach in REACHES_M], axis=1
+    )
     strongest_m = np.linalg.norm(rx_m - tx_m, axis=1)
     weakest_first = np.argsort(power, kind="stable")
     strongest_m[link[weakest_first]] = unobserved_m[weakest_first]
     return LinkContext((partial,), np.zeros(len(tx_m), dtype=np.int64), tx_m, rx_m, gains_db, strongest_m)
 
 
-def _path_unobserved_m(partial: PartialMap, links: TracedLinks, chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Length of the chosen paths in unknown cells [m]."""
-    paths = np.flatnonzero(chosen)
-    total_m = np.zeros(len(paths))
+def path_unobserved_m(
+    partial: PartialMap,
+    start_m: NDArray[np.float64],
+    interactions: NDArray[np.uint8],
+    vertices_m: NDArray[np.float64],
+    end_m: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Measure the length of paths in unknown cells.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    start_m, end_m : (P, 3) float64 arrays
+        Ends of the paths [m].
+    interactions : (P, D) uint8 array
+        0 where there is none.
+    vertices_m : (P, D, 3) float64 array
+        Places of the interactions [m].
+
+    Returns
+    -------
+    (P,) float64 array
+        [m]; 0 on a complete map.
+    """
+    total_m = np.zeros(len(start_m))
     if partial.is_complete:
         return total_m
-    here_m = links.tx.reshape(-1, 3)[links.path_tx[paths]]
-    for depth in range(links.interactions.shape[1]):
-        bends = np.flatnonzero(links.interactions[paths, depth])
-        there_m = links.vertices_m[paths[bends], depth]
+    here_m = start_m.copy()
+    for depth in range(interactions.shape[1]):
+        bends = np.flatnonzero(interactions[:, depth])
+        there_m = vertices_m[bends, depth]
         total_m[bends] += unobserved_lengths_m(partial, here_m[bends], there_m)
         here_m[bends] = there_m
-    return total_m + unobserved_lengths_m(partial, here_m, links.rx[links.path_rx[paths]])
+    return total_m + unobserved_lengths_m(partial, here_m, end_m)
 
 
-def _kept(unobserved_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
-    """Share (P,) of the power of paths that gets through the unobserved space that they cross."""
+def kept_shares(unobserved_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
+    """Return the share (P,) of the power of paths that gets through the unobserved space that they cross [m]."""
     return np.exp(-unobserved_m / reach_m) if reach_m > 0.0 else (unobserved_m < _SEEN_M).astype(np.float64)
 
 
 def _gain_db(link: NDArray[np.int64], power: NDArray[np.float64], links: int) -> NDArray[np.float64]:
-    total = np.bincount(link, weights=power, minlength=links).astype(np.float64)
-    with np.errstate(divide="ignore"):
-        return np.maximum(10.0 * np.log10(total), GAIN_FLOOR_DB)
+    return path_gain_db(np.bincount(link, weights=power, minlength=links).astype(np.float64))

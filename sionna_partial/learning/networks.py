@@ -9,7 +9,7 @@ known to physics: the gain of the partial trace, or that of free space.
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.llvm import load_llvm
 
@@ -114,9 +114,9 @@ def import_keras() -> ModuleType:
     return keras
 
 
-def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float) -> NDArray[np.float64]:
-    """Return Friis' path gain between isotropic antennas [dB]."""
-    return _gain_at_1m_db(frequency_hz) - 20.0 * np.log10(np.maximum(distance_m, NEAREST_M))
+def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
+    """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
+    return _gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
 
 
 def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
@@ -213,16 +213,66 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict
     return {name: column.astype(np.float32)[:, None] for name, column in columns.items()}
 
 
-def evaluate_networks(model: "keras.Model", phi: LinkFeatures) -> dict[str, NDArray[np.float64]]:
-    """Evaluate every network of the paper on every link: (N, `OUTPUT_WIDTHS`) arrays by name."""
-    networks = {name: network for name, network in parts(model).items() if name in OUTPUT_WIDTHS}
-    blocks = []
+def distribution_by_paper(
+    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: NDArray[np.uint8]
+) -> tuple[Any, Any, Any]:
+    """Let the paper's networks answer for N links.
+
+    Parameters
+    ----------
+    networks : mapping of str to keras.Model
+        By name.
+    inputs : mapping of str to (N, 1) float32 tensors
+        Of `FEATURES`.
+    link_state : (N,) uint8 array of LinkState
+        On the partial map.
+
+    Returns
+    -------
+    probabilities, means_db, stds_db : (3, N) float64 tensors
+        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+    """
+    import tensorflow as tf
+
+    def outputs(name: str) -> Any:
+        network = networks[name]
+        return tf.cast(network({key: inputs[key] for key in network.input}, training=False), tf.float64)
+
+    states = tf.stack([outputs(STATE_NETWORKS[state]) for state in LinkState])
+    probabilities = tf.gather_nd(states, np.stack([link_state, np.arange(len(link_state))], axis=1))
+    outage = tf.fill([len(link_state)], tf.constant(GAIN_FLOOR_DB, tf.float64))
+    means_db, stds_db = [outage] * len(LinkState), [tf.zeros_like(outage)] * len(LinkState)
+    for row in GAIN_NETWORKS:
+        served, (mean_db, log_variance) = np.isin(link_state, row.partial_states), tf.unstack(outputs(row.name), axis=1)
+        means_db[row.link_state] = tf.where(served, tf.maximum(mean_db, GAIN_FLOOR_DB), means_db[row.link_state])
+        stds_db[row.link_state] = tf.where(served, tf.exp(0.5 * log_variance), stds_db[row.link_state])
+    total = tf.reduce_sum(probabilities, axis=1, keepdims=True)
+    return tf.transpose(probabilities / total), tf.stack(means_db), tf.stack(stds_db)
+
+
+def evaluate_paper(
+    networks: Mapping[str, "keras.Model"], phi: LinkFeatures
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Evaluate `distribution_by_paper` on the features of N links, to arrays."""
+    blocks = [distribution_by_paper(networks, network_inputs(block), block.link_state) for block in _blocks(phi)]
+    probabilities, means_db, stds_db = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
+    return probabilities, means_db, stds_db
+
+
+def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> NDArray[np.float64]:
+    """Return P(indoor) (N,) by the network that serves the partial link state of each link."""
+    p_indoor = np.zeros(len(phi))
+    for state, name in INDOOR_NETWORKS.items():
+        served = phi.link_state == state
+        blocks = [networks[name](network_inputs(block, INDOOR_INPUTS)) for block in _blocks(phi.take(served))]
+        p_indoor[served] = np.concatenate(blocks)[:, 0]
+    return p_indoor
+
+
+def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
+    """Cut features into blocks that bound the memory; there is at least one."""
     for start in range(0, max(1, len(phi)), _LINKS_AT_ONCE):
-        inputs = network_inputs(phi.take(slice(start, start + _LINKS_AT_ONCE)))
-        chosen = {name: {key: inputs[key] for key in network.input} for name, network in networks.items()}
-        values = {name: network(chosen[name], training=False) for name, network in networks.items()}
-        blocks.append({name: np.asarray(value, dtype=np.float64) for name, value in values.items()})
-    return {name: np.concatenate([block[name] for block in blocks]) for name in networks}
+        yield phi.take(slice(start, start + _LINKS_AT_ONCE))
 
 
 def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:

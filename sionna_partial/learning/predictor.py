@@ -14,13 +14,11 @@ from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.learning.context_fitting import fit_context_networks
 from sionna_partial.learning.context_networks import LINK_NETWORK, evaluate_context_networks
 from sionna_partial.learning.features import LinkFeatures, link_numbers, link_states
-from sionna_partial.learning.fitting import PredictorSettings, fit_indoor_networks, fit_networks
+from sionna_partial.learning.fitting import fit_indoor_networks, fit_networks
 from sionna_partial.learning.networks import (
-    GAIN_NETWORKS,
-    INDOOR_NETWORKS,
-    STATE_NETWORKS,
     assemble,
-    evaluate_networks,
+    evaluate_indoor,
+    evaluate_paper,
     import_keras,
     network_ranges,
     parts,
@@ -28,6 +26,7 @@ from sionna_partial.learning.networks import (
 from sionna_partial.learning.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
 
 if TYPE_CHECKING:
@@ -302,28 +301,14 @@ class Predictor:
         _require_features(features)
         networks = parts(self.model)
         if features.context is None or LINK_NETWORK not in networks:
-            return self._paper_answer(features)
+            return LinkPrediction.of_parts(*evaluate_paper(networks, features))
         answer = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
         return answer.where(features.context.complete, LinkPrediction.of_trace(features))
-
-    def _paper_answer(self, features: LinkFeatures) -> LinkPrediction:
-        """Let the paper's networks answer."""
-        outputs = evaluate_networks(self.model, features)
-        probabilities = _chosen(outputs, STATE_NETWORKS, features).T
-        probabilities /= probabilities.sum(axis=0)
-        means_db = np.full_like(probabilities, GAIN_FLOOR_DB)
-        stds_db = np.zeros_like(probabilities)
-        for row in GAIN_NETWORKS:
-            served = np.isin(features.link_state, row.partial_states)
-            mean_db, log_variance = outputs[row.name][served].T
-            means_db[row.link_state, served] = np.maximum(mean_db, GAIN_FLOOR_DB)
-            stds_db[row.link_state, served] = np.exp(0.5 * log_variance)
-        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
 
     def predict_indoor(self, features: LinkFeatures) -> NDArray[np.float64]:
         """Predict the probability (N,) that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
         _require_features(features)
-        return _chosen(evaluate_networks(self.model, features), INDOOR_NETWORKS, features)[:, 0]
+        return evaluate_indoor(parts(self.model), features)
 
     def save(self, path: str | Path) -> None:
         """Write a `.keras` file, and a `.json` card of the same stem beside it.
@@ -407,10 +392,3 @@ def _require_context(features: LinkFeatures, complete: Sequence[PartialMap] | No
 def _require_features(features: object) -> None:
     if not isinstance(features, LinkFeatures):
         raise PredictorError(f"features is of type {type(features).__name__}: give the LinkFeatures of link_features.")
-
-
-def _chosen(
-    outputs: Mapping[str, NDArray[np.float64]], names: Mapping[LinkState, str], phi: LinkFeatures
-) -> NDArray[np.float64]:
-    """Return the outputs (N, K) of the network that serves the partial link state of each link."""
-    return np.stack([outputs[names[state]] for state in LinkState])[phi.link_state, np.arange(len(phi))]

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.learning.link_context import LinkContext
-from sionna_partial.learning.unobserved import unknown_shares
+from sionna_partial.learning.unobserved import in_cells, unknown_shares, wall_shares
 from sionna_partial.maps.partial_map import PartialMap
 
 WINDOW_CELLS, CELL_M = 64, 0.3
@@ -23,6 +23,9 @@ CHANNELS = ("free", "wall", "seen", "hidden", "detour")
 free, wall: share of the cell's area that is known to be so. seen: share of the direct line from the transmitter that is
 observed. hidden: whether that line meets a known wall. detour: how much longer the way on foot is, see `_detours`.
 """
+
+PLAN_CHANNELS = 2
+"""Number of the channels that a complete map has, too: free and wall, the first of them."""
 
 _WALL_COST = 100.0
 """Cost of a cell of nothing but wall to one who walks, in cells."""
@@ -48,12 +51,17 @@ def transmitter_windows(context: LinkContext) -> tuple[NDArray[np.uint8], NDArra
     index : (N,) int array
         Which of them is each link's.
     """
-    return _each(context, transmitter_window, len(CHANNELS))
+    return _each(context, transmitter_window, len(CHANNELS)), window_index(context)
 
 
 def plan_windows(context: LinkContext) -> NDArray[np.uint8]:
-    """Draw the first two channels, free and wall, of every window of `transmitter_windows`: (W, ..., 2) uint8 array."""
-    return _each(context, _plan_window, 2)[0]
+    """Draw free and wall of every window of `transmitter_windows`: (W, ..., PLAN_CHANNELS) uint8 array."""
+    return _each(context, _plan_window, PLAN_CHANNELS)
+
+
+def window_index(context: LinkContext) -> NDArray[np.intp]:
+    """Return which of the windows of `transmitter_windows` is each link's (N,), without drawing them."""
+    return _transmitters(context)[1]
 
 
 def window_places(context: LinkContext) -> NDArray[np.float32]:
@@ -64,12 +72,16 @@ def window_places(context: LinkContext) -> NDArray[np.float32]:
 
 def _each(
     context: LinkContext, draw: Callable[[PartialMap, NDArray[np.float64]], NDArray[np.uint8]], channels: int
-) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+) -> NDArray[np.uint8]:
+    windows = [draw(context.maps[int(number)], np.array([x, y])) for number, x, y in _transmitters(context)[0]]
+    return np.stack(windows) if windows else np.zeros((0, WINDOW_CELLS, WINDOW_CELLS, channels), dtype=np.uint8)
+
+
+def _transmitters(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Return map number, x and y (W, 3) of every transmitter on every map, and which of them is each link's (N,)."""
     keys = np.column_stack([context.map_index, context.tx_m[:, :2]])
     places, index = np.unique(keys, axis=0, return_inverse=True)
-    windows = [draw(context.maps[int(number)], np.array([x, y])) for number, x, y in places]
-    shape = (0, WINDOW_CELLS, WINDOW_CELLS, channels)
-    return np.stack(windows) if windows else np.zeros(shape, dtype=np.uint8), index.reshape(-1)
+    return places, index.reshape(-1)
 
 
 def transmitter_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
@@ -92,8 +104,7 @@ def transmitter_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArra
     free, wall = _plan(state, edges)
     centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
     starts = np.tile(start, (len(centres), 1))
-    walls = np.where(state == CellState.WALL, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
-    unknown, blocked = (unknown_shares(cells, starts, centres).reshape(free.shape) for cells in (state, walls))
+    unknown, blocked = (of(state, starts, centres).reshape(free.shape) for of in (unknown_shares, wall_shares))
     return _in_255ths([free, wall, 1.0 - unknown, blocked > _GRAZE, _detours(wall)])
 
 
@@ -109,7 +120,7 @@ def _in_255ths(layers: Sequence[NDArray[np.generic]]) -> NDArray[np.uint8]:
 def _surroundings(partial: PartialMap, tx_m: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Extend or cut a map to what a window covers, and say where the transmitter is in it [cells]."""
     reach = int(np.ceil(0.5 * WINDOW_CELLS * CELL_M / partial.resolution_m)) + 1
-    start = np.round((tx_m - partial.origin_m) / partial.resolution_m, 6)
+    start = in_cells(partial, tx_m)
     column, row = np.floor(start).astype(int)
     spans = [(low - reach, low + reach + 1) for low in (row, column)]
     state = np.full((2 * reach + 1, 2 * reach + 1), CellState.UNKNOWN, dtype=np.uint8)

@@ -12,7 +12,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh_map import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.robot import Robot
-from sionna_partial.settings import SensorSettings, require, settings_or_default
+from sionna_partial.settings import SensorSettings, is_whole, require, settings_or_default
 
 MAX_STEPS = 100_000
 """Largest number of actions: many times what a large building takes."""
@@ -154,7 +154,7 @@ def explore_trajectory(
         As `explore` does.
     """
     counts = _checked_steps(steps)
-    require(_whole(seed), "seed", seed, "give a whole number of 0 or more.")
+    require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
     sensor = settings_or_default("sensor", sensor, SensorSettings)
     require_map("home", home)
     if not (home.state == _FREE).any():
@@ -190,11 +190,7 @@ def _poses(robot: Robot, corner_m: NDArray[np.float64], resolution_m: float) -> 
 
 def _checked_steps(steps: Sequence[int]) -> list[int]:
     counts = list(steps) if np.iterable(steps) else []
-    rising = len(counts) > 0 and all(_whole(count) for count in counts) and bool(np.all(np.diff(counts) > 0))
+    rising = len(counts) > 0 and all(map(is_whole, counts)) and bool(np.all(np.diff(counts) > 0))
     remedy = f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200)."
     require(rising and counts[-1] <= MAX_STEPS, "steps", steps, remedy)
     return [int(count) for count in counts]
-
-
-def _whole(value: object) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 0)

@@ -25,7 +25,7 @@ from shapely.ops import split, substring
 from sionna_partial.constants import CellState
 from sionna_partial.maps.furniture import GRID_M, NEAR_M, furnish, parts_of, union_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import require, require_number
+from sionna_partial.settings import is_whole, require, require_number
 
 HomeKind = Literal["apartment", "house", "office"]
 
@@ -122,8 +122,7 @@ def make_home(
     SettingsError
         For a seed, kind or resolution that is not allowed.
     """
-    whole = isinstance(seed, (int, np.integer)) and not isinstance(seed, bool) and seed >= 0
-    require(whole, "seed", seed, "give a whole number of 0 or more.")
+    require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
     require(kind is None or kind in STYLES, "kind", kind, f"choose one of {get_args(HomeKind)} or None.")
     require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)

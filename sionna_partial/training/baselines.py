@@ -12,9 +12,9 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.networks import free_space_gain_db
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
+from sionna_partial.settings import PredictorSettings
 from sionna_partial.training.link_table import LinkTable
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
@@ -220,28 +220,26 @@ def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkP
 
 
 def answers(
-    predictor: Predictor, baselines: Baselines, paper: Predictor | None, phi: LinkFeatures
+    baselines: Baselines, paper: Predictor | None, phi: LinkFeatures, frequency_hz: float
 ) -> Mapping[str, LinkPrediction]:
-    """Let a predictor and every baseline answer for N links.
+    """Let every baseline answer for N links.
 
     Parameters
     ----------
-    predictor : Predictor
     baselines : Baselines
     paper : Predictor, optional
-        The paper's, unless it is `predictor` itself.
+        The paper's.
     phi : LinkFeatures
+    frequency_hz : float
+        Carrier frequency [Hz].
 
     Returns
     -------
     mapping of str to LinkPrediction
-        "predictor" first.
+        The paper's predictor first.
     """
-    frequency_hz, distance = predictor.settings.frequency_hz, baselines.distance
-    result = {"predictor": predictor.predict(phi)}
-    if paper is not None:
-        result["paper"] = paper.predict(phi)
-    return result | {
+    distance = baselines.distance
+    return ({} if paper is None else {"paper": paper.predict(phi)}) | {
         "distance only": distance.predict(nothing_seen(phi, distance.settings.frequency_hz)),
         "majority": baselines.majority.predict(phi),
         "partial trace": LinkPrediction.of_trace(phi),

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.fitting import NetworkKind, PredictorSettings
+from sionna_partial.settings import NetworkKind, PredictorSettings
 from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.shards import INDEX_FILE, read_dataset
 

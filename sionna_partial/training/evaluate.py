@@ -154,20 +154,17 @@ def evaluate(
     homes = _homes(model, links)
     contestants = _Contestants(model, baselines or Baselines.load(_baselines_folder(model)), _paper(model))
     rows, differences, calibrations = [], [], {}
-    parts = list(itertools.product(homes, map(int, np.unique(links.stage)), ("indoor", "anywhere")))
-    for index, (name, stage, receivers) in enumerate(parts):
+    parts = list(itertools.product(homes, map(int, np.unique(links.stage))))
+    for index, (name, stage) in enumerate(parts):
         if progress:
-            progress(index / len(parts), f"measuring on {name} homes after {stage} steps, receivers {receivers}")
-        drawn = links.anywhere == (receivers == "anywhere")
-        some = links.take(np.isin(links.home, homes[name]) & (links.stage == stage) & drawn)
-        if not len(some):
-            continue
-        given = contestants.indoors(some) if receivers == "indoor" else contestants.anywhere(some)
-        rows += list(_rows(name, receivers, stage, some, given))
-        if name == "test":
-            differences += list(_differences(receivers, stage, some, given))
-            if receivers == "indoor":
-                calibrations[stage] = calibration(given["predictor"], some.link_state, some.gain_db)
+            progress(index / len(parts), f"measuring on {name} homes after {stage} steps")
+        both = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
+        for receivers, some, given in contestants.answers(both):
+            rows += list(_rows(name, receivers, stage, some, given))
+            if name == "test":
+                differences += list(_differences(receivers, stage, some, given))
+                if receivers == "indoor":
+                    calibrations[stage] = calibration(given["predictor"], some.link_state, some.gain_db)
     notes = tuple(contestants.notes(homes["test"]))
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
 
@@ -218,13 +215,25 @@ class _Contestants:
     baselines: Baselines
     paper: Predictor | None
 
-    def indoors(self, links: LinkTable) -> Mapping[str, LinkPrediction]:
-        """Answers where receivers are indoors."""
-        return answers(self.predictor, self.baselines, self.paper, links.phi)
+    def answers(self, links: LinkTable) -> Iterator[tuple[str, LinkTable, Mapping[str, LinkPrediction]]]:
+        """Yield "indoor" and "anywhere", the links of such receivers, and the answers for them.
 
-    def anywhere(self, links: LinkTable) -> Mapping[str, LinkPrediction]:
-        """Answers where receivers may be outside."""
-        indoors = self.predictor.predict(links.phi)
+        The predictor is asked once: the transmitters of both are the same, and so are their windows.
+        """
+        given = self.predictor.predict(links.phi)
+        for receivers, answer in (("indoor", self._indoors), ("anywhere", self._anywhere)):
+            drawn = links.anywhere == (receivers == "anywhere")
+            if drawn.any():
+                some = links.take(drawn)
+                yield receivers, some, answer(some, given.take(drawn))
+
+    def _indoors(self, links: LinkTable, given: LinkPrediction) -> Mapping[str, LinkPrediction]:
+        """Answers where receivers are indoors."""
+        others = answers(self.baselines, self.paper, links.phi, self.predictor.settings.frequency_hz)
+        return {"predictor": given, **others}
+
+    def _anywhere(self, links: LinkTable, indoors: LinkPrediction) -> Mapping[str, LinkPrediction]:
+        """Answers where receivers may be outside, from the predictor's for receivers indoors."""
         p_indoor = np.where(links.context.rx_seen, 1.0, self.predictor.predict_indoor(links.phi))
         outage = indoors.anywhere(np.zeros(len(links)))
         return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}

@@ -141,6 +141,29 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
     return [folder / name for name in REPORT_FILES]
 
 
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, names: int = 1) -> str:
+    """Lay out a Markdown table, its columns aligned for the eye.
+
+    Parameters
+    ----------
+    header : sequence of str
+    rows : iterable of sequences of str
+        As long as `header`.
+    names : int
+        Number of columns, from the left, that are aligned to the left; the others hold figures.
+
+    Returns
+    -------
+    str
+    """
+    cells = [list(header), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    sides = [str.ljust] * names + [str.rjust] * (len(widths) - names)
+    head, *lines = [[side(text, width) for side, text, width in zip(sides, row, widths, strict=True)] for row in cells]
+    rule = ["-" * width for width in widths[:names]] + ["-" * (width - 1) + ":" for width in widths[names:]]
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *lines))
+
+
 def _metrics_section(evaluation: Evaluation, homes: str, ends_seen: str) -> str:
     whose = {"all": "", "both": ", both ends seen", "one": ", one end seen", "none": ", no end seen"}[ends_seen]
     rows = evaluation.select(homes=homes, receivers="indoor", ends_seen=ends_seen)
@@ -163,7 +186,7 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
             where = "indoors" if receivers == "indoor" else "anywhere"
             title = f"Test homes, receivers {where}: {first} minus other, mean and standard error over homes"
             header = ["steps", "other", "homes", "accuracy", "RMSE [dB]"]
-            yield f"### {title}\n\n{_table(header, map(_difference_cells, rows))}"
+            yield f"### {title}\n\n{markdown_table(header, map(_difference_cells, rows), names=2)}"
 
 
 def _by_stage(rows: Sequence[Row]) -> str:
@@ -171,13 +194,14 @@ def _by_stage(rows: Sequence[Row]) -> str:
     stages, answers = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "answer"))
     found = {(row.answer, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
     header = ["accuracy, RMSE", *(f"{stage} steps" for stage in stages)]
-    return _table(header, ([answer, *(found.get((answer, stage), _MISSING) for stage in stages)] for answer in answers))
+    cells = ([answer, *(found.get((answer, stage), _MISSING) for stage in stages)] for answer in answers)
+    return markdown_table(header, cells)
 
 
 def _section(title: str, rows: Sequence[Row]) -> str:
     header = ["steps", "answer", *(label for label, _ in _COLUMNS.values())]
     cells = ([str(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links)
-    return f"### {title}\n\n{_table(header, cells)}"
+    return f"### {title}\n\n{markdown_table(header, cells, names=2)}"
 
 
 def _cells(metrics: Metrics) -> list[str]:
@@ -193,15 +217,6 @@ def _difference_cells(each: Difference) -> list[str]:
 
 def _text(value: float, form: str) -> str:
     return _MISSING if math.isnan(value) else format(value, form)
-
-
-def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Markdown table, its columns aligned for the eye."""
-    cells = [list(header), *map(list, rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in cells]
-    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
-    return "\n".join([lines[0], rule, *lines[1:]])
 
 
 def _finite(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import json
 import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from sionna_partial.files import atomic_write
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import Material
 from sionna_partial.training.link_table import LinkTable
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
@@ -248,6 +249,7 @@ def _links_of(columns: dict[str, Any], maps: Any) -> LinkTable:
 
 def _packed(partial: PartialMap) -> dict[str, object]:
     """Return a floor plan as JSON has it, its cells deflated."""
+    material = {} if partial.material is None else {"material": asdict(partial.material)}
     cells = base64.b64encode(zlib.compress(partial.state.tobytes(), 9)).decode()
     return {
         "shape": list(partial.shape),
@@ -256,13 +258,15 @@ def _packed(partial: PartialMap) -> dict[str, object]:
         "origin_m": list(partial.origin_m),
         "wall_height_m": partial.wall_height_m,
         "interior_cells": partial.interior_cells,
+        **material,
     }
 
 
 def _unpacked(entry: Any) -> PartialMap:
     cells = np.frombuffer(zlib.decompress(base64.b64decode(entry["cells"])), dtype=np.uint8)
     rest = {name: entry[name] for name in ("resolution_m", "wall_height_m", "interior_cells")}
-    return PartialMap(cells.reshape(entry["shape"]), origin_m=tuple(entry["origin_m"]), **rest)
+    material = Material(**entry["material"]) if "material" in entry else None
+    return PartialMap(cells.reshape(entry["shape"]), origin_m=tuple(entry["origin_m"]), material=material, **rest)
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:

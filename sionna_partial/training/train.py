@@ -9,9 +9,8 @@ import numpy as np
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_files, atomic_write
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.predictor import Predictor
-from sionna_partial.settings import require_number, settings_or_default
+from sionna_partial.settings import PredictorSettings, require_number, settings_or_default
 from sionna_partial.training.baselines import Baselines
 from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
 from sionna_partial.training.evaluate import Evaluation, Progress, evaluate
