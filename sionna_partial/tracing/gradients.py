@@ -6,28 +6,18 @@ gives the derivatives of all paths at once.
 """
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.errors import BackendError, PositionError
-from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings, require
-from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.contract import contract_remedy
-from sionna_partial.tracing.generator import WrittenScene, write_scene_of
-from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.probe import fast_engine_works
-from sionna_partial.tracing.solver import Offsets, SceneSolver
-from sionna_partial.tracing.trace import Progress, checked_positions, checked_settings, link_summary
-
-PATHS_PER_BLOCK = 50_000
-"""Number of paths that are differentiated together, which bounds the memory."""
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene, checked_ends, fixed_path_settings
+from sionna_partial.tracing.trace import Progress, link_summary
 
 
 @dataclass(frozen=True)
@@ -134,23 +124,20 @@ def gain_gradients(
     [-0.3102]
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    settings, scene_settings = checked_settings(partial, settings, scene_settings)
-    _require_off(settings, "refraction", "diffuse_reflection")
-    tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
-    if np.ndim(tx) != 1:
-        raise PositionError(f"tx has shape {np.shape(tx)}: give one transmitter as (3,).")
+    settings, scene_settings = fixed_path_settings(partial, settings, scene_settings)
+    tx_m, rx_m = checked_ends(partial, tx, rx, settings.frequency_hz)
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
-    shift = np.array([*partial.origin_m, 0.0])
     total = _Sums(len(rx_m))
     if len(rx_m):
-        with temporary_folder() as folder:
-            written = write_scene_of(partial, folder, settings, scene_settings)
-            _add_paths(total, written, settings, tx_m[0] - shift, rx_m - shift, report)
+        paths = PathScene(partial, settings=settings, scene_settings=scene_settings)
+        for block, share, message in paths.blocks(tx_m, rx_m):
+            total.add(block)
+            report(0.1 + 0.9 * share, message.replace("verifying", "differentiating"))
     link_state, gain_db = link_summary(total.power, total.is_direct)
     slopes_db = total.slopes_db()
     return GainGradients(
-        tx=tx_m[0],
+        tx=tx_m,
         rx=rx_m,
         link_state=link_state,
         gain_db=gain_db,
@@ -164,97 +151,24 @@ def gain_gradients(
     )
 
 
-def path_slopes(
-    solver: SceneSolver, candidates: Candidates, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Differentiate the power of paths.
-
-    Parameters
-    ----------
-    solver : SceneSolver
-    candidates : Candidates
-        Candidates that are paths.
-    tx_m, rx_m : (3,) and (N, 3) arrays
-        Transmitter and receivers, in scene coordinates [m].
-
-    Returns
-    -------
-    (7, C) float64 array
-        Derivatives of the power |a|^2 of each with respect to the fields of `Offsets`, in their order.
-    """
-    slopes = np.zeros((len(fields(Offsets)), len(candidates.rx)))
-    for start in range(0, len(candidates.rx), PATHS_PER_BLOCK):
-        block = slice(start, min(start + PATHS_PER_BLOCK, len(candidates.rx)))
-        part = candidates.rows(np.arange(block.start, block.stop))
-        slopes[:, block] = _block_slopes(solver, part, tx_m, rx_m)
-    return slopes
-
-
 class _Sums:
     """Sums over the paths of each of N receivers."""
 
     def __init__(self, receivers: int) -> None:
         self.power = np.zeros(receivers)
         self.is_direct = np.zeros(receivers, dtype=bool)
-        self.slopes = np.zeros((len(fields(Offsets)), receivers))
+        self.slopes = np.zeros((2 + len(PARAMETERS), receivers))
 
-    def add(self, paths: SolvedPaths, slopes: NDArray[np.float64]) -> None:
-        count = len(self.power)
-        self.power += np.bincount(paths.path_rx, weights=np.abs(paths.a) ** 2, minlength=count)
-        self.is_direct[paths.path_rx[paths.is_direct]] = True
-        for total, slope in zip(self.slopes, slopes, strict=True):
-            total += np.bincount(paths.path_rx, weights=slope, minlength=count)
+    def add(self, paths: FixedPaths) -> None:
+        count, index = len(self.power), paths.rx_of_path
+        self.power += np.bincount(index, weights=paths.power, minlength=count)
+        self.is_direct[index[paths.is_direct]] = True
+        slopes = np.concatenate(list(paths.slopes(paths.base, together=True).values()), axis=1)
+        for total, slope in zip(self.slopes, slopes.T, strict=True):
+            total += np.bincount(index, weights=slope, minlength=count)
 
     def slopes_db(self) -> NDArray[np.float64]:
         """Turn the derivatives (7, N) into those of the gain [dB], which are 0 at its floor."""
         _, gain_db = link_summary(self.power, self.is_direct)
         above = gain_db > GAIN_FLOOR_DB
         return np.where(above, 10.0 / math.log(10.0) * self.slopes / np.where(above, self.power, 1.0), 0.0)
-
-
-def _require_off(settings: TraceSettings, *names: str) -> None:
-    for name in names:
-        value = getattr(settings, name)
-        remedy = "paths that are found by shooting rays have no gradients: give False"
-        require(not value, name, value, f"{remedy}, and trace_links for the gain alone.")
-
-
-def _add_paths(
-    total: _Sums,
-    written: WrittenScene,
-    settings: TraceSettings,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    report: Progress,
-) -> None:
-    """Find, verify and differentiate the paths in scene coordinates, block by block."""
-    if not written.is_plan:
-        _require_off(settings, "diffraction")
-    if not fast_engine_works():
-        raise BackendError(
-            f"Gradients need the internal parts of Sionna RT that the fast engine has: {contract_remedy()}"
-        )
-    solver = SceneSolver(written.xml, written.shapes, settings)
-    for candidates, share, message in written.candidates(solver, tx_m, rx_m):
-        paths, rows = solver.verify_rows(candidates, tx_m, rx_m)
-        total.add(paths, path_slopes(solver, candidates.rows(rows), tx_m, rx_m))
-        report(0.1 + 0.9 * share, message.replace("verifying", "differentiating"))
-
-
-def _block_slopes(
-    solver: SceneSolver, candidates: Candidates, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Differentiate one block of paths (see `path_slopes`)."""
-    import drjit as dr
-    import mitsuba as mi
-
-    offsets = Offsets(*(dr.opaque(mi.Float, 0.0) for _ in fields(Offsets)))
-    leaves = [getattr(offsets, field.name) for field in fields(Offsets)]
-    dr.enable_grad(leaves)
-    power = solver.path_power(candidates, tx_m, rx_m, offsets)
-    slopes = np.zeros((len(leaves), len(candidates.rx)))
-    for slope, leaf in zip(slopes, leaves, strict=True):
-        dr.clear_grad(power)
-        dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next parameter
-        slope[:] = dr.grad(power).numpy()
-    return slopes

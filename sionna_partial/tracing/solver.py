@@ -57,18 +57,18 @@ def _to_device(kind: Any, values: NDArray[Any]) -> Any:
 class Offsets:
     """What is added to a transmitter's position and to a scene: variables of Dr.Jit with one entry each.
 
-    With gradients enabled, the derivatives of what `SceneSolver.path_power` gives lead back to them.
+    With gradients enabled, the derivatives of what `SceneSolver.moved_paths` gives lead back to them.
 
     Parameters
     ----------
     x_m, y_m, z_m : mitsuba.Float
         Added to the transmitter's position [m].
-    relative_permittivity : mitsuba.Float
-        Added to the real relative permittivity of every material.
-    conductivity_s_m : mitsuba.Float
-        Added to the conductivity of every material [S/m].
-    thickness_m : mitsuba.Float
-        Added to the thickness of every material [m].
+    relative_permittivity : tuple of mitsuba.Float
+        Added to the real relative permittivity: of each of `SceneSolver.materials`, or one for all of them.
+    conductivity_s_m : tuple of mitsuba.Float
+        Added to the conductivity [S/m], likewise.
+    thickness_m : tuple of mitsuba.Float
+        Added to the thickness [m], likewise.
     frequency_hz : mitsuba.Float
         Added to the carrier frequency [Hz], on which ITU materials depend too.
     """
@@ -76,9 +76,9 @@ class Offsets:
     x_m: Any
     y_m: Any
     z_m: Any
-    relative_permittivity: Any
-    conductivity_s_m: Any
-    thickness_m: Any
+    relative_permittivity: tuple[Any, ...]
+    conductivity_s_m: tuple[Any, ...]
+    thickness_m: tuple[Any, ...]
     frequency_hz: Any
 
 
@@ -95,12 +95,11 @@ class _Chain:
         self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
     ) -> Any:
         """Verify the candidates in a buffer, and give it back with their coefficients."""
-        import drjit as dr
-        import mitsuba as mi
+        buffer = self.verify(scene, buffer, source, targets, diffraction)
+        return self.evaluate(scene, buffer, source, targets, samples_per_tx, diffraction)
 
-        still = dr.zeros(mi.Point3f, 1), dr.zeros(mi.Point3f, dr.width(targets))
-        dr.make_opaque(*still)
-        patterns = scene.tx_array.antenna_pattern.patterns
+    def verify(self, scene: Any, buffer: Any, source: Any, targets: Any, diffraction: bool) -> Any:
+        """Verify the candidates in a buffer, and give it back with their vertices."""
         buffer = self._image_method(
             scene=_IncoherentScene(scene.mi_scene),
             paths=buffer,
@@ -111,6 +110,18 @@ class _Chain:
         )
         if diffraction:
             _end_at_targets(buffer, targets)
+        return buffer
+
+    def evaluate(
+        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
+    ) -> Any:
+        """Give a buffer of verified candidates back with their coefficients."""
+        import drjit as dr
+        import mitsuba as mi
+
+        still = dr.zeros(mi.Point3f, dr.width(source)), dr.zeros(mi.Point3f, dr.width(targets))
+        dr.make_opaque(*still)
+        patterns = scene.tx_array.antenna_pattern.patterns
         return self._field_calculator(
             wavelength=scene.wavelength,
             paths=buffer,
@@ -142,6 +153,28 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
         setattr(buffer, name, type(getattr(buffer, name))(beyond, kind.shape))
 
 
+@dataclass(frozen=True)
+class VerifiedPaths:
+    """Candidates that the image method has verified, from any of T transmitters to any of N receivers.
+
+    Parameters
+    ----------
+    buffer : sionna.rt PathsBuffer
+    valid : mitsuba.Bool
+        Which of them are paths.
+    source, targets : mitsuba.Point3f
+        The transmitters and the receivers [m].
+    diffraction : bool
+        Whether they diffract.
+    """
+
+    buffer: Any
+    valid: Any
+    source: Any
+    targets: Any
+    diffraction: bool
+
+
 class SceneSolver:
     """Verifies candidates in one exported scene.
 
@@ -168,6 +201,15 @@ class SceneSolver:
         primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
         self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
         self._symbolic, self._evaluated = _Chain("symbolic"), _Chain("evaluated")
+
+    @property
+    def materials(self) -> dict[str, NDArray[np.float64]]:
+        """Relative permittivity, conductivity [S/m] and thickness [m] (3,) of each material, by name."""
+        constants = ("relative_permittivity", "conductivity", "thickness")
+        return {
+            name: np.ravel([getattr(each, constant) for constant in constants]).astype(np.float64)
+            for name, each in self._scene.radio_materials.items()
+        }
 
     @property
     def mi_scene(self) -> Any:
@@ -215,16 +257,18 @@ class SceneSolver:
         buffer = self._solve(self._symbolic, candidates, _points(tx_m[None]), _points(rx_m))
         return _read_buffer(buffer, tx_m, rx_m)
 
-    def path_power(
+    def moved_paths(
         self,
         candidates: Candidates,
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
         offsets: Offsets,
-    ) -> Any:
-        """Power of candidates as a differentiable function of the transmitter's position and of the scene.
+        *,
+        differentiable: bool = True,
+    ) -> tuple[Any, Any]:
+        """Power and vertices of candidates as functions of the transmitter's position and of the scene.
 
-        Candidates are verified again, so that those that the offsets make invalid have none.
+        Candidates are verified again, so that those that the offsets make invalid have no power.
 
         Parameters
         ----------
@@ -233,6 +277,71 @@ class SceneSolver:
         tx_m, rx_m : (3,) and (N, 3) arrays
             Transmitter and receivers, in scene coordinates [m].
         offsets : Offsets
+        differentiable : bool
+            Whether derivatives are wanted, which takes the slower, evaluated loops.
+
+        Returns
+        -------
+        power : mitsuba.Float
+            Squared magnitude (C,) of each candidate's coefficient.
+        vertices_m : mitsuba.Point3f
+            Points of interaction (C D,), candidate by candidate [m].
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        source = _points(tx_m[None]) + mi.Point3f(offsets.x_m, offsets.y_m, offsets.z_m)
+        chain = self._evaluated if differentiable else self._symbolic
+        # Dr.Jit cannot pass forward through a symbolic call of a material twice
+        with self._changed(offsets), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+            buffer = self._solve(chain, candidates, source, _points(rx_m))
+            a = buffer.a[0][0]
+            power = dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
+            places = (buffer.vertices_x.array, buffer.vertices_y.array, buffer.vertices_z.array)
+            return power, mi.Point3f(*places)
+
+    def verified(
+        self,
+        candidates: Candidates,
+        tx_index: NDArray[np.integer],
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+    ) -> VerifiedPaths:
+        """Verify candidates from several transmitters once, for `power`.
+
+        Parameters
+        ----------
+        candidates : Candidates
+            At least one.
+        tx_index : (C,) integer array
+            Transmitter of each.
+        tx_m, rx_m : (T, 3) and (N, 3) arrays
+            Transmitters and receivers, in scene coordinates [m].
+
+        Returns
+        -------
+        VerifiedPaths
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        diffraction, (source, targets) = candidates.wedges is not None, (_points(tx_m), _points(rx_m))
+        buffer = self._buffer(candidates)
+        buffer._src_indices = _to_device(mi.UInt, tx_index.astype(np.uint32))
+        buffer = self._symbolic.verify(self._scene, buffer, source, targets, diffraction)
+        buffer.schedule()
+        return VerifiedPaths(buffer, dr.copy(buffer.valid), source, targets, diffraction)
+
+    def power(self, paths: VerifiedPaths, offsets: Offsets, *, differentiable: bool = True) -> Any:
+        """Power of verified candidates as a function of the materials and of the frequency, not of places.
+
+        Parameters
+        ----------
+        paths : VerifiedPaths
+        offsets : Offsets
+            Those of the transmitter's position do not count.
+        differentiable : bool
+            Whether derivatives are wanted, which takes the slower, evaluated loops.
 
         Returns
         -------
@@ -240,14 +349,13 @@ class SceneSolver:
             Squared magnitude (C,) of each candidate's coefficient.
         """
         import drjit as dr
-        import mitsuba as mi
 
-        source = _points(tx_m[None]) + mi.Point3f(offsets.x_m, offsets.y_m, offsets.z_m)
-        # Dr.Jit cannot pass forward through a symbolic call of a material twice
-        with self._changed(offsets), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, False):
-            buffer = self._solve(self._evaluated, candidates, source, _points(rx_m))
-            a = buffer.a[0][0]
-            return dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
+        chain, samples = self._evaluated if differentiable else self._symbolic, self._settings.samples_per_tx
+        paths.buffer.valid = dr.copy(paths.valid)
+        with self._changed(offsets), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+            done = chain.evaluate(self._scene, paths.buffer, paths.source, paths.targets, samples, paths.diffraction)
+            a = done.a[0][0]
+            return dr.select(done.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
 
     @contextmanager
     def _changed(self, offsets: Offsets) -> Iterator[None]:
@@ -257,10 +365,11 @@ class SceneSolver:
         frequency = self._scene.frequency
         try:
             self._scene.frequency = frequency + offsets.frequency_hz  # ITU materials follow
-            for material, *_ in kept:
-                material.relative_permittivity = material.relative_permittivity + offsets.relative_permittivity
-                material.conductivity = material.conductivity + offsets.conductivity_s_m
-                material.thickness = material.thickness + offsets.thickness_m
+            for index, (each, *_) in enumerate(kept):
+                permittivities, conductivities = offsets.relative_permittivity, offsets.conductivity_s_m
+                each.relative_permittivity = each.relative_permittivity + permittivities[index % len(permittivities)]
+                each.conductivity = each.conductivity + conductivities[index % len(conductivities)]
+                each.thickness = each.thickness + offsets.thickness_m[index % len(offsets.thickness_m)]
             yield
         finally:
             self._scene.frequency = frequency

@@ -1,0 +1,1 @@
+"""Back from predictions to what they depend on: materials and places."""

@@ -1,0 +1,338 @@
+"""Smooth lengths of segments in cells: by hand, beside quadrature and finite differences, and by their properties."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import RegularGridInterpolator
+
+from sionna_partial.constants import CellState
+from sionna_partial.inverse.smooth_lengths import SmoothLengths
+from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.maps.partial_map import PartialMap
+
+FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+RESOLUTION_M = 0.25
+ORIGIN_M = (3.0, -2.0)
+
+
+def random_map(seed=0, shape=(12, 20), block=1, resolution_m=RESOLUTION_M):
+    """Return a map of random blocks of cells."""
+    blocks = np.random.default_rng(seed).integers(0, 3, shape)
+    return PartialMap(np.kron(blocks, np.ones((block, block), dtype=int)), resolution_m, ORIGIN_M)
+
+
+def ends_around(partial, count, seed=0, margin_m=1.0):
+    """Return random ends (count, 3) twice, some of them outside the map."""
+    x0, y0, x1, y1 = partial.bounds_m
+    low, high = (x0 - margin_m, y0 - margin_m, 0.2), (x1 + margin_m, y1 + margin_m, 2.8)
+    start_m, end_m = np.random.default_rng(seed).uniform(low, high, (2, count, 3))
+    return start_m, end_m
+
+
+def half_plane(edge_m=5.0):
+    """Return a free room that is unknown from x = edge_m on, wide enough for the ends of what is measured."""
+    state = np.full((40, 40), FREE)
+    state[:, round(edge_m / RESOLUTION_M) :] = UNKNOWN
+    return PartialMap(state, RESOLUTION_M)
+
+
+def interpolated(partial, kind):
+    """Return the bilinear interpolation of the mask as a function of places (..., 2) [m], by SciPy."""
+    mask = np.pad((partial.state == kind).astype(float), 1, constant_values=float(kind == UNKNOWN))
+    middles_m = [
+        start + (np.arange(size) - 0.5) * partial.resolution_m
+        for start, size in zip(partial.origin_m, mask.shape[::-1], strict=True)
+    ]
+    return RegularGridInterpolator(middles_m, mask.T, bounds_error=False, fill_value=mask[0, 0])
+
+
+def quadrature(partial, kind, start_m, end_m, points=20_000):
+    """Return lengths (N,) by the midpoint rule."""
+    look_up = interpolated(partial, kind)
+    t = ((np.arange(points) + 0.5) / points)[:, None]
+    means = [look_up(start + t * (end - start)).mean() for start, end in zip(start_m[:, :2], end_m[:, :2], strict=True)]
+    return np.array(means) * np.linalg.norm(end_m - start_m, axis=1)
+
+
+def differences(smooth, start_m, end_m, step_m):
+    """Return central finite differences of the lengths with respect to both ends, (N, 3) each."""
+    start, end = np.empty(start_m.shape), np.empty(end_m.shape)
+    for axis, shift_m in enumerate(step_m * np.eye(3)):
+        start[:, axis] = (smooth(start_m + shift_m, end_m) - smooth(start_m - shift_m, end_m)) / (2.0 * step_m)
+        end[:, axis] = (smooth(start_m, end_m + shift_m) - smooth(start_m, end_m - shift_m)) / (2.0 * step_m)
+    return start, end
+
+
+def one(smooth, start, end):
+    """Return length and slopes of one segment."""
+    start_m, end_m = np.array([start], dtype=float), np.array([end], dtype=float)
+    slopes = smooth.slopes(start_m, end_m)
+    return smooth(start_m, end_m)[0], slopes[0][0], slopes[1][0]
+
+
+class TestLengths:
+    def test_everything_on_an_unknown_map(self):
+        partial = PartialMap(np.full((4, 6), UNKNOWN), RESOLUTION_M, ORIGIN_M)
+        start_m, end_m = ends_around(partial, 100)
+        distance_m = np.linalg.norm(end_m - start_m, axis=1)
+        np.testing.assert_allclose(SmoothLengths(partial, UNKNOWN)(start_m, end_m), distance_m, rtol=1e-12)
+        assert not SmoothLengths(partial, WALL)(start_m, end_m).any()
+        assert not SmoothLengths(partial, FREE)(start_m, end_m).any()
+
+    def test_nothing_unknown_on_a_complete_map(self):
+        partial = PartialMap(np.pad([[FREE]], 1, constant_values=WALL), RESOLUTION_M, ORIGIN_M)
+        assert partial.is_complete
+        assert not SmoothLengths(partial, UNKNOWN)(*ends_around(partial, 100)).any()
+        assert SmoothLengths(partial, WALL)(*ends_around(partial, 100)).any()
+
+    def test_half_plane_by_hand(self):
+        partial = half_plane(5.0)
+        smooth = SmoothLengths(partial, UNKNOWN)
+        start_m, end_m = np.array([[2.0, 3.0, 1.0]]), np.array([[8.0, 6.5, 2.0]])
+        np.testing.assert_allclose(smooth(start_m, end_m), np.linalg.norm(end_m - start_m, axis=1) / 2, rtol=1e-12)
+        into_m = np.linspace(-0.5, 0.5, 21) * RESOLUTION_M
+        ends_m = np.column_stack([5.0 + into_m, np.full(21, 3.0), np.full(21, 1.0)])
+        ramp_m = (into_m + RESOLUTION_M / 2) ** 2 / (2 * RESOLUTION_M)
+        np.testing.assert_allclose(smooth(np.array([2.0, 3.0, 1.0]), ends_m), ramp_m, atol=1e-12)
+
+    @pytest.mark.parametrize("y_m", [5.0, 5.0 + RESOLUTION_M / 2, 4.9])
+    def test_segment_along_an_axis_by_hand(self, y_m):
+        smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
+        assert one(smooth, (1.0, y_m, 1.0), (8.0, y_m, 1.0))[0] == pytest.approx(3.0, abs=1e-12)
+        assert one(smooth, (5.0, y_m, 1.0), (5.0, 2.0, 1.0))[0] == pytest.approx((y_m - 2.0) / 2, abs=1e-12)
+
+    def test_upright_segment_by_hand(self):
+        smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
+        x_m = 5.0 + np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * RESOLUTION_M
+        bottom_m = np.column_stack([x_m, np.full(5, 3.0), np.full(5, 0.5)])
+        np.testing.assert_allclose(
+            smooth(bottom_m, np.add(bottom_m, (0.0, 0.0, 2.0))), [0.0, 0.5, 1.0, 1.5, 2.0], atol=1e-5
+        )
+
+    @pytest.mark.parametrize("block", [1, 3, 9])
+    @pytest.mark.parametrize("kind", CellState)
+    def test_agree_with_quadrature(self, kind, block):
+        partial = random_map(block=block, resolution_m=RESOLUTION_M / block)
+        start_m, end_m = ends_around(partial, 60)
+        expected_m = quadrature(partial, kind, start_m, end_m)
+        np.testing.assert_allclose(SmoothLengths(partial, kind)(start_m, end_m), expected_m, atol=1e-6)
+
+    @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (2, 2)])
+    @pytest.mark.parametrize("kind", [WALL, UNKNOWN])
+    def test_agree_with_quadrature_on_small_maps(self, shape, kind):
+        partial = PartialMap(np.full(shape, WALL), RESOLUTION_M, ORIGIN_M)
+        start_m, end_m = ends_around(partial, 50, margin_m=0.5)
+        expected_m = quadrature(partial, kind, start_m, end_m)
+        assert expected_m.any()
+        np.testing.assert_allclose(SmoothLengths(partial, kind)(start_m, end_m), expected_m, atol=1e-6)
+
+    @pytest.mark.parametrize("kind", CellState)
+    def test_between_zero_and_the_distance(self, kind):
+        # Long ways through cells of the kind, between quarters of cells: rounding would exceed 1.
+        state = np.random.default_rng(0).choice([kind, (kind + 1) % 3], (12, 20), p=[0.9, 0.1])
+        partial = PartialMap(state, RESOLUTION_M, (0.3, -0.7))
+        quarters = np.random.default_rng(1).integers(0, 48, (2, 50_000, 3)) / 4
+        start_m, end_m = 0.3 + RESOLUTION_M * quarters - [0.0, 1.0, 0.0]
+        found_m = SmoothLengths(partial, kind)(start_m, end_m)
+        assert (found_m >= 0.0).all()
+        assert (found_m <= np.linalg.norm(end_m - start_m, axis=1)).all()
+
+    def test_kinds_share_the_distance(self):
+        partial = random_map(2)
+        start_m, end_m = ends_around(partial, 500)
+        found_m = sum(SmoothLengths(partial, kind)(start_m, end_m) for kind in CellState)
+        np.testing.assert_allclose(found_m, np.linalg.norm(end_m - start_m, axis=1), rtol=1e-12)
+
+    def test_same_under_exchange_of_ends(self):
+        partial = random_map(3)
+        start_m, end_m = ends_around(partial, 500)
+        smooth = SmoothLengths(partial, UNKNOWN)
+        np.testing.assert_allclose(smooth(start_m, end_m), smooth(end_m, start_m), atol=1e-12)
+        np.testing.assert_allclose(smooth.slopes(start_m, end_m), smooth.slopes(end_m, start_m)[::-1], atol=1e-11)
+
+    @pytest.mark.parametrize("shift_m", [(0.1, -7.3), (4e5, 5.5e6)], ids=["metres", "UTM"])
+    def test_same_when_everything_is_moved(self, shift_m):
+        partial = random_map(4)
+        moved = PartialMap(partial.state, RESOLUTION_M, tuple(np.add(ORIGIN_M, shift_m)))
+        ends_m = ends_around(partial, 500)
+        moved_m = [np.add(points, (*shift_m, 0.0)) for points in ends_m]
+        here, there = SmoothLengths(partial, UNKNOWN), SmoothLengths(moved, UNKNOWN)
+        np.testing.assert_allclose(here(*ends_m), there(*moved_m), atol=1e-7)
+        np.testing.assert_allclose(here.slopes(*ends_m), there.slopes(*moved_m), atol=1e-5)
+
+    def test_same_when_everything_is_mirrored(self):
+        partial = random_map(5)
+        mirrored = PartialMap(partial.state[:, ::-1], RESOLUTION_M, (-partial.bounds_m[2], ORIGIN_M[1]))
+        ends_m = ends_around(partial, 500)
+        mirrored_m = [points * [-1.0, 1.0, 1.0] for points in ends_m]
+        here, there = SmoothLengths(partial, WALL), SmoothLengths(mirrored, WALL)
+        np.testing.assert_allclose(here(*ends_m), there(*mirrored_m), atol=1e-12)
+        slopes = np.array(there.slopes(*mirrored_m)) * [-1.0, 1.0, 1.0]
+        np.testing.assert_allclose(here.slopes(*ends_m), slopes, atol=1e-11)
+
+    def test_parts_of_a_segment_add_up(self):
+        partial = random_map(6)
+        start_m, end_m = ends_around(partial, 500)
+        smooth, middle_m = SmoothLengths(partial, UNKNOWN), 0.3 * start_m + 0.7 * end_m
+        parts_m = smooth(start_m, middle_m) + smooth(middle_m, end_m)
+        np.testing.assert_allclose(smooth(start_m, end_m), parts_m, atol=1e-12)
+
+    def test_one_start_for_all(self):
+        partial = random_map(7)
+        start_m, end_m = ends_around(partial, 20)
+        smooth, tiled_m = SmoothLengths(partial, UNKNOWN), np.tile(start_m[0], (20, 1))
+        np.testing.assert_array_equal(smooth(start_m[0], end_m), smooth(tiled_m, end_m))
+        np.testing.assert_array_equal(smooth.slopes(start_m[0], end_m), smooth.slopes(tiled_m, end_m))
+        np.testing.assert_array_equal(smooth(end_m, start_m[0]), smooth(end_m, tiled_m))
+
+    def test_no_segments(self):
+        smooth, none = SmoothLengths(random_map(), UNKNOWN), np.zeros((0, 3))
+        assert smooth(none, none).shape == smooth(np.zeros(3), none).shape == (0,)
+        assert [slope.shape for slope in smooth.slopes(none, none)] == [(0, 3), (0, 3)]
+
+    def test_not_a_number(self):
+        smooth = SmoothLengths(random_map(), UNKNOWN)
+        start_m, end_m = np.full((3, 3), 1.0), np.full((3, 3), 2.0)
+        start_m[[0, 1], [0, 2]] = np.nan
+        assert np.isnan(smooth(start_m, end_m)).tolist() == [True, True, False]
+        assert np.isnan(smooth.slopes(start_m, end_m)[1]).any(axis=1).tolist() == [True, True, False]
+
+
+class TestBesideTheExactLength:
+    def test_within_a_quarter_of_a_cell_diagonal_for_each_border_and_end(self):
+        partial = random_map(8, block=8, resolution_m=RESOLUTION_M / 4)
+        start_m, end_m = ends_around(partial, 2_000, margin_m=0.0)
+        step_m = np.abs(end_m - start_m)[:, :2]
+        askew = step_m.min(axis=1) > 0.3 * step_m.max(axis=1)
+        start_m, end_m = start_m[askew], end_m[askew]
+        t = np.linspace(0.0, 1.0, 2_000)[:, None, None]
+        unknown = partial.state_at(start_m + t * (end_m - start_m)) == UNKNOWN
+        allowed = 2 + (unknown[1:] != unknown[:-1]).sum(axis=0)
+        slant = np.linalg.norm(end_m - start_m, axis=1) / np.linalg.norm((end_m - start_m)[:, :2], axis=1)
+        error_m = np.abs(
+            SmoothLengths(partial, UNKNOWN)(start_m, end_m) - unobserved_lengths_m(partial, start_m, end_m)
+        )
+        assert (error_m <= allowed * slant * 0.25 * np.sqrt(2) * partial.resolution_m).all()
+        assert error_m.mean() < 0.1 * partial.resolution_m
+
+    def test_comes_closer_as_cells_become_smaller(self):
+        state = random_map(9).state
+        errors_m = []
+        for parts in (1, 2, 4, 8):
+            fine = PartialMap(np.kron(state, np.ones((parts, parts), dtype=int)), RESOLUTION_M / parts, ORIGIN_M)
+            ends_m = ends_around(fine, 2_000, margin_m=0.0)
+            errors_m.append(np.abs(SmoothLengths(fine, UNKNOWN)(*ends_m) - unobserved_lengths_m(fine, *ends_m)).mean())
+        assert all(fine < 0.6 * coarse for coarse, fine in pairwise(errors_m))
+
+
+class TestSlopes:
+    def test_unit_vectors_on_an_unknown_map(self):
+        partial = PartialMap(np.full((4, 6), UNKNOWN), RESOLUTION_M, ORIGIN_M)
+        start_m, end_m = ends_around(partial, 100)
+        towards = (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=1, keepdims=True)
+        start, end = SmoothLengths(partial, UNKNOWN).slopes(start_m, end_m)
+        np.testing.assert_allclose(end, towards, atol=1e-12)
+        np.testing.assert_allclose(start, -towards, atol=1e-12)
+
+    def test_zero_on_a_complete_map(self):
+        partial = PartialMap(np.pad([[FREE]], 1, constant_values=WALL), RESOLUTION_M, ORIGIN_M)
+        assert not np.any(SmoothLengths(partial, UNKNOWN).slopes(*ends_around(partial, 100)))
+
+    def test_half_plane_by_hand(self):
+        # In the plane, with its start in the free half, a segment is unknown for (x - 5 m) / (x - x_start) of its way.
+        smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
+        _, start, end = one(smooth, (2.0, 3.0, 1.0), (6.0, 6.0, 1.0))
+        np.testing.assert_allclose(start, [5 / 16 - 4 / 5 / 4, -3 / 5 / 4, 0.0], atol=1e-12)
+        np.testing.assert_allclose(end, [4 / 5 / 4 + 5 * 3 / 16, 3 / 5 / 4, 0.0], atol=1e-12)
+
+    @pytest.mark.parametrize("kind", CellState)
+    def test_agree_with_finite_differences(self, kind):
+        partial = random_map(10)
+        start_m, end_m = ends_around(partial, 1_000)
+        smooth = SmoothLengths(partial, kind)
+        found, expected = smooth.slopes(start_m, end_m), differences(smooth, start_m, end_m, 1e-5)
+        error = np.abs(np.subtract(found, expected)).max(axis=(0, 2))
+        assert np.quantile(error, 0.9) < 1e-7
+        assert error.max() < 1e-5
+
+    @pytest.mark.parametrize(
+        ("start", "end"),
+        [
+            ((4.9, 1.0, 1.0), (4.9, 8.0, 2.0)),
+            ((5.0 + RESOLUTION_M / 2, 1.0, 1.0), (5.0 + RESOLUTION_M / 2, 8.0, 2.0)),
+            ((5.0 - RESOLUTION_M / 2, 1.0, 1.0), (5.0 - RESOLUTION_M / 2, 8.0, 2.0)),
+            ((1.0, 3.0, 1.0), (8.0, 3.0, 1.0)),
+            ((1.0, 3.0 + RESOLUTION_M / 2, 1.0), (8.0, 3.0 + RESOLUTION_M / 2, 1.0)),
+            ((5.05, 3.0, 1.0), (5.05, 3.0, 2.0)),
+            (
+                (5.0 + RESOLUTION_M / 2, 3.0 + RESOLUTION_M / 2, 1.0),
+                (5.0 + RESOLUTION_M / 2, 3.0 + RESOLUTION_M / 2, 2.0),
+            ),
+        ],
+        ids=[
+            "along edge",
+            "along middles",
+            "along other middles",
+            "across",
+            "across in middles",
+            "upright",
+            "upright in a middle",
+        ],
+    )
+    def test_agree_with_finite_differences_along_axes(self, start, end):
+        smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
+        start_m, end_m = np.array([start]), np.array([end])
+        expected = differences(smooth, start_m, end_m, 1e-3)
+        np.testing.assert_allclose(smooth.slopes(start_m, end_m), expected, atol=1e-5)
+
+    def test_moving_both_ends_is_their_sum(self):
+        partial = random_map(11)
+        start_m, end_m = ends_around(partial, 500)
+        smooth = SmoothLengths(partial, UNKNOWN)
+        move_m = 1e-5 * np.array([0.6, -0.8, 0.5])
+        rate = (smooth(start_m + move_m, end_m + move_m) - smooth(start_m - move_m, end_m - move_m)) / 2e-5
+        error = np.abs(sum(smooth.slopes(start_m, end_m)) @ move_m / 1e-5 - rate)
+        assert np.quantile(error, 0.9) < 1e-7
+        assert error.max() < 1e-4
+        assert not np.sum(smooth.slopes(start_m, end_m), axis=0)[:, 2].any()
+
+    def test_stretching_from_the_start_is_the_mask_at_the_end(self):
+        partial = random_map(12)
+        start_m, end_m = ends_around(partial, 500)
+        towards = (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=1, keepdims=True)
+        _, end = SmoothLengths(partial, UNKNOWN).slopes(start_m, end_m)
+        expected = interpolated(partial, UNKNOWN)(end_m[:, :2])
+        np.testing.assert_allclose((end * towards).sum(axis=1), expected, atol=1e-10)
+
+    def test_do_not_jump(self):
+        partial, angle = random_map(13), np.linspace(0.1, np.pi / 2 - 0.1, 20_000)
+        start_m = np.array([4.4, -1.3, 1.0])
+        end_m = start_m + 2.5 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))])
+        slopes = np.concatenate(SmoothLengths(partial, UNKNOWN).slopes(start_m, end_m), axis=1)
+        exact = np.gradient(unobserved_lengths_m(partial, start_m, end_m), angle)
+        assert np.abs(np.diff(slopes, axis=0)).max() < 0.05
+        assert np.abs(np.diff(exact)).max() > 5.0
+
+    def test_coinciding_ends(self):
+        partial = random_map(14)
+        places_m, _ = ends_around(partial, 100)
+        smooth = SmoothLengths(partial, UNKNOWN)
+        assert not smooth(places_m, places_m).any()
+        assert not np.any(smooth.slopes(places_m, places_m))
+
+
+places = st.integers(-6, 46).map(lambda quarters: quarters / 4)
+"""Coordinates in quarters of a cell: many are on lines through middles of cells or on borders of cells."""
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.integers(0, 20), st.tuples(places, places, places, places))
+def test_segments_between_quarters_of_cells(seed, ends):
+    partial = PartialMap(random_map(seed, (10, 10)).state, 1.0)
+    smooth, start_m, end_m = SmoothLengths(partial, WALL), np.array([[*ends[:2], 1.0]]), np.array([[*ends[2:], 1.5]])
+    expected_m = quadrature(partial, WALL, start_m, end_m, 4_000)
+    np.testing.assert_allclose(smooth(start_m, end_m), expected_m, atol=1e-4)
+    np.testing.assert_allclose(smooth.slopes(start_m, end_m), differences(smooth, start_m, end_m, 1e-4), atol=1e-2)
