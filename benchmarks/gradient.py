@@ -5,8 +5,8 @@ respect to transmitter, materials and frequency, by TensorFlow through networks,
 those of the same function at 25 places around each parameter's value: their slope, and its standard error, come from a
 polynomial of degree 4. On complete maps the answer is the trace itself; on the others it is that of both predictors.
 
-Receivers are left out at which paths of more than 0.1 % of the power appear or vanish between the outermost places, for
-derivatives cannot see that, or which pass the middle of a cell of the map network's window, where its answer has a
+Receivers are left out at which paths of more than 0.002 % of the power appear or vanish between the outermost places,
+for derivatives cannot see that, or which pass the middle of a cell of the map network's window, where its answer has a
 bend; the column "kept" has the share of the others. Sionna RT computes in single precision, so that differences can be
 unsure by more than 1 % of a small slope: errors are given as they are, with three standard errors allowed, and for the
 receivers where the standard error is below 0.3 % of the slope. Run it with
@@ -33,9 +33,9 @@ import_keras()
 import tensorflow as tf  # noqa: E402 (after LLVM)
 
 REACHES = {
-    "x": 0.01,
-    "y": 0.01,
-    "z": 0.025,
+    "x": 0.003,
+    "y": 0.003,
+    "z": 0.01,
     "relative_permittivity": 0.01,
     "conductivity_s_m": 0.01,
     "thickness_m": 1e-4,
@@ -45,6 +45,9 @@ REACHES = {
 
 OUTPUTS = ("gain_mean_db", "gain_std_db", "p_los", "p_outage")
 POINTS, DEGREE = 25, 4
+
+CHANGE = 2e-5
+"""Share of a receiver's power whose coming or going leaves the receiver out: 0.0001 dB within millimetres is a slope."""
 
 Errors = NDArray[np.float64]
 """Error, size and standard error (3, N) of derivatives; NaN where a receiver is left out."""
@@ -135,7 +138,7 @@ def moved(links: DifferentiableLinks, name: str, step: float) -> NDArray[np.floa
 
 
 def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: float) -> NDArray[np.bool_]:
-    """Whether paths of more than 0.1 % of the power to each receiver (N,) appear or vanish within reach."""
+    """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within reach."""
     changed = np.zeros(len(paths.rx_m), dtype=bool)
     if name not in "xyz":
         return changed  # paths are a matter of geometry
@@ -147,7 +150,7 @@ def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: flo
         gone = np.bincount(paths.rx_of_path, weights=paths.power * (kept == 0.0), minlength=len(changed))
         fixed = np.bincount(paths.rx_of_path, weights=kept, minlength=len(changed))
         new = np.bincount(there.rx_of_path, weights=there.power, minlength=len(changed))
-        changed |= (gone > 1e-3 * old) | (np.abs(new - fixed) > 1e-3 * np.maximum(old, new))
+        changed |= (gone > CHANGE * old) | (np.abs(new - fixed) > CHANGE * np.maximum(old, new))
     return changed
 
 

@@ -17,6 +17,7 @@ What gradients see, and what they do not:
   switches.
 - On a complete map the distribution is the trace itself: its probabilities are constant, and its gain is that of the
   paths.
+- There are first derivatives alone: TensorFlow refuses those of derivatives.
 """
 
 import math
@@ -64,6 +65,9 @@ from sionna_partial.tracing.trace import Progress
 
 WINDOW_STEP_M = CELL_M / 2
 """How far from the transmitter further windows are drawn [m]."""
+
+_NEAREST_M = 1e-6
+"""Distance that a transmitter keeps from receivers: at the receiver, a distance has no slope [m]."""
 
 _LIMITS = {
     "tx_m": (-1e9, 1e9),
@@ -267,10 +271,12 @@ class DifferentiableLinks:
             return numbers
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(place, rx_m.shape), rx_m)
         scene, base = self._scene, (first, self._paths.rx_m)
+        distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - place) ** 2, axis=1), _NEAREST_M**2))
+        unobserved_m = moved_lengths_m(scene.smooth_unknown, numbers.unobserved_distance_m, base, ends)
         return replace(
             numbers,
-            distance_m=tf.norm(rx_m - place, axis=1),
-            unobserved_distance_m=moved_lengths_m(scene.smooth_unknown, numbers.unobserved_distance_m, base, ends),
+            distance_m=distance_m,
+            unobserved_distance_m=tf.minimum(unobserved_m, distance_m),
             walled_m=moved_lengths_m(scene.smooth_walls, numbers.walled_m, base, ends),
         )
 
