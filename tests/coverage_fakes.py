@@ -12,10 +12,9 @@ from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.fitting import PredictorSettings
 from sionna_partial.learning.predictor import LinkPrediction
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import PredictorSettings, SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import TracedLinks
 
 PICTURE = """

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -338,6 +339,12 @@ def test_settings_reach_the_tracer_and_the_attributes(fakes):
     assert "sionna-rt" in attributes["source"]
     assert (attributes["predictor"], attributes["predictor_sha256"]) == ("fake", "0" * 64)
     assert float(coverage["distance_m"].min()) >= 0.5
+
+
+def test_material_of_the_map_reaches_the_attributes(fakes):
+    partial = replace(map_of(PICTURE), material=Material(itu="concrete"))
+    coverage = predict_map(partial, TX, spacing_m=0.5)
+    assert json.loads(coverage.attrs["scene_settings"])["material"]["itu"] == "concrete"
 
 
 def test_units_and_flags_follow_cf(coverage):

@@ -4,6 +4,7 @@ import io
 import re
 import sysconfig
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from sionna_partial.maps.map_files import (
     save_map,
 )
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import Material
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
@@ -75,6 +77,14 @@ def test_other_suffix_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"home.pgm' has the suffix '.pgm': choose .yaml, .yml or .npz"):
         save_map(SMALL, tmp_path / "home.pgm")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
+@pytest.mark.parametrize("material", [Material(np.float32(5.31), np.float64(0.1), 1), Material(itu="brick")])
+def test_material_comes_back(tmp_path: Path, name: str, material: Material) -> None:
+    partial = replace(SMALL, material=material)
+    save_map(partial, tmp_path / name)
+    assert load_map(tmp_path / name) == load_map(tmp_path / name, wall_height_m=2.5) == partial
 
 
 @pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
@@ -251,6 +261,7 @@ WHOLE = {"state": SMALL.state, "resolution_m": 0.05, "origin_m": (0.0, 0.0), "wa
         npz_bytes(**{**WHOLE, "resolution_m": [0.1, 0.2]}),
         npz_bytes(**{**WHOLE, "state": np.array([[None]])}),
         npz_bytes(**WHOLE, interior_cells="many"),
+        npz_bytes(**WHOLE, material="brick"),
     ],
 )
 def test_damaged_npz(tmp_path: Path, content: bytes) -> None:

@@ -14,6 +14,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps import partial_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import Material
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
@@ -57,6 +58,7 @@ def test_state_is_a_read_only_copy() -> None:
         PartialMap(PLAN.state, 0.5, (10.0, -4.5), 2.5),
         PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.4),
         PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5, 2),
+        PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5, material=Material()),
         "a text",
     ],
 )
@@ -215,6 +217,7 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
         ({"origin_m": 3.0}, "origin_m = 3.0: give the (x, y)"),
         ({"origin_m": (0.0, np.inf)}, "origin_m = inf is not allowed: give a number of metres in [-1e+08, 1e+08]"),
         ({"wall_height_m": 0.0}, "wall_height_m = 0.0 is not allowed: give a number of metres in [0.1, 100]"),
+        ({"material": "brick"}, "material is of type str: give a Material, or None for that of SceneSettings."),
     ],
 )
 def test_wrong_map(arguments: dict[str, object], message: str) -> None:

@@ -244,6 +244,10 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
         *[("image", value, "give the file name of the map image") for value in ("", None, 3, ["map.pgm"], "a\0b")],
         *[("image", value, "there is no file '.*'; put the image there") for value in ("gone.pgm", ".", "a" * 300)],
         *[("wall_height", value, r"give a number of metres in \[0.1, 100\]") for value in (0, -3, math.nan, "tall")],
+        *[
+            ("material", value, "give relative_permittivity, conductivity_s_m, thickness_m, itu, as save_map does")
+            for value in (3, {"color": "red"}, {"relative_permittivity": 0.5})
+        ],
         *[("interior_cells", value, "give the number of free cells") for value in (-1, 2.5, "many", True)],
     ],
 )

@@ -252,6 +252,16 @@ def test_reading_back_gives_the_same_map(tmp_path: Path) -> None:
     assert load_map(export_scene(partial, tmp_path / "scene")) == partial
 
 
+@pytest.mark.parametrize("settings", [None, SceneSettings(Material(itu="wood"))])
+def test_material_of_the_map_comes_before_that_of_the_settings(settings: SceneSettings | None, tmp_path: Path) -> None:
+    partial = replace(drawn(ROOM), material=Material(itu="concrete"))
+    assert build_scene(partial, settings).material == partial.material
+    folder = export_scene(partial, tmp_path / "scene", settings)
+    names = ET.parse(folder / "scene.xml").getroot().iterfind(".//string[@name='type']")
+    assert [name.get("value") for name in names] == ["concrete"]
+    assert load_map(folder) == partial
+
+
 def test_paths_in_the_scene_are_relative(tmp_path: Path) -> None:
     root = ET.parse(export_scene(drawn(ROOM), tmp_path / "scene") / "scene.xml").getroot()
     names = [node.get("value") for node in root.iter("string") if node.get("name") == "filename"]
@@ -302,6 +312,13 @@ class TestMeshScene:
         assert load_map(folder) == load_map(folder / "map.yaml") == load_map(folder / "scene.xml") == partial
         assert load_map(folder, wall_height_m=5.0).height_range_m[1] == pytest.approx(shift_m[2] + 5.0)
         assert np.abs(mesh(folder, "part0").vertices).max() <= FAR_M
+
+    def test_material_of_the_map_is_that_of_parts_without_one(self, tmp_path: Path) -> None:
+        partial = replace(self.partial(), material=Material(thickness_m=0.2))
+        folder = export_scene(partial, tmp_path / "scene", SceneSettings(Material(thickness_m=0.3)))
+        thickness_m = {m.name: float(m.thickness[0]) for m in load(folder).radio_materials.values()}
+        assert thickness_m == pytest.approx({"material0": 0.2, "material2": 0.05})
+        assert load_map(folder) == partial
 
     def test_wide_meshes_come_back_to_the_last_digit(self, tmp_path: Path) -> None:
         whole = self.partial().mesh

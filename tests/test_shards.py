@@ -15,7 +15,7 @@ from dataset_fakes import fake_links
 from link_tables import assert_same
 
 from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.settings import DatasetSettings
+from sionna_partial.settings import DatasetSettings, Material
 from sionna_partial.training.link_table import COLUMNS, LinkTable
 from sionna_partial.training.shards import (
     FORMAT,
@@ -46,6 +46,12 @@ def shard(links: LinkTable, tmp_path: Path) -> Path:
 
 
 class TestShard:
+    def test_materials_of_maps_come_back(self, links: LinkTable, tmp_path: Path) -> None:
+        brick = Material(itu="brick", thickness_m=0.12)
+        maps = {name: replace(each, material=brick) for name, each in links.complete_maps.items()}
+        write_shard(replace(links, complete_maps=maps), tmp_path / "brick.parquet", NOTES)
+        assert read_shard(tmp_path / "brick.parquet").complete_maps == maps
+
     def test_round_trip(self, links: LinkTable, shard: Path) -> None:
         assert_same(read_shard(shard), links)
 

@@ -1,6 +1,7 @@
 """The trace against closed forms and against stock Sionna RT."""
 
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -327,6 +328,18 @@ def test_frequency_must_suit_the_material() -> None:
         trace_links(
             _room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], scene_settings=SceneSettings(Material(itu="wet_ground"))
         )
+
+
+def test_material_of_the_map_comes_before_that_of_the_settings() -> None:
+    concrete = Material(itu="concrete")
+    place, receivers = (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]]
+    asked = trace_links(_room(), place, receivers, scene_settings=SceneSettings(concrete))
+    own = trace_links(replace(_room(), material=concrete), place, receivers)
+    assert own.scene_settings == asked.scene_settings
+    assert own.a.tobytes() == asked.a.tobytes()
+    assert own.a.tobytes() != trace_links(_room(), place, receivers).a.tobytes()
+    with pytest.raises(SettingsError, match="'wet_ground' is defined for 1-10 GHz"):
+        trace_links(replace(_room(), material=Material(itu="wet_ground")), place, receivers)
 
 
 def test_links_shorter_than_friis_allows_are_refused() -> None:

@@ -1,9 +1,10 @@
 """Maps in and out: files, NumPy arrays, and the maps of simulators and SLAM."""
 
+import json
 import os
 import zipfile
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from sionna_partial.maps.mesh_map import MeshReading, mesh_map, raised
 from sionna_partial.maps.mesh_scene import read_exported_mesh, read_mitsuba_scene
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, require_map
 from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
+from sionna_partial.settings import Material
 
 ACCEPTED = (
     "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), an exported scene (folder or scene.xml), "
@@ -151,6 +153,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
         }
         if partial.interior_cells is not None:
             content["interior_cells"] = partial.interior_cells
+        if partial.material is not None:
+            content["material"] = json.dumps(asdict(partial.material))
         if partial.mesh is not None:
             content |= mesh_arrays(partial.mesh)
         with atomic_write(target) as stream:
@@ -394,6 +398,7 @@ def _read_npz(source: Path, wall_height_m: float | None) -> PartialMap:
             origin_m, height = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
             mesh = mesh_of_arrays(content)
+            material = Material(**json.loads(str(content["material"]))) if "material" in content else None
     except MapError:
         raise
     except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files
@@ -401,5 +406,5 @@ def _read_npz(source: Path, wall_height_m: float | None) -> PartialMap:
             f"path = '{source}' is damaged or was not written by save_map ({error}): save it again."
         ) from error
     if wall_height_m is None:
-        return PartialMap(state, resolution_m, origin_m, height, interior, mesh)
-    return raised(PartialMap(state, resolution_m, origin_m, wall_height_m, interior, mesh))
+        return PartialMap(state, resolution_m, origin_m, height, interior, mesh, material)
+    return raised(PartialMap(state, resolution_m, origin_m, wall_height_m, interior, mesh, material))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.mesh import SceneMesh
+from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
 """Largest number of cells of a map: more is a unit error or a map that should be cut."""
@@ -41,6 +42,9 @@ class PartialMap:
         Number of free cells of the complete home, where a simulation knows it.
     mesh : SceneMesh or None
         What is known of the building, in place of walls extruded from the cells. Its z is the world's.
+    material : Material or None
+        Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
+        SceneSettings.
 
     Raises
     ------
@@ -54,6 +58,7 @@ class PartialMap:
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M
     interior_cells: int | None = None
     mesh: SceneMesh | None = None
+    material: Material | None = None
 
     def __post_init__(self) -> None:
         state = _checked_state(self.state)
@@ -72,6 +77,9 @@ class PartialMap:
             )
         if not (self.mesh is None or isinstance(self.mesh, SceneMesh)):
             raise MapError(f"mesh is of type {type(self.mesh).__name__}: give a SceneMesh, or None for a plan.")
+        if not (self.material is None or isinstance(self.material, Material)):
+            kind = type(self.material).__name__
+            raise MapError(f"material is of type {kind}: give a Material, or None for that of SceneSettings.")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PartialMap):
@@ -83,6 +91,7 @@ class PartialMap:
             and self.wall_height_m == other.wall_height_m
             and self.interior_cells == other.interior_cells
             and self.mesh == other.mesh
+            and self.material == other.material
         )
 
     @property

@@ -4,7 +4,7 @@ import math
 import reprlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
-from sionna_partial.errors import MapError
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.map_turn import turn_grid
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.settings import Material
 
 MODES = ("trinary", "scale", "raw")
 """Ways in which map_server reads an image."""
@@ -56,6 +57,7 @@ class _Sheet:
     free_thresh: float
     wall_height_m: float
     interior_cells: int | None
+    material: Material | None
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def read_ros_map(
     interior = sheet.interior_cells
     if interior is not None:
         interior *= round(sheet.resolution_m / resolution_m) ** 2
-    return PartialMap(placed, resolution_m, origin_m, height, interior)
+    return PartialMap(placed, resolution_m, origin_m, height, interior, material=sheet.material)
 
 
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
@@ -143,6 +145,8 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
     }
     if partial.interior_cells is not None:
         sheet["interior_cells"] = int(partial.interior_cells)
+    if partial.material is not None:
+        sheet["material"] = asdict(partial.material)
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     ny, nx = partial.shape
@@ -206,7 +210,16 @@ def _read_sheet(path: Path, *, confined: bool) -> _Sheet:
         free_thresh=free,
         wall_height_m=_number(path, height, "wall_height", 0.1, 100.0, "metres"),
         interior_cells=interior,
+        material=_material(path, raw.get("material")),
     )
+
+
+def _material(path: Path, value: object) -> Material | None:
+    try:
+        return None if value is None else Material(**value)  # type: ignore[arg-type]
+    except (TypeError, SettingsError) as error:
+        names = ", ".join(field.name for field in fields(Material))
+        raise _refuse(path, "material", value, f"give {names}, as save_map does ({error}).") from error
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:

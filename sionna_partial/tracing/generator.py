@@ -17,7 +17,14 @@ from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, diffraction_cand
 from sionna_partial.tracing.mesh_candidates import mesh_candidates
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.rays import shoot_rays
-from sionna_partial.tracing.scene import SHAPES, SceneGeometry, build_scene, write_mesh_scene, write_scene
+from sionna_partial.tracing.scene import (
+    SHAPES,
+    SceneGeometry,
+    build_scene,
+    scene_settings_of,
+    write_mesh_scene,
+    write_scene,
+)
 from sionna_partial.tracing.solver import SceneSolver
 
 Generator = Callable[[SceneSolver, NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[Candidates, float, str]]]
@@ -76,7 +83,7 @@ def write_scene_of(
             partial.mesh,
             folder,
             offset_m=partial.origin_m,
-            default_material=scene_settings.material,
+            default_material=scene_settings_of(partial, scene_settings).material,
             frequency_hz=settings.frequency_hz,
         )
         shapes = tuple(f"part{index}" for index in range(len(partial.mesh.materials)))

@@ -3,7 +3,7 @@
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -100,6 +100,26 @@ class SceneGeometry:
         return _triangles(self.floor_m, self.cell_m)
 
 
+def scene_settings_of(partial: PartialMap, settings: SceneSettings | None, name: str = "settings") -> SceneSettings:
+    """Return the settings of a map's scene: its own material, where it has one, takes the place of theirs.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    settings : SceneSettings or None
+        None is the default.
+    name : str
+        What the settings are called, for the message.
+
+    Raises
+    ------
+    SettingsError
+        For settings of another kind.
+    """
+    settings = settings_or_default(name, settings, SceneSettings)
+    return settings if partial.material is None else replace(settings, material=partial.material)
+
+
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
     """Turn a map into walls, floor and ceiling.
 
@@ -114,7 +134,7 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     SceneGeometry
     """
     require_map("partial", partial)
-    settings = settings_or_default("settings", settings, SceneSettings)
+    settings = scene_settings_of(partial, settings)
     outlines = _outlines(partial, settings)
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
@@ -187,7 +207,7 @@ def _export_mesh_scene(
     settings: SceneSettings | None,
     frequency_hz: float,
 ) -> Path:
-    material = settings_or_default("settings", settings, SceneSettings).material
+    material = scene_settings_of(partial, settings).material
     for used in mesh.used_materials(material):
         used.require_frequency(frequency_hz)
     x0, y0, x1, y1 = partial.bounds_m
@@ -321,15 +341,15 @@ def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz
     else:
         permittivity, conductivity = material.relative_permittivity, material.conductivity_s_m
         if material.itu is not None:
-            permittivity, conductivity = _itu_constants(material.itu, frequency_hz)
+            permittivity, conductivity = itu_constants(material.itu, frequency_hz)
         bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id=name)
         ET.SubElement(bsdf, "float", name="relative_permittivity", value=repr(float(permittivity)))
         ET.SubElement(bsdf, "float", name="conductivity", value=repr(float(conductivity)))
     ET.SubElement(bsdf, "float", name="thickness", value=repr(float(material.thickness_m)))
 
 
-def _itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
-    """Relative permittivity and conductivity [S/m] of an ITU material (ITU-R P.2040-3, eq. 28 and 29)."""
+def itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
+    """Return relative permittivity and conductivity [S/m] of an ITU material (ITU-R P.2040-3, eq. 28 and 29)."""
     load_llvm()
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 

@@ -21,6 +21,7 @@ from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_de
 from sionna_partial.tracing.generator import Generator, WrittenScene, bends_at, write_scene_of
 from sionna_partial.tracing.paths import PathColumns, SolvedPaths
 from sionna_partial.tracing.probe import fast_engine_works
+from sionna_partial.tracing.scene import scene_settings_of
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.stock import stock_paths
 
@@ -72,6 +73,7 @@ class TracedLinks:
     settings : TraceSettings
         With `diffraction` True or False.
     scene_settings : SceneSettings
+        With the map's material, if it has one.
     """
 
     tx: NDArray[np.float64]
@@ -234,9 +236,12 @@ class _Tracer:
 def checked_settings(
     partial: PartialMap, settings: TraceSettings | None, scene_settings: SceneSettings | None
 ) -> tuple[TraceSettings, SceneSettings]:
-    """Put defaults in place of None; raise a SettingsError unless all materials cover the frequency."""
+    """Put defaults in place of None, and the map's material in place of the settings'.
+
+    Raises a SettingsError unless all materials cover the frequency.
+    """
     settings = settings_or_default("settings", settings, TraceSettings)
-    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
+    scene_settings = scene_settings_of(partial, scene_settings, "scene_settings")
     default = scene_settings.material
     for material in {default} if partial.mesh is None else partial.mesh.used_materials(default):
         material.require_frequency(settings.frequency_hz)
@@ -322,6 +327,23 @@ def _summary(paths: SolvedPaths, transmitters: int, receivers: int) -> tuple[NDA
     return link_summary(power, np.isin(np.arange(links), link[paths.is_direct]))
 
 
+def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Omnidirectional path gain of links (paper, eq. 5).
+
+    Parameters
+    ----------
+    power : (N,) float64 array
+        Sum of |a|^2 over the paths of each link.
+
+    Returns
+    -------
+    (N,) float64 array
+        At least -150 [dB].
+    """
+    with np.errstate(divide="ignore"):
+        return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
+
+
 def link_summary(
     power: NDArray[np.float64], is_direct: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
@@ -334,8 +356,7 @@ def link_summary(
     is_direct : (N,) bool array
         Whether one of them has no interaction.
     """
-    with np.errstate(divide="ignore"):
-        gain_db = np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
+    gain_db = path_gain_db(power)
     link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
     link_state[is_direct] = LinkState.LOS
     return link_state, gain_db
