@@ -47,7 +47,7 @@ OUTPUTS = ("gain_mean_db", "gain_std_db", "p_los", "p_outage")
 POINTS, DEGREE = 25, 4
 
 CHANGE = 2e-5
-"""Share of a receiver's power whose coming or going leaves the receiver out: 0.0001 dB within millimetres is a slope."""
+"""Share of a receiver's power whose coming or going leaves it out: 0.0001 dB within millimetres is a slope."""
 
 Errors = NDArray[np.float64]
 """Error, size and standard error (3, N) of derivatives; NaN where a receiver is left out."""

@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from sionna_partial.coverage import predict_map
     from sionna_partial.errors import SionnaPartialError
     from sionna_partial.export import save_coverage
+    from sionna_partial.inverse.calibration import MaterialCalibration, calibrate_materials
+    from sionna_partial.inverse.differentiable_links import DifferentiableScene
+    from sionna_partial.inverse.placement import TransmitterPlacement, place_transmitter
     from sionna_partial.learning.features import LinkFeatures, link_features
     from sionna_partial.learning.predictor import LinkPrediction, Predictor
     from sionna_partial.maps.explore import Exploration, explore, explore_trajectory
@@ -26,6 +29,8 @@ if TYPE_CHECKING:
     from sionna_partial.maps.partial_map import PartialMap
     from sionna_partial.plots.coverage_plot import plot_coverage
     from sionna_partial.plots.exploration_plot import animate_exploration, plot_exploration
+    from sionna_partial.plots.material_plot import plot_calibration
+    from sionna_partial.plots.placement_plot import plot_placement
     from sionna_partial.settings import DatasetSettings, Material, SceneSettings, SensorSettings, TraceSettings
     from sionna_partial.tracing.gradients import GainGradients, gain_gradients
     from sionna_partial.tracing.scene import export_scene
@@ -61,22 +66,29 @@ _PUBLIC = {
     "training.dataset": ("build_dataset",),
     "training.evaluate": ("evaluate",),
     "training.train": ("train",),
+    "inverse.differentiable_links": ("DifferentiableScene",),
     "coverage": ("predict_map",),
+    "inverse.calibration": ("MaterialCalibration", "calibrate_materials"),
+    "inverse.placement": ("TransmitterPlacement", "place_transmitter"),
     "export": ("save_coverage",),
     "plots.coverage_plot": ("plot_coverage",),
     "plots.exploration_plot": ("animate_exploration", "plot_exploration"),
+    "plots.material_plot": ("plot_calibration",),
+    "plots.placement_plot": ("plot_placement",),
 }
 _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in names}
 
 __all__ = [
     "CellState",
     "DatasetSettings",
+    "DifferentiableScene",
     "Exploration",
     "GainGradients",
     "LinkFeatures",
     "LinkPrediction",
     "LinkState",
     "Material",
+    "MaterialCalibration",
     "PartialMap",
     "Predictor",
     "SceneSettings",
@@ -84,9 +96,11 @@ __all__ = [
     "SionnaPartialError",
     "TraceSettings",
     "TracedLinks",
+    "TransmitterPlacement",
     "__version__",
     "animate_exploration",
     "build_dataset",
+    "calibrate_materials",
     "evaluate",
     "explore",
     "explore_trajectory",
@@ -99,8 +113,11 @@ __all__ = [
     "map_from_habitat",
     "map_from_occupancy",
     "map_from_slam",
+    "place_transmitter",
+    "plot_calibration",
     "plot_coverage",
     "plot_exploration",
+    "plot_placement",
     "predict_map",
     "read_dataset",
     "save_coverage",

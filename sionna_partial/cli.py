@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from sionna_partial import __version__
+from sionna_partial.commands.inverse import calibrate, place
 from sionna_partial.commands.learning import dataset, evaluate, train
 from sionna_partial.commands.prediction import demo, explore, export_scene, info, predict
 from sionna_partial.commands.shell import TransmitterCommand
@@ -73,5 +74,7 @@ app.command()(explore)
 app.command()(dataset)
 app.command()(train)
 app.command()(evaluate)
+app.command()(calibrate)
+app.command()(place)
 app.command()(demo)
 app.command()(info)

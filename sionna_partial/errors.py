@@ -28,6 +28,10 @@ class PredictorError(SionnaPartialError, ValueError):
     """A predictor file that is missing, damaged or of another kind, or data that cannot train one."""
 
 
+class MeasurementError(SionnaPartialError, ValueError):
+    """Measurements that are missing, damaged, or too few to calibrate a material."""
+
+
 class OutputError(SionnaPartialError, OSError):
     """An output that could not be written; nothing half written is left behind."""
 

@@ -28,16 +28,27 @@ MODULES = (
     *("tracing.plan", "tracing.scene", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
     *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
-    *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.gradients"),
+    *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.fixed_paths", "tracing.gradients"),
     *("learning.unobserved", "learning.link_context", "learning.features", "learning.windows"),
     *("learning.networks", "learning.fitting", "learning.context_networks", "learning.context_fitting"),
     *("learning.predictor_files", "learning.predictor"),
+    *(
+        "inverse.smooth_lengths",
+        "inverse.link_distribution",
+        "inverse.bridges",
+        "inverse.differentiable_links",
+    ),
     *("training.link_table", "training.metrics", "training.baselines"),
+    *("inverse.measurements", "inverse.slab", "inverse.gain_errors", "inverse.material_paths", "inverse.material_fit"),
+    *("inverse.measured_building", "inverse.calibration"),
+    *("inverse.placement_area", "inverse.placement_objective", "inverse.placement_climb"),
+    *("inverse.placement_state", "inverse.placement_views", "inverse.placement"),
     *("coverage", "plots.figures", "plots.coverage_plot", "plots.exploration_plot", "plots.calibration_plot"),
+    *("plots.material_plot", "plots.placement_plot"),
     *("export", "demo", "info"),
     *("training.home_sources", "training.home_links", "training.shards", "training.home_process", "training.dataset"),
     *("training.dataset_links", "training.evaluate", "plots.evaluation_plot", "training.train", "training.report"),
-    *("commands.shell", "commands.prediction", "commands.learning", "cli"),
+    *("commands.shell", "commands.prediction", "commands.learning", "commands.inverse", "cli"),
 )
 """Reading order: a module imports only from those before it."""
 
@@ -134,7 +145,20 @@ class TestLightImports:
         assert not loaded_by("import sionna_partial") & (HEAVY | {"typer", "rich"})
 
     @pytest.mark.parametrize(
-        "command", ["", "predict", "export-scene", "explore", "dataset", "train", "evaluate", "demo", "info"]
+        "command",
+        [
+            "",
+            "predict",
+            "export-scene",
+            "explore",
+            "dataset",
+            "train",
+            "evaluate",
+            "calibrate",
+            "place",
+            "demo",
+            "info",
+        ],
     )
     def test_help(self, command: str) -> None:
         arguments = [*filter(None, [command]), "--help"]

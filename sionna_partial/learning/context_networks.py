@@ -43,7 +43,7 @@ _LOS_OFFSET_DB, _NLOS_OFFSET_DB = 2.0, -25.0
 _LOS_SCALE_DB, _NLOS_SCALE_DB = 10.0, 20.0
 _SCALE_M, _SCALE_DB = 15.0, 100.0
 _NEAREST_M = 0.1
-_LINKS_AT_ONCE = 65_536
+_LINKS_AT_ONCE, _WINDOWS_AT_ONCE = 65_536, 8
 
 
 @dataclass(frozen=True)
@@ -303,11 +303,10 @@ def evaluate_context_networks(
     context = context_of(phi)
     inputs, places = link_inputs(phi, frequency_hz), window_places(context)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
-    for windows, links in _by_window(networks, context):
+    for known, links in _by_window(networks, context):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
-            found, _ = look(networks, windows, inputs[None, here], places[None, here])
-            outputs[here] = found[0]
+            outputs[here] = read_links(networks, known, inputs[None, here], places[None, here])[0]
     probabilities, means_db, stds_db = distribution(outputs, free_space_gain_db(phi.distance_m, frequency_hz))
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
@@ -377,16 +376,16 @@ def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
     return keras.Model(link, outputs, name=LINK_NETWORK)
 
 
-def _by_window(
-    networks: Mapping[str, Any], context: LinkContext
-) -> Iterator[tuple[NDArray[np.float32] | None, NDArray[np.intp]]]:
-    """Yield each window (1, ...) and the links of it; without a map network no window and all links."""
+def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tuple[Any, NDArray[np.intp]]]:
+    """Yield what the map network knows of each window (1, ...), and its links; without one None and all links."""
     if MAP_NETWORK not in networks:
         yield None, np.arange(len(context))
         return
     windows, index = transmitter_windows(context)
-    for number, window in enumerate(windows):
-        yield window[None].astype(np.float32), np.flatnonzero(index == number)
+    for start in range(0, len(windows), _WINDOWS_AT_ONCE):
+        known, _ = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE].astype(np.float32))
+        for number in range(len(known)):
+            yield known[number : number + 1], np.flatnonzero(index == start + number)
 
 
 def _walled_m(context: LinkContext) -> NDArray[np.float64]:

@@ -46,6 +46,7 @@ BUFFER_FIELDS = {
     "_shapes": ("TensorXu", (2, 3)),
     "_primitives": ("TensorXu", (2, 3)),
     "_interaction_types": ("TensorXu", (2, 3)),
+    "_src_indices": ("UInt", (2,)),
     "_tgt_indices": ("UInt", (2,)),
     "_paths_counter": ("UInt", (1,)),
     "_diffracting_wedges": ("WedgeGeometry", None),

@@ -22,7 +22,7 @@ from sionna_partial.tracing.contract import contract_remedy
 from sionna_partial.tracing.generator import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.probe import fast_engine_works
-from sionna_partial.tracing.solver import Offsets, SceneSolver
+from sionna_partial.tracing.solver import SceneSolver, Variables
 from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
@@ -249,9 +249,9 @@ class FixedPaths:
             For a frequency that a material does not cover; so do the derivatives.
         """
         power, vertices_m = np.zeros(len(self)), np.full_like(self.vertices_m, math.nan)
-        _, offsets = self._offsets(parameters)
+        _, variables = self._variables(parameters)
         for block, candidates in self._blocks():
-            found = self._moved(candidates, offsets, differentiable=False)
+            found = self._moved(candidates, variables, differentiable=False)
             depth = candidates.face.shape[1]
             power[block] = found[0].numpy()
             vertices_m[block, :depth] = np.transpose(found[1].numpy()).reshape(-1, depth, 3)
@@ -273,14 +273,14 @@ class FixedPaths:
         names : sequence of str
             Fields of `PathParameters`.
         together : bool
-            Whether all materials change together, which have changed by as much since `base`.
+            Whether all materials change together, by as much.
 
         Returns
         -------
         dict of str to (P, K) float64 array
             Derivatives with respect to the K entries of each field; those of all materials have one, `together`.
         """
-        leaves, _ = self._offsets(parameters, together=together)
+        leaves, _ = self._variables(parameters, together=together)
         power = {name: np.zeros((len(self), len(leaves[name]))) for name in names}
         for block, name, entry, of_power, _ in self._passes(parameters, names, together=together):
             power[name][block, entry] = of_power.numpy()
@@ -316,9 +316,9 @@ class FixedPaths:
         import drjit as dr
 
         for block, candidates in self._blocks():
-            leaves, offsets = self._offsets(parameters, together=together)
+            leaves, variables = self._variables(parameters, together=together)
             dr.enable_grad([leaves[name] for name in names])
-            power, vertices_m = self._moved(candidates, offsets)
+            power, vertices_m = self._moved(candidates, variables)
             results = power, vertices_m + dr.opaque(type(power), 0.0)  # power is made of them: theirs would be cleared
             for name in names:
                 for entry, leaf in enumerate(leaves[name]):
@@ -326,25 +326,32 @@ class FixedPaths:
                     dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next parameter
                     yield block, name, entry, *dr.grad(results)
 
-    def _moved(self, candidates: Candidates, offsets: Offsets, *, differentiable: bool = True) -> tuple[Any, Any]:
+    def _moved(self, candidates: Candidates, variables: Variables, *, differentiable: bool = True) -> tuple[Any, Any]:
         tx_m, rx_m = self.base.tx_m - self._scene.shift_m, self.rx_m - self._scene.shift_m
-        return self._scene.solver.moved_paths(candidates, tx_m, rx_m, offsets, differentiable=differentiable)
+        return self._scene.solver.moved_paths(candidates, tx_m, rx_m, variables, differentiable=differentiable)
 
-    def _offsets(self, parameters: PathParameters, *, together: bool = False) -> tuple[dict[str, list[Any]], Offsets]:
-        """Return a variable for each entry of each parameter, by name, and what they add to the scene."""
+    def _variables(
+        self, parameters: PathParameters, *, together: bool = False
+    ) -> tuple[dict[str, list[Any]], Variables]:
+        """Return a variable for each entry of each parameter, by name, and all of them for the solver."""
         import drjit as dr
         import mitsuba as mi
 
         if parameters.frequency_hz != self.base.frequency_hz:
             settings = replace(self._scene.settings, frequency_hz=float(parameters.frequency_hz))
             checked_settings(self._scene.partial, settings, self._scene.scene_settings)
-        added = {name: np.ravel(getattr(parameters, name) - getattr(self.base, name)) for name in PARAMETERS}
+        values = {name: np.ravel(getattr(parameters, name)) for name in PARAMETERS}
+        for name in ("tx_m", "frequency_hz"):
+            values[name] = values[name] - np.ravel(getattr(self.base, name))
+        leaves = {name: [dr.opaque(mi.Float, float(value)) for value in own] for name, own in values.items()}
+        materials = {name: tuple(leaves[name]) for name in MATERIAL_PARAMETERS}
         if together:
-            added |= {name: np.append(added[name], 0.0)[:1] for name in MATERIAL_PARAMETERS}  # even of no materials
-        leaves = {name: [dr.opaque(mi.Float, float(value)) for value in values] for name, values in added.items()}
+            for name in MATERIAL_PARAMETERS:
+                leaves[name] = [dr.opaque(mi.Float, 0.0)]
+                dr.enable_grad(leaves[name])
+                materials[name] = tuple(value + leaves[name][0] for value in materials[name])
         x_m, y_m, z_m = leaves["tx_m"]
-        permittivity, conductivity_s_m, thickness_m = (tuple(leaves[name]) for name in MATERIAL_PARAMETERS)
-        return leaves, Offsets(x_m, y_m, z_m, permittivity, conductivity_s_m, thickness_m, *leaves["frequency_hz"])
+        return leaves, Variables(x_m, y_m, z_m, **materials, frequency_hz=leaves["frequency_hz"][0])
 
     def _blocks(self) -> Iterator[tuple[slice, Candidates]]:
         """Candidates in blocks, and where their paths are among all."""

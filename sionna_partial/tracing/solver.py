@@ -10,7 +10,7 @@ Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: t
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -54,23 +54,20 @@ def _to_device(kind: Any, values: NDArray[Any]) -> Any:
 
 
 @dataclass(frozen=True)
-class Offsets:
-    """What is added to a transmitter's position and to a scene: variables of Dr.Jit with one entry each.
+class Variables:
+    """What the power of paths depends on: variables of Dr.Jit with one entry each.
 
-    With gradients enabled, the derivatives of what `SceneSolver.moved_paths` gives lead back to them.
+    With gradients enabled, the derivatives of what `SceneSolver.moved_paths` gives lead back to them. Materials have
+    values, not additions, which would drown in the conductivity of a metal.
 
     Parameters
     ----------
     x_m, y_m, z_m : mitsuba.Float
         Added to the transmitter's position [m].
-    relative_permittivity : tuple of mitsuba.Float
-        Added to the real relative permittivity: of each of `SceneSolver.materials`, or one for all of them.
-    conductivity_s_m : tuple of mitsuba.Float
-        Added to the conductivity [S/m], likewise.
-    thickness_m : tuple of mitsuba.Float
-        Added to the thickness [m], likewise.
+    relative_permittivity, conductivity_s_m, thickness_m : tuples of mitsuba.Float
+        Of each of `SceneSolver.materials`; [S/m] and [m]. What an ITU material gains with the frequency comes on top.
     frequency_hz : mitsuba.Float
-        Added to the carrier frequency [Hz], on which ITU materials depend too.
+        Added to the carrier frequency [Hz].
     """
 
     x_m: Any
@@ -262,13 +259,13 @@ class SceneSolver:
         candidates: Candidates,
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
-        offsets: Offsets,
+        variables: Variables,
         *,
         differentiable: bool = True,
     ) -> tuple[Any, Any]:
         """Power and vertices of candidates as functions of the transmitter's position and of the scene.
 
-        Candidates are verified again, so that those that the offsets make invalid have no power.
+        Candidates are verified again, so that those that they make invalid have no power.
 
         Parameters
         ----------
@@ -276,7 +273,7 @@ class SceneSolver:
             At least one.
         tx_m, rx_m : (3,) and (N, 3) arrays
             Transmitter and receivers, in scene coordinates [m].
-        offsets : Offsets
+        variables : Variables
         differentiable : bool
             Whether derivatives are wanted, which takes the slower, evaluated loops.
 
@@ -290,10 +287,10 @@ class SceneSolver:
         import drjit as dr
         import mitsuba as mi
 
-        source = _points(tx_m[None]) + mi.Point3f(offsets.x_m, offsets.y_m, offsets.z_m)
+        source = _points(tx_m[None]) + mi.Point3f(variables.x_m, variables.y_m, variables.z_m)
         chain = self._evaluated if differentiable else self._symbolic
         # Dr.Jit cannot pass forward through a symbolic call of a material twice
-        with self._changed(offsets), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+        with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
             buffer = self._solve(chain, candidates, source, _points(rx_m))
             a = buffer.a[0][0]
             power = dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
@@ -332,13 +329,45 @@ class SceneSolver:
         buffer.schedule()
         return VerifiedPaths(buffer, dr.copy(buffer.valid), source, targets, diffraction)
 
-    def power(self, paths: VerifiedPaths, offsets: Offsets, *, differentiable: bool = True) -> Any:
+    def in_copies(
+        self, candidates: Candidates, tx_index: NDArray[np.integer], paths: VerifiedPaths, count: int
+    ) -> VerifiedPaths:
+        """Lay candidates, verified in another scene, into each of the copies of that scene that this one holds.
+
+        Parameters
+        ----------
+        candidates : Candidates
+        tx_index : (C,) integer array
+            Transmitter of each.
+        paths : VerifiedPaths
+            What the other solver's `verified` gave for them.
+        count : int
+            Number of copies, whose faces follow one another.
+
+        Returns
+        -------
+        VerifiedPaths
+            Those of the first copy, then those of the second, and so on.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        faces = (len(self._shape_of_face) - 1) // count
+        places = [getattr(paths.buffer, f"vertices_{axis}").numpy() for axis in "xyz"]
+        buffer = self._buffer(_repeated(candidates, np.stack(places, axis=2), faces, count))
+        buffer._src_indices = _to_device(mi.UInt, np.tile(tx_index, count).astype(np.uint32))
+        buffer.schedule()
+        valid = mi.Bool(np.tile(paths.valid.numpy(), count))
+        dr.eval(valid)
+        return VerifiedPaths(buffer, valid, paths.source, paths.targets, paths.diffraction)
+
+    def power(self, paths: VerifiedPaths, variables: Variables, *, differentiable: bool = True) -> Any:
         """Power of verified candidates as a function of the materials and of the frequency, not of places.
 
         Parameters
         ----------
         paths : VerifiedPaths
-        offsets : Offsets
+        variables : Variables
             Those of the transmitter's position do not count.
         differentiable : bool
             Whether derivatives are wanted, which takes the slower, evaluated loops.
@@ -352,24 +381,24 @@ class SceneSolver:
 
         chain, samples = self._evaluated if differentiable else self._symbolic, self._settings.samples_per_tx
         paths.buffer.valid = dr.copy(paths.valid)
-        with self._changed(offsets), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+        with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
             done = chain.evaluate(self._scene, paths.buffer, paths.source, paths.targets, samples, paths.diffraction)
             a = done.a[0][0]
             return dr.select(done.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
 
     @contextmanager
-    def _changed(self, offsets: Offsets) -> Iterator[None]:
-        """Add offsets to the frequency and to all materials for a while."""
+    def _changed(self, variables: Variables) -> Iterator[None]:
+        """Give the scene another frequency and all materials other values for a while."""
         materials = self._scene.radio_materials.values()
         kept = [(each, each.relative_permittivity, each.conductivity, each.thickness) for each in materials]
         frequency = self._scene.frequency
         try:
-            self._scene.frequency = frequency + offsets.frequency_hz  # ITU materials follow
-            for index, (each, *_) in enumerate(kept):
-                permittivities, conductivities = offsets.relative_permittivity, offsets.conductivity_s_m
-                each.relative_permittivity = each.relative_permittivity + permittivities[index % len(permittivities)]
-                each.conductivity = each.conductivity + conductivities[index % len(conductivities)]
-                each.thickness = each.thickness + offsets.thickness_m[index % len(offsets.thickness_m)]
+            self._scene.frequency = frequency + variables.frequency_hz  # ITU materials follow
+            values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
+            for (each, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
+                each.relative_permittivity = new[0] + (each.relative_permittivity - permittivity)
+                each.conductivity = new[1] + (each.conductivity - conductivity)
+                each.thickness = new[2]
             yield
         finally:
             self._scene.frequency = frequency
@@ -433,6 +462,33 @@ class SceneSolver:
             n0=vectors(mi.Normal3f, *normal[:, 0].T, flat),
             nn=vectors(mi.Normal3f, *normal[:, 1].T, flat),
         )
+
+
+def _repeated(candidates: Candidates, vertices_m: NDArray[Any], faces: int, count: int) -> Candidates:
+    """Repeat candidates for each copy of a scene with so many faces, with their verified vertices."""
+    shift = faces * np.repeat(np.arange(count, dtype=np.int32), len(candidates.rx))
+    face = np.tile(candidates.face, (count, 1))
+    new = replace(
+        candidates,
+        rx=np.tile(candidates.rx, count),
+        face=np.where(face >= 0, face + shift[:, None], face),
+        vertices_m=np.tile(vertices_m, (count, 1, 1)),
+    )
+    wedges, wedge = candidates.wedges, candidates.wedge
+    if wedges is None or wedge is None:
+        return new
+    edges = len(wedges.edge_m)
+    faces_of = wedges.face.reshape(2, 1, edges, 2) + faces * np.arange(count, dtype=np.int32)[:, None, None]
+    normals = np.broadcast_to(wedges.normal.reshape(2, 1, edges, 2, 2), (2, count, edges, 2, 2))
+    copies = replace(
+        wedges,
+        edge_m=np.tile(wedges.edge_m, (count, 1)),
+        face=faces_of.reshape(-1, 2),
+        normal=normals.reshape(-1, 2, 2),
+    )
+    copy = np.repeat(np.arange(count, dtype=np.int32), len(wedge))
+    side, edge = np.divmod(np.tile(wedge, count), np.int32(edges))
+    return replace(new, wedges=copies, wedge=(side * count + copy) * np.int32(edges) + edge)
 
 
 def _points(places_m: NDArray[np.float64]) -> Any:

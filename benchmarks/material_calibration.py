@@ -1,0 +1,190 @@
+"""Hidden materials recovered from noisy gains, on procedural homes that nothing was made on.
+
+Each home gets hidden materials, whose gains are traced on the complete home at places that the map shows as free; noise
+is added, and `calibrate_materials` sees the map (complete, or half explored) and the noisy gains. Errors are those of
+the loss of a reflection at angles of incidence from 0 to 75 degrees, where the loss is below 30 dB; "te" is the
+polarisation of vertical antennas at walls. Gains of links that were not measured are compared with their truth. Run
+
+    python benchmarks/material_calibration.py
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+from sionna_partial.inverse.slab import reflection_loss_db
+from sionna_partial.tracing.trace import trace_each
+
+HIDDEN = {
+    "drywall": sp.Material(),
+    "plasterboard": sp.Material(2.73, 0.195),
+    "brick": sp.Material(3.91, 0.041),
+    "concrete": sp.Material(5.24, 0.626),
+    "glass": sp.Material(6.31, 0.312),
+    "wood": sp.Material(1.99, 0.167),
+    "lossless": sp.Material(2.94, 0.0),
+}
+STARTS = {"default": None, "poor": sp.Material(25.0, 20.0)}
+ANGLES_DEG = (0.0, 30.0, 45.0, 60.0, 75.0)
+LARGEST_LOSS_DB = 30.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One calibration: errors and stated deviations (2, 5) [dB], by polarisation and angle, and how links are met."""
+
+    hidden: str
+    stage: str
+    start: str
+    error_db: NDArray[np.float64]
+    std_db: NDArray[np.float64]
+    rmse_db: dict[str, float]
+    inside: dict[str, bool]
+    undetermined: tuple[str, ...]
+    used: int
+    seconds: float
+    result: sp.MaterialCalibration
+
+
+def main() -> None:
+    """Calibrate, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--homes", type=int, default=3, help="number of homes")
+    parser.add_argument("--first", type=int, default=40_000, help="seed of the first home")
+    parser.add_argument("--stages", nargs="+", default=["complete", "step100"])
+    parser.add_argument("--hidden", nargs="+", default=list(HIDDEN))
+    parser.add_argument("--starts", nargs="+", default=["default"])
+    parser.add_argument("--links", type=int, default=200, help="measured links")
+    parser.add_argument("--transmitters", type=int, default=8)
+    parser.add_argument("--noise", type=float, default=3.0, help="standard deviation of the noise [dB]")
+    arguments = parser.parse_args()
+    done = []
+    for trial in trials(arguments):
+        done.append(trial)
+        print(line(f"{trial.hidden}, {trial.stage}, {trial.start}", [trial]), flush=True)
+    print(f"\n{header()}")
+    for stage in arguments.stages:
+        for start in arguments.starts:
+            chosen = [each for each in done if (each.stage, each.start) == (stage, start)]
+            for hidden in arguments.hidden:
+                print(line(f"{hidden}, {stage}, {start}", [each for each in chosen if each.hidden == hidden]))
+            print(line(f"all, {stage}, {start}", chosen))
+
+
+def trials(arguments: argparse.Namespace) -> Iterator[Trial]:
+    """Calibrate each home, stage, hidden material and start."""
+    for seed in range(arguments.first, arguments.first + arguments.homes):
+        home = sp.make_home(seed)
+        for stage in arguments.stages:
+            known = home if stage == "complete" else sp.explore(home, steps=(int(stage.removeprefix("step")),))[0]
+            for hidden in arguments.hidden:
+                for start in arguments.starts:
+                    yield trial(home, known, stage, hidden, start, seed, arguments)
+
+
+def trial(
+    home: sp.PartialMap,
+    known: sp.PartialMap,
+    stage: str,
+    hidden: str,
+    start: str,
+    seed: int,
+    arguments: argparse.Namespace,
+) -> Trial:
+    """Measure with noise, calibrate, and compare."""
+    rng = np.random.default_rng([seed, *hidden.encode()])
+    count, material = arguments.transmitters, HIDDEN[hidden]
+    places = free_places(known, count, rng)
+    each = [free_places(known, 2 * arguments.links // count, rng) for _ in range(count)]
+    truth = gains_db(home, places, each, material)
+    tx = np.repeat(places, len(each[0]), axis=0)
+    rx = np.concatenate(each)
+    measured = np.arange(len(rx)) % 2 == 0
+    noisy = truth + arguments.noise * rng.standard_normal(len(truth))
+    began = time.perf_counter()
+    result = sp.calibrate_materials(
+        known, {"tx": tx[measured], "rx": rx[measured], "gain_db": noisy[measured]}, start=STARTS[start]
+    )
+    seconds = time.perf_counter() - began
+    held = ~measured & (truth > -140.0)
+    rmse = {}
+    for name, scene in (("default", known), ("calibrated", result.scene), ("hidden", known)):
+        traced = gains_db(scene, places, each, material if name == "hidden" else None)
+        rmse[name] = float(np.sqrt(np.mean((traced - truth)[held & (traced > -150.0)] ** 2)))
+    error, std = loss_errors(result, material)
+    inside = {
+        "permittivity": abs(result.permittivity - material.relative_permittivity) <= 2.0 * result.permittivity_std,
+        "conductivity": abs(result.conductivity - material.conductivity_s_m) <= 2.0 * result.conductivity_std,
+    }
+    return Trial(
+        hidden, stage, start, error, std, rmse, inside, result.undetermined, int(result.used.sum()), seconds, result
+    )
+
+
+def loss_errors(result: sp.MaterialCalibration, hidden: sp.Material) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Errors of the loss of a reflection and stated deviations (2, 5) [dB]; NaN where nearly nothing is reflected."""
+    errors, deviations = [], []
+    for polarisation in ("te", "tm"):
+        true = reflection_loss_db(
+            hidden.relative_permittivity,
+            hidden.conductivity_s_m,
+            hidden.thickness_m,
+            result.settings.frequency_hz,
+            ANGLES_DEG,
+            polarisation,
+        )
+        found, std = result.reflection_loss_db(ANGLES_DEG, polarisation)
+        errors.append(np.where(true < LARGEST_LOSS_DB, found - true, np.nan))
+        deviations.append(std)
+    return np.array(errors), np.array(deviations)
+
+
+def gains_db(
+    scene: sp.PartialMap, tx: NDArray[np.float64], rx: list[NDArray[np.float64]], material: sp.Material | None
+) -> NDArray[np.float64]:
+    """Traced gains of all links [dB], with the scene's own material for None."""
+    settings = None if material is None else sp.SceneSettings(material=material)
+    return np.concatenate([links.gain_db for links in trace_each(scene, list(tx), rx, scene_settings=settings)])
+
+
+def free_places(partial: sp.PartialMap, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Places in free cells, 1.5 m high."""
+    cells = np.argwhere(partial.state == sp.CellState.FREE)
+    chosen = cells[rng.choice(len(cells), count)] + rng.uniform(0.2, 0.8, (count, 2))
+    return np.column_stack([chosen[:, ::-1] * partial.resolution_m + partial.origin_m, np.full(count, 1.5)])
+
+
+def header() -> str:
+    """Head of the tables."""
+    return (
+        f"{'hidden, map, start':30}{'median |error| te':>19}{'tm':>7}{'within 0.5 dB te':>18}{'tm':>6}{'in 2 std':>10}"
+        f"{'RMSE default':>14}{'calib.':>8}{'hidden':>8}{'links':>7}"
+        f"{'eps, sigma in 2 std':>21}{'undetermined':>14}{'s':>6}"
+    )
+
+
+def line(name: str, chosen: list[Trial]) -> str:
+    """Line of a table."""
+    error = np.abs(np.stack([each.error_db for each in chosen], axis=1))
+    sure = error <= 2.0 * np.stack([each.std_db for each in chosen], axis=1)
+    there = np.isfinite(error)
+    medians = [float(np.nanmedian(each)) for each in error]
+    within = [float(np.mean(each[known] <= 0.5)) for each, known in zip(error, there, strict=True)]
+    rmse = [float(np.mean([each.rmse_db[key] for each in chosen])) for key in ("default", "calibrated", "hidden")]
+    inside = [np.mean([each.inside[key] for each in chosen]) for key in ("permittivity", "conductivity")]
+    doubts = [np.mean([key in each.undetermined for each in chosen]) for key in ("permittivity", "conductivity")]
+    used, seconds = (float(np.mean([getattr(each, key) for each in chosen])) for key in ("used", "seconds"))
+    return (
+        f"{name:30}{medians[0]:>19.2f}{medians[1]:>7.2f}{within[0]:>18.0%}{within[1]:>6.0%}{sure[there].mean():>10.0%}"
+        f"{rmse[0]:>14.2f}{rmse[1]:>8.2f}{rmse[2]:>8.2f}{used:>7.0f}{inside[0]:>14.0%}{inside[1]:>7.0%}"
+        f"{doubts[0]:>8.0%}{doubts[1]:>6.0%}{seconds:>6.0f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

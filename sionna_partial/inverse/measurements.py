@@ -1,0 +1,186 @@
+"""Measured path gains at known places: mappings, data frames and CSV files -> Measurements."""
+
+import csv
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
+from sionna_partial.errors import MeasurementError
+
+LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
+"""Gains beyond these are in another unit, or of another sign [dB]. Noise may take an outage below the floor."""
+
+OUTAGE_DB = GAIN_FLOOR_DB + 10.0
+"""Up to this gain, noise included, a link counts as an outage [dB]."""
+
+_ACCEPTED = "a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV"
+_CSV_COLUMNS = "tx_x, tx_y, tx_z, rx_x, rx_y, rx_z, gain_db"
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Measured gains of N links.
+
+    Parameters
+    ----------
+    tx : (N, 3) float64 array
+        Transmitter position of each link [m]; one position (3,) stands for all links.
+    rx : (N, 3) float64 array
+        Receiver position of each link [m].
+    gain_db : (N,) float64 array
+        Omnidirectional path gain [dB], negative. -150 is an outage.
+
+    Raises
+    ------
+    MeasurementError
+        For arrays of other shapes, values that are not finite, or gains that no link has.
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    gain_db: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        gain_db = _numbers("gain_db", self.gain_db)
+        if gain_db.ndim != 1:
+            raise MeasurementError(f"gain_db has shape {gain_db.shape}: give one gain for each link, (N,).")
+        for name in ("tx", "rx"):
+            object.__setattr__(self, name, _positions(name, getattr(self, name), len(gain_db)))
+        low, high = gain_db < LOWEST_DB, gain_db > HIGHEST_DB
+        _require(~high, "gain_db", gain_db, "path gains are negative; give minus the path loss.")
+        _require(~low, "gain_db", gain_db, f"give dB, not below {LOWEST_DB:g}; an outage is {GAIN_FLOOR_DB:g}.")
+        object.__setattr__(self, "gain_db", gain_db)
+
+    def __len__(self) -> int:
+        """Return the number of links N."""
+        return len(self.gain_db)
+
+    @property
+    def is_outage(self) -> NDArray[np.bool_]:
+        """Whether each link (N,) is an outage."""
+        return self.gain_db <= OUTAGE_DB
+
+    def take(self, index: NDArray[Any]) -> "Measurements":
+        """Return the links that an index array or a mask (N,) selects."""
+        return Measurements(self.tx[index], self.rx[index], self.gain_db[index])
+
+
+def measurements_of(source: Any) -> Measurements:
+    """Read measurements.
+
+    Parameters
+    ----------
+    source : Measurements, mapping, data frame, Dataset or path
+        With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB]; cells of a data frame may hold x, y, z. Instead
+        of `tx` there may be `tx_x`, `tx_y` and `tx_z` (N,), and likewise for `rx`. A CSV has these columns, with a
+        header; without `tx_z` or `rx_z`, heights are 1.5 m.
+
+    Returns
+    -------
+    Measurements
+
+    Raises
+    ------
+    MeasurementError
+        For a missing field or file, or values that are no measurements; the message names the first of them.
+    """
+    if isinstance(source, Measurements):
+        return source
+    if isinstance(source, str | os.PathLike):
+        source = _read_csv(Path(source))
+    gain_db = _field(source, "gain_db")
+    if gain_db is None:
+        raise MeasurementError(f"gain_db is missing from measurements of type {type(source).__name__}: {_give()}")
+    return Measurements(_place(source, "tx"), _place(source, "rx"), gain_db)
+
+
+def _give() -> str:
+    return f"give {_ACCEPTED} with the columns {_CSV_COLUMNS}."
+
+
+def _field(source: Any, name: str) -> Any:
+    """Return a field by its name, None where there is none."""
+    try:
+        return source[name]
+    except (KeyError, IndexError, TypeError, ValueError):
+        return None
+
+
+def _place(source: Any, name: str) -> Any:
+    """Return positions (N, 3), from one field or from one for each axis."""
+    places = _field(source, name)
+    if places is not None:
+        return places
+    x, y, z = (_field(source, f"{name}_{axis}") for axis in "xyz")
+    if x is None or y is None:
+        raise MeasurementError(f"{name} is missing from the measurements: {_give()}")
+    columns = [_numbers(f"{name}_{axis}", values) for axis, values in zip("xy", (x, y), strict=True)]
+    columns.append(np.full_like(columns[0], DEFAULT_HEIGHT_M) if z is None else _numbers(f"{name}_z", z))
+    if len({column.shape for column in columns}) > 1:
+        shapes = ", ".join(str(column.shape) for column in columns)
+        raise MeasurementError(f"{name}_x, {name}_y and {name}_z have shapes {shapes}: give one value for each link.")
+    return np.stack(columns, axis=-1)
+
+
+def _read_csv(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Read those columns of a CSV that measurements have."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as stream:
+            header, *rows = list(csv.reader(stream, skipinitialspace=True)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise MeasurementError(f"measurements = '{path}' cannot be read ({error}): {_give()}") from error
+    lines = [(line, row) for line, row in enumerate(rows, 2) if row]
+    places = {name.strip(): place for place, name in enumerate(header) if name.strip() in _CSV_COLUMNS.split(", ")}
+    return {
+        name: np.array([_cell(path, name, line, row[place : place + 1]) for line, row in lines], dtype=np.float64)
+        for name, place in places.items()
+    }
+
+
+def _cell(path: Path, name: str, line: int, cell: list[str]) -> float:
+    """Return the number in a cell, which a short line lacks."""
+    try:
+        return float(cell[0])
+    except (IndexError, ValueError) as error:
+        text = cell[0] if cell else ""
+        raise MeasurementError(
+            f"measurements = '{path}', line {line}: {name} = {text!r} is not a number: correct the line, or leave it "
+            "out."
+        ) from error
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return finite numbers as a new array, or raise a MeasurementError."""
+    try:
+        array = np.asarray(values)
+        array = np.array(np.stack(list(array)) if array.dtype == object and array.size else array, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MeasurementError(f"{name} is not an array of numbers ({error}): give finite numbers.") from error
+    _require(np.isfinite(array), name, array, "give finite numbers, or leave the link out.")
+    return array
+
+
+def _positions(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
+    places = _numbers(name, values)
+    if places.shape == (3,):
+        places = np.tile(places, (count, 1))
+    if places.shape != (count, 3):
+        raise MeasurementError(
+            f"{name} has shape {places.shape} for {count} gains: give x, y, z of each link in metres, ({count}, 3)."
+        )
+    return places
+
+
+def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], remedy: str) -> None:
+    """Raise a MeasurementError that names the first value that is not good."""
+    if not good.all():
+        place = tuple(int(index) for index in np.argwhere(~good)[0])
+        more = f" (and {int((~good).sum()) - 1} more)" if (~good).sum() > 1 else ""
+        raise MeasurementError(
+            f"{name}[{', '.join(map(str, place))}] = {values[place]:g}{more} is not allowed: {remedy}"
+        )

@@ -1,0 +1,139 @@
+"""Pictures of how a place for a transmitter was found."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
+from matplotlib.ticker import PercentFormatter
+from numpy.typing import NDArray
+
+from sionna_partial.constants import CellState
+from sionna_partial.inverse.placement import TransmitterPlacement
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.figures import BLUE, RED
+from sionna_partial.settings import require
+
+_WIDTH_IN, _DPI = 9.0, 130
+_WALL, _UNKNOWN = "black", "0.86"
+_BORDER_M = 0.3
+_STAR: dict[str, Any] = {"marker": "*", "markersize": 15, "markerfacecolor": "white", "markeredgecolor": "black"}
+
+
+def plot_placement(placement: TransmitterPlacement) -> Figure:
+    """Draw the map, the places that were looked at, the climbs, and the best place with what it covers.
+
+    Squares are receivers, in the colour of their probability of being covered from there (or of their mean gain), the
+    paler the less likely they are indoors. The way to the best place is red, other climbs are blue.
+
+    Parameters
+    ----------
+    placement : TransmitterPlacement
+        From `place_transmitter`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not known to pyplot: it need not be closed.
+
+    Raises
+    ------
+    SettingsError
+        For something else than a TransmitterPlacement.
+    """
+    kind = type(placement).__name__
+    require(isinstance(placement, TransmitterPlacement), "placement", kind, "give what place_transmitter returned.")
+    x0, x1, y0, y1 = _window_m(placement)
+    height = min(max((_WIDTH_IN - 1.8) * (y1 - y0) / (x1 - x0), 3.0), 14.0)
+    figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
+    axis = figure.add_subplot()
+    _draw_map(axis, placement.partial)
+    squares = _draw_receivers(axis, placement)
+    _draw_search(axis, placement)
+    axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
+    coverage = placement.objective.name == "coverage"
+    label = f"probability of more than {placement.objective.threshold_db:g} dB" if coverage else "mean path gain [dB]"
+    bar = figure.colorbar(squares, ax=axis, label=label, shrink=0.8)
+    if coverage:
+        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
+    _add_legend(figure)
+    return figure
+
+
+def _headline(placement: TransmitterPlacement) -> str:
+    x, y, z = placement.position_m
+    score = placement.score
+    if placement.objective.name == "coverage":
+        return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, predicted coverage {score:.1%}"
+    return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, worst tenth at {score:.1f} dB"
+
+
+def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:
+    """Part of the map that is drawn: what is known, and what counts (x0, x1, y0, y1) [m]."""
+    partial, half = placement.partial, 0.5 * placement.spacing_m
+    rows, columns = np.nonzero(partial.state != CellState.UNKNOWN)
+    corners = np.column_stack([columns, rows])
+    known_m = np.vstack([corners, corners + 1]) * partial.resolution_m + partial.origin_m
+    counting_m = placement.rx_m[placement.weight > 0.2, :2]
+    points_m = np.vstack([known_m, counting_m - half, counting_m + half])
+    (x0, y0), (x1, y1) = points_m.min(axis=0) - _BORDER_M, points_m.max(axis=0) + _BORDER_M
+    return float(x0), float(x1), float(y0), float(y1)
+
+
+def _draw_map(axis: Axes, partial: PartialMap) -> None:
+    x0, y0, x1, y1 = partial.bounds_m
+    axis.set_facecolor(_UNKNOWN)
+    free = _painted(partial.state == CellState.FREE, (255, 255, 255))
+    wall = _painted(partial.state == CellState.WALL, (0, 0, 0))
+    for picture, order in ((free, 0.5), (wall, 3.0)):
+        axis.imshow(picture, extent=(x0, x1, y0, y1), origin="lower", interpolation="nearest", zorder=order)
+
+
+def _painted(where: NDArray[np.bool_], colour: tuple[int, int, int]) -> NDArray[np.uint8]:
+    picture = np.zeros((*where.shape, 4), dtype=np.uint8)
+    picture[where] = (*colour, 255)
+    return picture
+
+
+def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollection:
+    """Draw a square for each receiver, and return them as what the colour scale is for."""
+    size = placement.spacing_m
+    patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
+    coverage = placement.objective.name == "coverage"
+    norm = Normalize(0.0, 1.0) if coverage else Normalize(-150.0, -60.0)
+    squares = PatchCollection(patches, cmap="viridis", norm=norm, linewidths=0.0, zorder=1)
+    squares.set_array(placement.values)
+    squares.set_alpha((0.15 + 0.75 * np.clip(placement.weight, 0.0, 1.0)).tolist())
+    axis.add_collection(squares)
+    scale = PatchCollection([], cmap="viridis", norm=norm)
+    scale.set_array(np.zeros(0))
+    return scale
+
+
+def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
+    x, y = placement.starts_m[:, :2].T
+    axis.scatter(x, y, s=26, facecolors="white", edgecolors="black", linewidths=1.0, zorder=4)
+    for climb in placement.climbs:
+        won = np.array_equal(climb.trajectory_m, placement.trajectory_m)
+        x, y = climb.trajectory_m[:, :2].T
+        axis.plot(x, y, color=RED if won else BLUE, marker="o", markersize=4, linewidth=1.8, zorder=5 if won else 4.5)
+    x, y = placement.position_m[:2]
+    axis.plot(x, y, linestyle="none", zorder=6, **_STAR)
+
+
+def _add_legend(figure: Figure) -> None:
+    handles = [
+        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="way there"),
+        Line2D([], [], color=BLUE, marker="o", markersize=4, label="other climb"),
+        Line2D(
+            [], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="looked at"
+        ),
+        Patch(color=_WALL, label="wall"),
+        Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)

@@ -1,0 +1,258 @@
+"""Materials from measured gains: found again, with an honest spread, from any start, and to the same bytes."""
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from meshes import OBSERVED, room
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+from sionna_partial.errors import MeasurementError, PositionError, SettingsError
+from sionna_partial.inverse import calibration, material_fit
+from sionna_partial.inverse.measured_building import custom_material
+from sionna_partial.inverse.slab import reflection_loss_db
+from sionna_partial.maps.mesh import merged_mesh
+from sionna_partial.maps.mesh_map import MeshReading, mesh_map
+from sionna_partial.tracing.scene import itu_constants
+
+SETTINGS = sp.TraceSettings(max_depth=2)
+THIN_M = 0.01
+HIDDEN = sp.Material(4.4, 2.0, THIN_M)
+START = sp.Material(2.94, 0.1226, THIN_M)
+ANGLES_DEG = np.array([0.0, 30.0, 45.0, 60.0])
+
+
+def flat() -> sp.PartialMap:
+    """Two rooms with a wide door: most links have no line of sight."""
+    state = np.zeros((50, 80), dtype=np.uint8)
+    state[[0, -1], :] = state[:, [0, -1]] = sp.CellState.WALL
+    state[:30, 40] = sp.CellState.WALL
+    return sp.PartialMap(state, 0.1)
+
+
+FLAT = flat()
+TX = np.array([[1.03, 1.02, 1.4], [6.91, 0.93, 1.6]])
+
+
+def places(count: int = 60) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    rng = np.random.default_rng(3)
+    rx = rng.uniform([0.3, 0.3, 1.0], [7.7, 4.7, 2.0], (count, 3))
+    rx[np.abs(rx[:, 0] - 4.05) < 0.15, 0] += 0.4
+    return TX[np.arange(count) % 2], rx
+
+
+def measured(
+    scene: sp.PartialMap = FLAT, hidden: sp.Material | None = HIDDEN, noise_db: float = 1.0
+) -> dict[str, object]:
+    tx, rx = places()
+    settings = None if hidden is None else sp.SceneSettings(material=hidden)
+    links = sp.trace_links(scene, TX, rx, settings=SETTINGS, scene_settings=settings)
+    gain_db = links.gain_db[np.arange(len(rx)) % 2, np.arange(len(rx))]
+    return {"tx": tx, "rx": rx, "gain_db": gain_db + noise_db * np.random.default_rng(4).standard_normal(len(rx))}
+
+
+def calibrate(measurements: object, **arguments: object) -> sp.MaterialCalibration:
+    return sp.calibrate_materials(FLAT, measurements, **{"start": START, "settings": SETTINGS, **arguments})  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_search() -> Iterator[None]:
+    """A slab of 1 cm has few teeth: few cells are enough, and quick."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"COARSE_PARTS": 12, "MOST_TEETH": 2, "MOST_CELLS": 120, "FEW_TEETH": 1}.items():
+            patch.setattr(material_fit, name, value)
+        yield
+
+
+@pytest.fixture(scope="module")
+def result() -> sp.MaterialCalibration:
+    return calibrate(measured())
+
+
+def same(one: sp.MaterialCalibration, other: sp.MaterialCalibration) -> bool:
+    return (
+        one.record() == other.record()
+        and one.gain_after_db.tobytes() == other.gain_after_db.tobytes()
+        and one.scene == other.scene
+    )
+
+
+class TestHiddenMaterial:
+    def test_losses_of_reflections(self, result: sp.MaterialCalibration) -> None:
+        for polarisation in ("te", "tm"):
+            found_db, std_db = result.reflection_loss_db(ANGLES_DEG, polarisation)
+            hidden_db = reflection_loss_db(4.4, 2.0, THIN_M, 28e9, ANGLES_DEG, polarisation)
+            shown = hidden_db < 25.0
+            assert (np.abs(found_db - hidden_db) <= np.maximum(0.5, 2.5 * std_db))[shown].all()
+        assert (std_db >= 0.0).all()
+
+    def test_parameters_within_their_spread(self, result: sp.MaterialCalibration) -> None:
+        assert abs(result.permittivity - 4.4) <= 2.5 * result.permittivity_std
+        assert abs(result.conductivity - 2.0) <= 2.5 * result.conductivity_std
+        assert 0.0 < result.permittivity_std < 1.0
+        assert result.noise_db == pytest.approx(1.0, abs=0.3)
+
+    def test_links_fit_better(self, result: sp.MaterialCalibration) -> None:
+        rmse = result.record()["rmse_db"]
+        assert rmse["after"] < 1.3 < rmse["before"]
+        assert result.used.sum() + sum(result.left_out.values()) == len(result.gain_db) == 60
+
+    def test_loss_falls(self, result: sp.MaterialCalibration) -> None:
+        assert (np.diff(result.loss) <= 0.0).all()
+        assert result.loss[-1] < result.loss[0] - 0.1
+
+    def test_scene_predicts_with_it(self, result: sp.MaterialCalibration) -> None:
+        assert result.scene == replace(FLAT, material=result.materials[0])
+        assert result.materials[0] == sp.Material(result.permittivity, result.conductivity, THIN_M)
+        links = sp.trace_links(result.scene, TX[0], places()[1][::2], settings=SETTINGS)
+        np.testing.assert_allclose(links.gain_db, result.gain_after_db[::2], atol=0.3)
+
+    def test_record_is_plain(self, result: sp.MaterialCalibration) -> None:
+        record = json.loads(json.dumps(result.record()))
+        assert record["permittivity"] == result.permittivity
+        assert record["materials"][0]["thickness_m"] == THIN_M
+
+
+class TestSameAnswer:
+    def test_from_a_poor_start(self, result: sp.MaterialCalibration) -> None:
+        poor = calibrate(measured(), start=sp.Material(30.0, 20.0, THIN_M))
+        assert poor.loss[0] > result.loss[0]
+        assert poor.materials == result.materials
+        assert poor.permittivity_std == result.permittivity_std
+
+    def test_of_a_run_that_was_stopped(
+        self, result: sp.MaterialCalibration, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The second run is killed in the middle, and the third goes on; the fourth finds all of it."""
+        state = tmp_path / "state.json"
+
+        def stop(share: float, message: str) -> None:
+            if share > 0.55:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            calibrate(measured(), checkpoint=state, progress=stop)
+        half = len(json.loads(state.read_text())["found"])
+        assert same(calibrate(measured(), checkpoint=state), result)
+        whole = state.read_bytes()
+        assert 50 < half < len(json.loads(whole)["found"])
+        monkeypatch.setattr(calibration.MaterialTarget, "_slopes", lambda *_: pytest.fail("is known"))
+        assert same(calibrate(measured(), checkpoint=state), result)
+        assert state.read_bytes() == whole
+
+    def test_other_checkpoints_are_not_taken(
+        self, result: sp.MaterialCalibration, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        state = tmp_path / "state.json"
+        state.write_text('{"fingerprint": "another", "found": {"0x1p+1 0x1p+1": [0.0, 1.0, 0.0, 0.0]}}')
+        assert same(calibrate(measured(), checkpoint=state), result)
+        assert any("is damaged, or of another calibration: it starts anew" in text for text in caplog.messages)
+
+
+class TestWhatCannotBeDetermined:
+    def test_is_said(self, caplog: pytest.LogCaptureFixture) -> None:
+        """Thick lossy slabs are opaque: how lossy, hardly shows."""
+        opaque = sp.Material(5.0, 1.5, 0.04)
+        with caplog.at_level(logging.WARNING):
+            found = calibrate(measured(hidden=opaque, noise_db=3.0), start=replace(opaque, conductivity_s_m=0.1))
+        assert "conductivity" in found.undetermined
+        assert any(
+            re.search(r"cannot determine the conductivity: 95 % .* between [\d.]+ and [\d.]+ S/m", text)
+            for text in caplog.messages
+        )
+        assert found.conductivity_std > 0.2
+
+    def test_line_of_sight_says_nothing(self) -> None:
+        """In an open field with no floor in reach of the trace, nothing reflects."""
+        field = sp.PartialMap(np.zeros((50, 80), dtype=np.uint8), 0.1)
+        tx, rx = places(20)
+        gain_db = sp.trace_links(field, TX, rx, settings=sp.TraceSettings(max_depth=0)).gain_db
+        measurements = {"tx": tx, "rx": rx, "gain_db": gain_db[np.arange(20) % 2, np.arange(20)]}
+        found = sp.calibrate_materials(field, measurements, start=START, settings=sp.TraceSettings(max_depth=0))
+        assert found.undetermined == ("permittivity", "conductivity")
+
+
+class TestPartialMap:
+    def test_links_through_the_unseen_are_left_out(self) -> None:
+        state = FLAT.state.copy()
+        state[5:45, 42:60] = sp.CellState.UNKNOWN
+        found = sp.calibrate_materials(replace(FLAT, state=state), measured(), start=START, settings=SETTINGS)
+        assert found.left_out["runs through unobserved space"] > 5
+        assert (~found.used).sum() == sum(found.left_out.values())
+
+    def test_outages_are_left_out(self, result: sp.MaterialCalibration) -> None:
+        assert result.left_out == {"measured outage": 0, "no path on the map": 0, "runs through unobserved space": 0}
+        measurements = measured()
+        gain_db = np.array(measurements["gain_db"])
+        gain_db[:52] = -151.0
+        message = r"has 8 usable links of 60, fewer than 10; left out: 52 \(measured outage\)\. Measure more links"
+        with pytest.raises(MeasurementError, match=message):
+            calibrate({**measurements, "gain_db": gain_db})
+
+
+def test_materials_of_a_mesh() -> None:
+    """The walls of the room and the one inside are of different materials, and a third one is not used."""
+    walls, inner = room().geometry.values()
+    vertices = np.concatenate([walls.vertices, inner.vertices])
+    triangles = np.concatenate([walls.faces, inner.faces + len(walls.vertices)])
+    unused, hidden = sp.Material(itu="wood"), (sp.Material(6.0, 0.8, THIN_M), sp.Material(2.2, 0.3, THIN_M))
+    mesh = merged_mesh(vertices, triangles, np.repeat([0, 2], 12), (hidden[0], unused, hidden[1]))
+    partial = mesh_map(mesh, MeshReading(observed=OBSERVED, resolution_m=0.1))
+    rng = np.random.default_rng(5)
+    tx, rx = np.tile([1.5, 1.0, 1.5], (24, 1)), rng.uniform([0.3, 0.3, 1.0], [4.7, 3.7, 2.0], (24, 3))
+    rx[np.abs(rx[:, 0] - 3.0) < 0.2, 0] -= 0.4
+    gain_db = sp.trace_links(partial, tx[0], rx, settings=SETTINGS).gain_db
+    blank = replace(partial, mesh=replace(mesh, materials=(None, unused, None)), material=START)
+    found = sp.calibrate_materials(blank, {"tx": tx, "rx": rx, "gain_db": gain_db}, settings=SETTINGS)
+    assert found.permittivity.shape == found.conductivity_std.shape == (2,)
+    assert found.permittivity[0] == pytest.approx(6.0, abs=1.5)
+    assert found.record()["rmse_db"]["after"] < found.record()["rmse_db"]["before"]
+    assert found.scene.mesh is not None
+    assert found.scene.mesh.materials == (found.materials[0], unused, found.materials[1])
+    assert all("[" in name for name in found.undetermined)
+
+
+class TestWrongArguments:
+    @pytest.mark.parametrize(
+        ("changes", "error", "message"),
+        [
+            ({"rx": [9.0, 1.0, 1.5]}, PositionError, "rx[3] = (9.0, 1.0, 1.5) is outside the map"),
+            ({"tx": [4.05, 1.0, 1.5]}, PositionError, "tx[3] = (4.05, 1.0, 1.5) is inside a wall"),
+            ({"rx": [1.0, 1.0, np.nan]}, MeasurementError, "rx[3, 2] = nan is not allowed: give finite numbers"),
+            ({"gain_db": np.nan}, MeasurementError, "gain_db[3] = nan is not allowed: give finite numbers"),
+        ],
+    )
+    def test_unusable_measurements(self, changes: dict[str, object], error: type[Exception], message: str) -> None:
+        tx, rx = places()
+        arrays = {"tx": tx, "rx": rx, "gain_db": np.full(60, -80.0)}
+        for name, value in changes.items():
+            arrays[name] = arrays[name].copy()
+            arrays[name][3] = value
+        with pytest.raises(error, match=re.escape(message)):
+            calibrate(arrays)
+
+    def test_links_without_length(self) -> None:
+        tx, _ = places()
+        message = r"rx\[0\] = \(1.03, 1.02, 1.4\) is 0 m from its transmitter, where .* links shorter than 0.011 m"
+        with pytest.raises(MeasurementError, match=message):
+            calibrate({"tx": tx, "rx": tx, "gain_db": np.full(60, -80.0)})
+
+    def test_start_and_settings(self) -> None:
+        with pytest.raises(SettingsError, match="start = 'brick' is not allowed: give a Material, or None for the s"):
+            calibrate(measured(), start="brick")
+        with pytest.raises(SettingsError, match="refraction = True is not allowed"):
+            calibrate(measured(), settings=sp.TraceSettings(refraction=True))
+        with pytest.raises(SettingsError, match="'wet_ground' is defined for 1-10 GHz"):
+            calibrate(measured(), start=sp.Material(itu="wet_ground"))
+
+
+def test_itu_material_becomes_a_custom_one() -> None:
+    brick = custom_material(sp.Material(itu="brick", thickness_m=0.2), 28e9)
+    assert (brick.relative_permittivity, brick.conductivity_s_m) == pytest.approx(itu_constants("brick", 28e9))
+    assert (brick.itu, brick.thickness_m) == (None, 0.2)

@@ -1,0 +1,94 @@
+"""The command line back from measurements: what is written, what is said, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import sionna_partial as sp
+from sionna_partial.cli import app
+from sionna_partial.inverse import material_fit
+
+pytestmark = pytest.mark.usefixtures("command_line")
+
+HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
+HIDDEN = sp.Material(5.0, 2.0, 0.01)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A map of a room with a wall, and measurements of 24 links in it."""
+    folder = tmp_path_factory.mktemp("room")
+    state = np.zeros((40, 50), dtype=np.uint8)
+    state[[0, -1], :] = state[:, [0, -1]] = sp.CellState.WALL
+    state[:28, 25] = sp.CellState.WALL
+    room = sp.PartialMap(state, 0.1)
+    sp.save_map(room, folder / "room.yaml")
+    rng = np.random.default_rng(0)
+    tx, rx = np.array([1.0, 1.0, 1.5]), rng.uniform([2.8, 0.3, 1.0], [4.7, 3.7, 2.0], (24, 3))
+    links = sp.trace_links(
+        room, tx, rx, settings=sp.TraceSettings(max_depth=2), scene_settings=sp.SceneSettings(material=HIDDEN)
+    )
+    rows = [
+        ",".join(f"{value:.6f}" for value in (*tx, *place, gain)) for place, gain in zip(rx, links.gain_db, strict=True)
+    ]
+    (folder / "measured.csv").write_text("\n".join([HEADER, *rows, ""]))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"COARSE_PARTS": 8, "MOST_TEETH": 1, "MOST_CELLS": 40, "FEW_TEETH": 1}.items():
+        monkeypatch.setattr(material_fit, name, value)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
+
+
+def test_calibrate(place: Path, tmp_path: Path) -> None:
+    out, state = tmp_path / "out", tmp_path / "state.json"
+    result = run(
+        *(place / "room.yaml", "--measurements", place / "measured.csv", "--out", out, "--checkpoint", state),
+        *("--material", "2.94,0.1226,0.01", "--max-depth", 2),
+    )
+    assert result.exit_code == 0, result.output
+    assert sorted(file.name for file in out.iterdir()) == ["calibrated.npz", "calibration.json", "calibration.png"]
+    numbers = json.loads((out / "calibration.json").read_text())
+    calibrated = sp.load_map(out / "calibrated.npz")
+    assert calibrated.material == sp.Material(numbers["permittivity"], numbers["conductivity"], 0.01)
+    assert numbers["rmse_db"]["after"] < numbers["rmse_db"]["before"]
+    assert numbers["start"][0]["relative_permittivity"] == 2.94
+    assert (out / "calibration.png").stat().st_size > 10_000
+    assert len(json.loads(state.read_text())["found"]) > 50
+    for words in (
+        "permittivity ",
+        "(start 2.94)",
+        " S/m (start 0.1226 S/m)",
+        "24 used; left out: none",
+        "dB at 45 deg",
+    ):
+        assert words in result.output
+    doubts = [line for line in result.output.splitlines() if line.endswith("CANNOT BE DETERMINED")]
+    assert {line.split()[0] for line in doubts} == {*numbers["undetermined"]}
+    assert f"wrote {out / 'calibrated.npz'}" in result.output
+
+
+def test_unusable_measurements_are_one_line(place: Path, tmp_path: Path) -> None:
+    (tmp_path / "bad.csv").write_text(f"{HEADER}\n1,1,1.5,3,3,1.5,loud\n")
+    result = run(place / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "error: measurements = " in result.output
+    assert "line 2: gain_db = 'loud' is not a number: correct the line" in result.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_too_few_measurements(place: Path, tmp_path: Path) -> None:
+    few = (place / "measured.csv").read_text().splitlines()[:6]
+    (tmp_path / "few.csv").write_text("\n".join(few))
+    result = run(place / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert "has 5 usable links of 5, fewer than 10" in result.output
+    assert "Traceback" not in result.output

@@ -1,0 +1,159 @@
+"""Measurements: every form gives the same arrays, and what is unusable is named."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from numpy.typing import NDArray
+
+from sionna_partial.errors import MeasurementError
+from sionna_partial.inverse.measurements import Measurements, measurements_of
+
+TX = np.array([[1.0, 2.0, 1.5], [1.0, 2.0, 1.5], [3.0, 4.0, 2.0]])
+RX = np.array([[2.0, 2.0, 1.5], [4.0, 1.0, 1.5], [5.0, 5.0, 1.0]])
+GAIN_DB = np.array([-70.5, -140.0, -99.25])
+FIELDS = {"tx": TX, "rx": RX, "gain_db": GAIN_DB}
+FLAT = {f"{end}_{axis}": FIELDS[end][:, k] for end in ("tx", "rx") for k, axis in enumerate("xyz")} | {
+    "gain_db": GAIN_DB
+}
+HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
+
+
+class Frame:
+    """Behaves as a pandas data frame does: a column of triples is an array of objects."""
+
+    def __init__(self, columns: dict[str, list[object]]) -> None:
+        self.columns = columns
+
+    def __getitem__(self, name: str) -> NDArray[np.object_]:
+        column = np.empty(len(self.columns[name]), dtype=object)
+        column[:] = self.columns[name]
+        return column
+
+
+def csv_file(folder: Path, text: str) -> Path:
+    path = folder / "measured.csv"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def rows(columns: dict[str, NDArray[np.float64]]) -> str:
+    return "\n".join(",".join(f"{value:.17g}" for value in row) for row in zip(*columns.values(), strict=True))
+
+
+class TestForms:
+    @pytest.mark.parametrize(
+        "source",
+        [
+            Measurements(TX, RX, GAIN_DB),
+            FIELDS,
+            {name: values.tolist() for name, values in FIELDS.items()},
+            FLAT,
+            Frame({"tx": [*map(tuple, TX)], "rx": [*RX], "gain_db": [*GAIN_DB]}),
+            Frame({name: [*values] for name, values in FLAT.items()}),
+            xr.Dataset({"tx": (("link", "axis"), TX), "rx": (("link", "axis"), RX), "gain_db": ("link", GAIN_DB)}),
+        ],
+        ids=["measurements", "mapping", "lists", "flat mapping", "frame of triples", "flat frame", "xarray"],
+    )
+    def test_all_give_the_same(self, source: object) -> None:
+        found = measurements_of(source)
+        for name, values in FIELDS.items():
+            assert getattr(found, name).dtype == np.float64
+            np.testing.assert_array_equal(getattr(found, name), values)
+
+    @pytest.mark.parametrize("as_text", [True, False])
+    def test_csv(self, tmp_path: Path, as_text: bool) -> None:
+        path = csv_file(tmp_path, f"{HEADER}\n{rows(FLAT)}\n\n")
+        found = measurements_of(str(path) if as_text else path)
+        for name, values in FIELDS.items():
+            np.testing.assert_array_equal(getattr(found, name), values)
+
+    def test_csv_of_a_spreadsheet(self, tmp_path: Path) -> None:
+        """With a byte order mark, blanks, other columns, another order, and no heights."""
+        path = csv_file(tmp_path, "\ufeffnote, gain_db, rx_y, rx_x, tx_x, tx_y\nhall, -80, 2, 1, 3, 4\n")
+        found = measurements_of(path)
+        assert (found.tx.tolist(), found.rx.tolist(), found.gain_db.tolist()) == ([[3, 4, 1.5]], [[1, 2, 1.5]], [-80])
+
+    def test_one_transmitter_stands_for_all(self) -> None:
+        found = measurements_of({**FIELDS, "tx": TX[0]})
+        np.testing.assert_array_equal(found.tx, [TX[0]] * 3)
+
+    def test_arrays_are_copies(self) -> None:
+        gain_db = GAIN_DB.copy()
+        found = measurements_of({**FIELDS, "gain_db": gain_db})
+        gain_db[0] = -1.0
+        assert found.gain_db[0] == GAIN_DB[0]
+
+
+class TestMeasurements:
+    def test_outages(self) -> None:
+        found = Measurements(TX, RX, np.array([-139.9, -150.0, -157.0]))
+        assert found.is_outage.tolist() == [False, True, True]
+        assert len(found) == 3
+
+    def test_take(self) -> None:
+        found = Measurements(TX, RX, GAIN_DB).take(np.array([2, 0]))
+        np.testing.assert_array_equal(found.rx, RX[[2, 0]])
+        assert found.gain_db.tolist() == [-99.25, -70.5]
+
+    @pytest.mark.parametrize(
+        ("changes", "message"),
+        [
+            ({"gain_db": GAIN_DB[:, None]}, "gain_db has shape (3, 1): give one gain for each link, (N,)."),
+            ({"gain_db": [-70.0, np.nan, np.nan]}, "gain_db[1] = nan (and 1 more) is not allowed: give finite numbers"),
+            ({"gain_db": [-70.0, -np.inf, -80.0]}, "gain_db[1] = -inf is not allowed: give finite numbers, or leave"),
+            ({"gain_db": [70.0, 80.0, 90.0]}, "gain_db[0] = 70 (and 2 more) is not allowed: path gains are negative;"),
+            ({"gain_db": [-70.0, -80.0, -201.0]}, "gain_db[2] = -201 is not allowed: give dB, not below -200;"),
+            ({"gain_db": "loud"}, "gain_db is not an array of numbers ("),
+            ({"tx": TX[:2]}, "tx has shape (2, 3) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
+            ({"rx": RX[:, :2]}, "rx has shape (3, 2) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
+            ({"rx": [[1.0, 2.0, 3.0], [1.0, np.nan, 3.0], [0, 0, 1]]}, "rx[1, 1] = nan is not allowed: give finite"),
+            ({"tx": [[1.0, 2.0, 3.0], [1.0, 3.0], [0, 0, 1]]}, "tx is not an array of numbers ("),
+            ({"tx": Frame({"tx": [(1, 2, 3), (1, 2), (0, 0, 1)]})["tx"]}, "tx is not an array of numbers ("),
+        ],
+    )
+    def test_what_is_unusable(self, changes: dict[str, object], message: str) -> None:
+        with pytest.raises(MeasurementError, match=re.escape(message)):
+            measurements_of({**FIELDS, **changes})
+
+
+class TestWhatIsMissing:
+    @pytest.mark.parametrize("name", FIELDS)
+    @pytest.mark.parametrize("kind", [dict, Frame])
+    def test_field(self, kind: type, name: str) -> None:
+        columns = {key: [*values] for key, values in FIELDS.items() if key != name}
+        with pytest.raises(MeasurementError, match=rf"{name} is missing from (the )?measurements.*: give a mapping or"):
+            measurements_of(kind(columns))
+
+    @pytest.mark.parametrize("source", [None, 7, [1.0, 2.0]])
+    def test_no_measurements_at_all(self, source: object) -> None:
+        message = f"gain_db is missing from measurements of type {type(source).__name__}: give a mapping"
+        with pytest.raises(MeasurementError, match=message):
+            measurements_of(source)
+
+    def test_columns_of_unequal_lengths(self) -> None:
+        with pytest.raises(MeasurementError, match=r"tx_x, tx_y and tx_z have shapes \(3,\), \(2,\), \(3,\): give one"):
+            measurements_of({**FLAT, "tx_y": TX[:2, 1]})
+
+    def test_file(self, tmp_path: Path) -> None:
+        with pytest.raises(MeasurementError, match=r"gone\.csv' cannot be read \(.*No such file.*\): give a mapping"):
+            measurements_of(tmp_path / "gone.csv")
+
+    @pytest.mark.parametrize("text", ["", "tx_x,tx_y\n1,2\n"])
+    def test_columns_of_a_file(self, tmp_path: Path, text: str) -> None:
+        with pytest.raises(MeasurementError, match=r"is missing .*with the columns tx_x, tx_y, tx_z, rx_x"):
+            measurements_of(csv_file(tmp_path, text))
+
+    @pytest.mark.parametrize(("line", "shown"), [("1,2,1.5,3,4,1.5,loud", "'loud'"), ("1,2,1.5,3,4,1.5", "''")])
+    def test_cell_that_is_no_number(self, tmp_path: Path, line: str, shown: str) -> None:
+        path = csv_file(tmp_path, f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n{line}\n")
+        message = re.escape(f"'{path}', line 4: gain_db = {shown} is not a number: correct the line, or leave it out.")
+        with pytest.raises(MeasurementError, match=message):
+            measurements_of(path)
+
+    def test_binary_file(self, tmp_path: Path) -> None:
+        (tmp_path / "map.npz").write_bytes(b"PK\x03\x04\xff\xfe")
+        with pytest.raises(MeasurementError, match=r"map\.npz' cannot be read"):
+            measurements_of(tmp_path / "map.npz")

@@ -1,0 +1,178 @@
+import numpy as np
+import pytest
+from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, use_fakes
+from placement_fakes import two_rooms
+
+from sionna_partial.constants import CellState
+from sionna_partial.coverage import predict_map
+from sionna_partial.errors import PositionError
+from sionna_partial.inverse.placement_area import CLEARANCE_M, PlacementArea, placement_area
+from sionna_partial.maps.partial_map import PartialMap
+
+
+class TestRoom:
+    def test_free_and_away_from_walls(self) -> None:
+        area = two_rooms()
+        places = np.array([[1.0, 1.0, 1.5], [0.55, 1.0, 1.5], [0.65, 1.0, 1.5], [0.25, 1.0, 1.5], [2.75, 1.0, 1.5]])
+        assert area.stands(places).tolist() == [True, False, True, False, False]
+
+    def test_unknown_cells_are_no_place_but_keep_no_distance(self) -> None:
+        area = placement_area(map_of("...??\n...??\n...??", 0.5, (0.0, 0.0)), 1.5, 1.5, None)
+        assert area.stands(np.array([[1.45, 0.7, 1.5], [1.55, 0.7, 1.5], [9.0, 0.7, 1.5]])).tolist() == [1, 0, 0]
+
+    def test_distance_to_walls_is_kept_at_any_resolution(self) -> None:
+        for cell_m in (0.02, 0.05, 0.07, 0.3, 1.0):
+            count = round(4.0 / cell_m)
+            state = np.zeros((count, count), dtype=np.uint8)
+            state[:, 0] = CellState.WALL
+            area = placement_area(PartialMap(state, cell_m), 1.5, 1.5, None)
+            x_m = np.arange(cell_m + 0.001, 3.0, 0.003)
+            stands = area.stands(np.column_stack([x_m, np.full_like(x_m, 2.0), np.full_like(x_m, 1.5)]))
+            nearest_m = x_m[stands].min() - cell_m
+            assert CLEARANCE_M - 1e-6 <= nearest_m <= CLEARANCE_M + 0.05
+
+    def test_area(self) -> None:
+        assert two_rooms().size_m2 == pytest.approx(1.8 * 1.8 + 1.3 * 1.8 + 0.7 * 0.3, abs=1e-6)
+
+    def test_nowhere(self) -> None:
+        message = "a transmitter can stand nowhere: the map has 0 free cells, and none of their area is 0.1 m away"
+        with pytest.raises(PositionError, match=message):
+            placement_area(map_of("##\n?#", 0.5), 1.5, 1.5, None)
+        with pytest.raises(PositionError, match="the map has 1 free cells, and none of their area"):
+            placement_area(map_of("###\n#.#\n###", 0.1), 1.5, 1.5, None)
+
+
+class TestReaches:
+    def test_walls_are_in_the_way(self) -> None:
+        area = two_rooms()
+        left, right, door = np.array([[1.0, 2.0, 1.5], [3.5, 2.0, 1.5], [2.75, 1.25, 1.5]])
+        assert not area.reaches(left, right)
+        assert area.reaches(np.array([1.0, 1.25, 1.5]), np.array([4.0, 1.25, 1.5]))
+        assert area.reaches(door, np.array([2.0, 1.25, 1.5]))
+        assert area.reaches(left, left)
+
+    def test_unknown_cells_are_in_the_way(self) -> None:
+        area = placement_area(map_of(".?.\n...", 0.5, (0.0, 0.0)), 1.5, 1.5, None)
+        assert not area.reaches(np.array([0.25, 0.75, 1.5]), np.array([1.25, 0.75, 1.5]))
+        assert area.reaches(np.array([0.25, 0.25, 1.5]), np.array([1.25, 0.25, 1.5]))
+
+    def test_end_outside(self) -> None:
+        assert not two_rooms().reaches(np.array([1.0, 1.0, 1.5]), np.array([-1.0, 1.0, 1.5]))
+
+
+class TestPlaces:
+    def test_all_over_the_area(self) -> None:
+        area = two_rooms()
+        places = area.places(3)
+        assert area.stands(places).all()
+        assert (places[:, 2] == 1.5).all()
+        assert len(places) == pytest.approx(area.size_m2 / 0.25**2, rel=0.25)
+
+    def test_seed(self) -> None:
+        area = two_rooms()
+        np.testing.assert_array_equal(area.places(3), area.places(3))
+        assert not np.isin(area.places(4)[:, 0], area.places(3)[:, 0]).any()
+
+    def test_no_more_than_wanted_on_a_large_map(self) -> None:
+        area = placement_area(PartialMap(np.zeros((200, 300), dtype=np.uint8), 0.2), 1.5, 1.5, None)
+        assert 400 < len(area.places(0)) < 600
+
+    def test_area_that_the_grid_misses(self) -> None:
+        state = np.full((40, 40), CellState.UNKNOWN, dtype=np.uint8)
+        state[20, 20:23] = CellState.FREE
+        area = placement_area(PartialMap(state, 0.05), 1.5, 1.5, FakePredictor())
+        for seed in range(5):
+            assert area.stands(area.places(seed)).all()
+
+
+class TestReceivers:
+    def test_where_predict_map_has_valid_ones(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        use_fakes(monkeypatch)
+        partial = map_of(PICTURE)
+        coverage = predict_map(partial, TX, spacing_m=0.5)
+        rows, columns = np.nonzero(coverage["valid"].to_numpy())
+        expected = np.column_stack([coverage["x"].to_numpy()[columns], coverage["y"].to_numpy()[rows]])
+        found = placement_area(partial, 1.5, 1.2, FakePredictor()).rx_m
+        np.testing.assert_allclose(found[:, :2], expected)
+        assert (found[:, 2] == 1.2).all()
+
+    def test_unknown_ones_count_as_much_as_they_are_indoors(self) -> None:
+        partial = map_of(PICTURE)
+        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        free = partial.state_at(area.rx_m) == CellState.FREE
+        assert 0 < free.sum() < len(free)
+        np.testing.assert_array_equal(area.weight, np.where(free, 1.0, 0.25))
+
+    def test_outside_of_a_complete_map_does_not_count(self) -> None:
+        partial = map_of(COMPLETE)
+        area = placement_area(partial, 1.5, 1.5, None)
+        assert (partial.state_at(area.rx_m) == CellState.FREE).all()
+        assert (area.weight == 1.0).all()
+
+    def test_those_hardly_indoors_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(FakePredictor, "predict_indoor", lambda self, phi: np.full(len(phi), 0.01))
+        partial = map_of(PICTURE)
+        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        assert (partial.state_at(area.rx_m) == CellState.FREE).all()
+
+    def test_the_nearer_to_what_is_seen_the_more(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """P(indoor) is asked with lengths that grow with the distance from the free cells."""
+        monkeypatch.setattr(FakePredictor, "predict_indoor", lambda self, phi: np.exp(-phi.unobserved_distance_m))
+        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, FakePredictor())
+        order = np.argsort(area.rx_m[:, 0])
+        assert (np.diff(area.weight[order][3:]) < 0.0).all()
+
+    def test_fewer_on_a_huge_map(self) -> None:
+        area = placement_area(PartialMap(np.zeros((100, 100), dtype=np.uint8), 1.0), 1.5, 1.5, None)
+        assert 3500 < len(area.rx_m) < 4500
+        assert area.spacing_m == pytest.approx(100 / np.sqrt(4000))
+
+    def test_no_receiver(self) -> None:
+        state = np.full((20, 20), CellState.UNKNOWN, dtype=np.uint8)
+        state[1:5, 1:5] = CellState.WALL
+        state[2:4, 2:4] = CellState.FREE
+        with pytest.raises(PositionError, match=r"no receiver can stand anywhere: all places of a grid of 0\.5 m"):
+            placement_area(PartialMap(state, 0.15), 1.5, 1.5, None)
+
+
+class TestThinned:
+    def test_stands_for_all(self) -> None:
+        partial = PartialMap(np.zeros((100, 160), dtype=np.uint8), 0.1)
+        area = placement_area(partial, 1.5, 1.5, None)
+        thinned = area.thinned(60)
+        assert len(thinned.rx_m) == 60
+        for axis in (0, 1):
+            mean, all_mean = (np.average(each.rx_m[:, axis], weights=each.weight) for each in (thinned, area))
+            assert mean == pytest.approx(all_mean, abs=0.3)
+
+    def test_more_where_they_weigh_more(self) -> None:
+        partial = PartialMap(np.repeat([[0], [0], [2], [2]], 40, axis=1).repeat(10, axis=0).astype(np.uint8), 0.2)
+        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        thinned = area.thinned(50)
+        free = partial.state_at(thinned.rx_m) == CellState.FREE
+        assert thinned.weight[free].sum() / thinned.weight.sum() == pytest.approx(0.8, abs=0.05)
+        assert thinned.weight.sum() == 50
+
+    def test_few_are_kept(self) -> None:
+        area = two_rooms()
+        assert area.thinned(10_000) is area
+
+
+class TestSight:
+    def test_open_unknown_and_walled(self) -> None:
+        partial = map_of("#####\n....?\n####?", 1.0, (0.0, 0.0))
+        area = PlacementArea(
+            partial, 1.5, partial, np.array([[3.5, 1.5, 1.5], [4.5, 1.5, 1.5], [4.5, 0.5, 1.5]]), np.ones(3), 0.5
+        )
+        clear, unseen, walled = area.sight(np.array([[0.5, 1.5, 1.5]]))[0]
+        assert clear == 1.0
+        assert unseen == pytest.approx(np.exp(-0.5 / 4.0))
+        assert 0.0 < walled < unseen
+
+    def test_beyond_reach(self) -> None:
+        area = two_rooms()
+        seen = area.sight(np.array([[1.0, 1.0, 1.5]]), reach_m=1.0)[0]
+        far = np.linalg.norm(area.rx_m - [1.0, 1.0, 1.5], axis=1) > 1.0
+        left = area.rx_m[:, 0] < 2.4
+        assert (seen[~far] == 1.0).all()
+        assert (seen[far & left] == 0.0).all()
