@@ -125,15 +125,15 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
     OutputError
         If writing fails.
     """
-    from sionna_partial.plots.calibration_plot import plot_calibration
     from sionna_partial.plots.evaluation_plot import plot_stages
     from sionna_partial.plots.figures import figure_png
+    from sionna_partial.plots.reliability_plot import plot_reliability
 
     contents = (
         markdown(evaluation).encode(),
         (json.dumps(as_json(evaluation), indent=2, allow_nan=False) + "\n").encode(),
         figure_png(plot_stages(evaluation)),
-        figure_png(plot_calibration(evaluation.calibrations)),
+        figure_png(plot_reliability(evaluation.calibrations)),
     )
     with atomic_files(folder) as place:
         for name, content in zip(REPORT_FILES, contents, strict=True):

@@ -14,7 +14,7 @@ _COLOUR = "#004488"
 _IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
 
 
-def plot_calibration(stages: Mapping[int, Calibration]) -> Figure:
+def plot_reliability(stages: Mapping[int, Calibration]) -> Figure:
     """Draw reliability diagrams of the link state (above) and histograms of the gain's transform (below).
 
     In a reliability diagram, discs on the dashed line are right as often as they say; the larger a disc, the more
