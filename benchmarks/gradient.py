@@ -60,7 +60,7 @@ def main() -> None:
     parser.add_argument(
         "--steps", type=int, nargs="+", default=[0, 100], help="of the robot; 0 stands for the complete home"
     )
-    parser.add_argument("--receivers", type=int, default=150, help="receivers with finite differences")
+    parser.add_argument("--receivers", type=int, default=60, help="receivers with finite differences")
     parser.add_argument("--spacing", type=float, default=0.3, help="receiver spacing for the cost [m]")
     arguments = parser.parse_args()
     found: dict[tuple[str, str, str], list[Errors]] = {}

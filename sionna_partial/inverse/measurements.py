@@ -91,11 +91,12 @@ def measurements_of(source: Any) -> Measurements:
     """
     if isinstance(source, Measurements):
         return source
+    given = f"measurements of type {type(source).__name__}"
     if isinstance(source, str | os.PathLike):
-        source = _read_csv(Path(source))
+        given, source = f"measurements '{source}'", _read_csv(Path(source))
     gain_db = _field(source, "gain_db")
     if gain_db is None:
-        raise MeasurementError(f"gain_db is missing from measurements of type {type(source).__name__}: {_give()}")
+        raise MeasurementError(f"gain_db is missing from {given}: {_give()}")
     return Measurements(_place(source, "tx"), _place(source, "rx"), gain_db)
 
 
