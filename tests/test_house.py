@@ -27,7 +27,7 @@ MODULES = (
     *("walls.lines", "walls.cells", "walls.chains", "walls.bridges", "walls.graph", "walls.outlines", "walls.lattice"),
     *("tracing.plan", "tracing.scene", "tracing.beams", "tracing.candidates", "tracing.diffraction"),
     *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
-    *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.solver"),
+    *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.chain", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.fixed_paths", "tracing.gradients"),
     *("learning.unobserved", "learning.link_context", "learning.features", "learning.windows"),
     *("learning.networks", "learning.fitting", "learning.context_networks", "learning.context_fitting"),

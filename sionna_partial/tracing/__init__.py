@@ -3,8 +3,8 @@
 - `scene` writes scenes.
 - What paths a floor plan may have: `plan`, `beams`, `candidates` (floor and ceiling added), `diffraction`.
 - What paths a mesh may have: `rays`, `mesh_planes`, `ray_chains`, `mesh_candidates`.
-- Sionna RT: `sionna_rt` loads it, `contract` names the internal parts that `solver` leans on, `stock` does without
-  them, and `paths` is what either of them gives.
-- `generator` knows which scene has which candidates, `probe` whether `solver` can be trusted, `trace` is the door for
-  everybody else, and `gradients` differentiates what comes through it.
+- Sionna RT: `sionna_rt` loads it, `contract` names the internal parts that `chain` and `solver` lean on, `stock`
+  does without them, and `paths` is what either of them gives.
+- `generator` knows which scene has which candidates, `probe` whether `solver` can be trusted, and `trace` is the door
+  for everybody else. `fixed_paths` makes functions of what comes through it, and `gradients` differentiates the gain.
 """

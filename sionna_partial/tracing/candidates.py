@@ -249,3 +249,44 @@ def _height_at(share, tx_z, rx_z, height, bounces, first, to_first, climb):  # t
     rest = travelled - to_first - legs * height
     rising = (legs % 2 == 0) == (first == FLOOR)
     return rest if rising else height - rest
+
+
+def in_copies_of_scene(candidates: Candidates, vertices_m: NDArray[np.floating], faces: int, count: int) -> Candidates:
+    """Repeat candidates for each copy of a scene.
+
+    Parameters
+    ----------
+    candidates : Candidates
+    vertices_m : (C, D, 3) array
+        Their points of interaction [m].
+    faces, count : int
+        Number of faces of the scene, and of its copies, whose faces follow one another.
+
+    Returns
+    -------
+    Candidates
+        Those of the first copy, then those of the second, and so on.
+    """
+    shift = faces * np.repeat(np.arange(count, dtype=np.int32), len(candidates.rx))
+    face = np.tile(candidates.face, (count, 1))
+    new = replace(
+        candidates,
+        rx=np.tile(candidates.rx, count),
+        face=np.where(face >= 0, face + shift[:, None], face),
+        vertices_m=np.tile(vertices_m, (count, 1, 1)),
+    )
+    wedges, wedge = candidates.wedges, candidates.wedge
+    if wedges is None or wedge is None:
+        return new
+    edges = len(wedges.edge_m)
+    faces_of = wedges.face.reshape(2, 1, edges, 2) + faces * np.arange(count, dtype=np.int32)[:, None, None]
+    normals = np.broadcast_to(wedges.normal.reshape(2, 1, edges, 2, 2), (2, count, edges, 2, 2))
+    copies = replace(
+        wedges,
+        edge_m=np.tile(wedges.edge_m, (count, 1)),
+        face=faces_of.reshape(-1, 2),
+        normal=normals.reshape(-1, 2, 2),
+    )
+    copy = np.repeat(np.arange(count, dtype=np.int32), len(wedge))
+    side, edge = np.divmod(np.tile(wedge, count), np.int32(edges))
+    return replace(new, wedges=copies, wedge=(side * count + copy) * np.int32(edges) + edge)

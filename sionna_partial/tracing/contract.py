@@ -1,4 +1,4 @@
-"""Every internal part of Sionna RT that `solver` leans on, and whether this version still has it.
+"""Every internal part of Sionna RT that `chain` and `solver` lean on, and whether this version still has it.
 
 Sionna RT documents its path solver, not the chain inside it. `solver` fills a `PathsBuffer` by its private fields and
 runs `ImageMethod` and `FieldCalculator` on it. Each of these parts is named here, and looked for once in each process.

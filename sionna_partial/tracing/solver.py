@@ -1,4 +1,4 @@
-"""The one place that leans on Sionna RT's internals: candidates in, verified paths out.
+"""Where Sionna RT's internals are leaned on, here and in `chain`: candidates in, verified paths out.
 
 Sionna RT's `PathSolver` is a chain of a candidate generator, `ImageMethod` and `FieldCalculator`. Here the same chain
 runs on our candidates: `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go
@@ -10,7 +10,7 @@ Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: t
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,29 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges
+from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges, in_copies_of_scene
+from sionna_partial.tracing.chain import Chain
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.sionna_rt import load_sionna, open_scene
 
 _ALIGNMENT_BYTES = 64
 """Alignment of Dr.Jit's own arrays [bytes]."""
-
-
-class _IncoherentScene:
-    """A Mitsuba scene that traces every ray for itself.
-
-    `ImageMethod` tells Embree that its rays are coherent. Neighbours in a packet then decide whether a wall is hit: one
-    path in 600 was lost, and which ones depended on the other receivers.
-    """
-
-    def __init__(self, scene: Any) -> None:
-        self._scene = scene
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._scene, name)
-
-    def ray_intersect(self, ray: Any, **options: Any) -> Any:
-        return self._scene.ray_intersect(ray, **{**options, "coherent": False})
 
 
 def _to_device(kind: Any, values: NDArray[Any]) -> Any:
@@ -77,77 +61,6 @@ class Variables:
     conductivity_s_m: tuple[Any, ...]
     thickness_m: tuple[Any, ...]
     frequency_hz: Any
-
-
-class _Chain:
-    """Sionna RT's image method and field calculator, with loops of one kind."""
-
-    def __init__(self, loop_mode: str) -> None:
-        solvers = load_sionna().path_solvers
-        self._image_method = solvers.image_method.ImageMethod()
-        self._field_calculator = solvers.field_calculator.FieldCalculator()
-        self._image_method.loop_mode = self._field_calculator.loop_mode = loop_mode
-
-    def __call__(
-        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
-    ) -> Any:
-        """Verify the candidates in a buffer, and give it back with their coefficients."""
-        buffer = self.verify(scene, buffer, source, targets, diffraction)
-        return self.evaluate(scene, buffer, source, targets, samples_per_tx, diffraction)
-
-    def verify(self, scene: Any, buffer: Any, source: Any, targets: Any, diffraction: bool) -> Any:
-        """Verify the candidates in a buffer, and give it back with their vertices."""
-        buffer = self._image_method(
-            scene=_IncoherentScene(scene.mi_scene),
-            paths=buffer,
-            src_positions=source,
-            tgt_positions=targets,
-            diffraction=diffraction,
-            diffraction_lit_region=True,
-        )
-        if diffraction:
-            _end_at_targets(buffer, targets)
-        return buffer
-
-    def evaluate(
-        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
-    ) -> Any:
-        """Give a buffer of verified candidates back with their coefficients."""
-        import drjit as dr
-        import mitsuba as mi
-
-        still = dr.zeros(mi.Point3f, dr.width(source)), dr.zeros(mi.Point3f, dr.width(targets))
-        dr.make_opaque(*still)
-        patterns = scene.tx_array.antenna_pattern.patterns
-        return self._field_calculator(
-            wavelength=scene.wavelength,
-            paths=buffer,
-            samples_per_src=samples_per_tx,
-            diffraction=diffraction,
-            src_positions=source,
-            tgt_positions=targets,
-            src_orientations=still[0],
-            tgt_orientations=still[1],
-            src_antenna_patterns=patterns,
-            tgt_antenna_patterns=patterns,
-        )
-
-
-def _end_at_targets(buffer: Any, targets: Any) -> None:
-    """Put the receiver where a path has no more interactions.
-
-    There `ImageMethod` leaves images of the edge, and `FieldCalculator` 2.2 takes the first of them for a place on the
-    way from the edge: a path with fewer interactions than others in its buffer came out longer, and some dB weaker.
-    """
-    import drjit as dr
-    import mitsuba as mi
-    from sionna.rt.constants import InteractionType
-
-    kind = buffer.interaction_types
-    target = dr.gather(mi.Point3f, targets, dr.repeat(buffer.target_indices, kind.shape[1]))
-    for name, place in zip(("_vertices_x", "_vertices_y", "_vertices_z"), target, strict=True):
-        beyond = dr.select(kind.array == InteractionType.NONE, place, getattr(buffer, name).array)
-        setattr(buffer, name, type(getattr(buffer, name))(beyond, kind.shape))
 
 
 @dataclass(frozen=True)
@@ -197,7 +110,7 @@ class SceneSolver:
         self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last stands for no face, -1
         primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
         self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
-        self._symbolic, self._evaluated = _Chain("symbolic"), _Chain("evaluated")
+        self._symbolic, self._evaluated = Chain("symbolic"), Chain("evaluated")
 
     @property
     def materials(self) -> dict[str, NDArray[np.float64]]:
@@ -354,7 +267,7 @@ class SceneSolver:
 
         faces = (len(self._shape_of_face) - 1) // count
         places = [getattr(paths.buffer, f"vertices_{axis}").numpy() for axis in "xyz"]
-        buffer = self._buffer(_repeated(candidates, np.stack(places, axis=2), faces, count))
+        buffer = self._buffer(in_copies_of_scene(candidates, np.stack(places, axis=2), faces, count))
         buffer._src_indices = _to_device(mi.UInt, np.tile(tx_index, count).astype(np.uint32))
         buffer.schedule()
         valid = mi.Bool(np.tile(paths.valid.numpy(), count))
@@ -406,7 +319,7 @@ class SceneSolver:
                 material.relative_permittivity = permittivity
                 material.conductivity, material.thickness = conductivity, thickness
 
-    def _solve(self, chain: _Chain, candidates: Candidates, source: Any, targets: Any) -> Any:
+    def _solve(self, chain: Chain, candidates: Candidates, source: Any, targets: Any) -> Any:
         """Verify candidates with one of the chains, in a buffer that keeps their order."""
         diffraction = candidates.wedges is not None
         samples = self._settings.samples_per_tx
@@ -462,33 +375,6 @@ class SceneSolver:
             n0=vectors(mi.Normal3f, *normal[:, 0].T, flat),
             nn=vectors(mi.Normal3f, *normal[:, 1].T, flat),
         )
-
-
-def _repeated(candidates: Candidates, vertices_m: NDArray[Any], faces: int, count: int) -> Candidates:
-    """Repeat candidates for each copy of a scene with so many faces, with their verified vertices."""
-    shift = faces * np.repeat(np.arange(count, dtype=np.int32), len(candidates.rx))
-    face = np.tile(candidates.face, (count, 1))
-    new = replace(
-        candidates,
-        rx=np.tile(candidates.rx, count),
-        face=np.where(face >= 0, face + shift[:, None], face),
-        vertices_m=np.tile(vertices_m, (count, 1, 1)),
-    )
-    wedges, wedge = candidates.wedges, candidates.wedge
-    if wedges is None or wedge is None:
-        return new
-    edges = len(wedges.edge_m)
-    faces_of = wedges.face.reshape(2, 1, edges, 2) + faces * np.arange(count, dtype=np.int32)[:, None, None]
-    normals = np.broadcast_to(wedges.normal.reshape(2, 1, edges, 2, 2), (2, count, edges, 2, 2))
-    copies = replace(
-        wedges,
-        edge_m=np.tile(wedges.edge_m, (count, 1)),
-        face=faces_of.reshape(-1, 2),
-        normal=normals.reshape(-1, 2, 2),
-    )
-    copy = np.repeat(np.arange(count, dtype=np.int32), len(wedge))
-    side, edge = np.divmod(np.tile(wedge, count), np.int32(edges))
-    return replace(new, wedges=copies, wedge=(side * count + copy) * np.int32(edges) + edge)
 
 
 def _points(places_m: NDArray[np.float64]) -> Any:
