@@ -148,7 +148,7 @@ class TestEffort:
         for name in ("starts", "climbs", "steps"):
             counts = [getattr(effort, name) for effort in efforts]
             assert counts == sorted(counts)
-        assert efforts[0] == Effort(2, 1, 1)
+        assert efforts[0] == Effort(6, 1, 1)
         assert efforts[-1] == Effort(16, 4, 4)
 
     def test_is_a_tenth_of_an_exhaustive_search_or_less(self) -> None:
