@@ -214,6 +214,14 @@ def require_coverage(coverage: xr.Dataset) -> None:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
 
 
+def clear_of_walls(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether receivers can stand at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
+    clear: NDArray[np.bool_] = partial.state_at(points_m) != CellState.WALL
+    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
+        clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
+    return clear
+
+
 def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
     with suppress(ValueError):
         if np.shape(tx) == (2,):
@@ -253,9 +261,7 @@ def _receivers(
     limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
     far = np.linalg.norm(points - tx_m, axis=-1) >= limit_m
-    valid = far & (cell_state != CellState.WALL)
-    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
-        valid &= partial.state_at(points[..., :2] + corner) != CellState.WALL
+    valid = far & clear_of_walls(partial, points)
     if not valid.any():
         raise _no_receiver(spacing_m, frequency_hz, limit_m, near=not far.any())
     return _Receivers(x_m, y_m, cell_state, valid, points[valid])

@@ -32,6 +32,7 @@ MODULES = (
     *("learning.unobserved", "learning.link_context", "learning.features", "learning.windows"),
     *("learning.networks", "learning.fitting", "learning.context_networks", "learning.context_fitting"),
     *("learning.predictor_files", "learning.predictor"),
+    "coverage",
     *(
         "inverse.smooth_lengths",
         "inverse.link_distribution",
@@ -43,7 +44,7 @@ MODULES = (
     *("inverse.measured_building", "inverse.calibration"),
     *("inverse.placement_area", "inverse.placement_objective", "inverse.placement_climb"),
     *("inverse.placement_state", "inverse.placement_views", "inverse.placement"),
-    *("coverage", "plots.figures", "plots.coverage_plot", "plots.exploration_plot", "plots.reliability_plot"),
+    *("plots.figures", "plots.coverage_plot", "plots.exploration_plot", "plots.reliability_plot"),
     *("plots.material_plot", "plots.placement_plot"),
     *("export", "demo", "info"),
     *("training.home_sources", "training.home_links", "training.shards", "training.home_process", "training.dataset"),

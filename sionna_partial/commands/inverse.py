@@ -7,10 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sionna_partial.commands.shell import (
+    CheckpointOption,
     FrequencyOption,
     HeightBandOption,
     MapArgument,
     MaterialOption,
+    MaxDepthOption,
+    PredictorOption,
     StrictOption,
     UpOption,
     parse_material,
@@ -42,10 +45,8 @@ def calibrate(
     ],
     material: MaterialOption = "",
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
-    max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
-    checkpoint: Annotated[
-        Path | None, typer.Option(metavar="JSON", help="Keeps what has been found: a stopped run goes on from there.")
-    ] = None,
+    max_depth: MaxDepthOption = 6,
+    checkpoint: CheckpointOption = None,
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
@@ -106,11 +107,9 @@ def place(
     seed: Annotated[int, typer.Option(help="Seed of the places that are compared.")] = 0,
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
-    max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
-    predictor: Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")] = "",
-    checkpoint: Annotated[
-        Path | None, typer.Option(metavar="JSON", help="Keeps what has been found: a stopped run goes on from there.")
-    ] = None,
+    max_depth: MaxDepthOption = 6,
+    predictor: PredictorOption = "",
+    checkpoint: CheckpointOption = None,
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,

@@ -10,6 +10,8 @@ from sionna_partial.commands.shell import (
     HeightBandOption,
     MapArgument,
     MaterialOption,
+    MaxDepthOption,
+    PredictorOption,
     StrictOption,
     UpOption,
     parse_material,
@@ -38,8 +40,8 @@ def predict(
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
-    max_depth: Annotated[int, typer.Option(help="Largest number of interactions on a path.")] = 6,
-    predictor: Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")] = "",
+    max_depth: MaxDepthOption = 6,
+    predictor: PredictorOption = "",
     receivers: Annotated[
         str, typer.Option(metavar="indoor|anywhere", help="Given that receivers are indoors, or outside in outage.")
     ] = "indoor",

@@ -33,6 +33,11 @@ MaterialOption = Annotated[
     str, typer.Option(help="ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall.")
 ]
 FrequencyOption = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
+MaxDepthOption = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
+PredictorOption = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
+CheckpointOption = Annotated[
+    Path | None, typer.Option(metavar="JSON", help="Keeps what has been found: a stopped run goes on from there.")
+]
 
 
 LINE_S = 60.0

@@ -21,7 +21,7 @@ from sionna_partial.learning.link_context import path_unobserved_m
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.fixed_paths import PATHS_PER_BLOCK, PathScene
 from sionna_partial.tracing.generator import write_scene_of
-from sionna_partial.tracing.solver import SceneSolver, Variables, VerifiedPaths
+from sionna_partial.tracing.solver import SceneSolver, Variables, VerifiedPaths, forward_passes
 from sionna_partial.tracing.trace import Progress
 
 KEPT_SHARE = 0.96
@@ -130,11 +130,7 @@ class MaterialPaths:
             leaves, variables = self._variables(permittivity, conductivity_s_m)
             dr.enable_grad(leaves)
             power = self.scene.solver.power(paths, variables)
-            columns = []
-            for leaf in leaves:
-                dr.clear_grad(power)
-                dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next parameter
-                columns.append(dr.grad(power).numpy().astype(np.float64))
+            columns = [slope.numpy().astype(np.float64) for slope in forward_passes(power, leaves)]
             slopes.append(np.stack(columns, axis=1))
             powers.append(dr.detach(power).numpy().astype(np.float64))
         return np.concatenate(powers), np.concatenate(slopes)

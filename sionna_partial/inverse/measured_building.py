@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sionna_partial.errors import MeasurementError
 from sionna_partial.inverse.material_paths import MaterialPaths, find_material_paths
 from sionna_partial.inverse.measurements import Measurements
+from sionna_partial.learning.link_context import SEEN_M
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.fixed_paths import PathScene
@@ -20,9 +21,6 @@ FEWEST_LINKS = 10
 
 SURE_SHARE = 0.5
 """Smallest share of a link's power on paths that run wholly through observed space, for a link that is used."""
-
-SEEN_M = 1e-3
-"""Unobserved length below which a path is wholly in observed space [m]."""
 
 OUTAGE = "measured outage"
 """Reason why a link is left out before anything is traced."""

@@ -1,6 +1,5 @@
 """Where a transmitter may stand, and where it shall be heard: PartialMap -> PlacementArea."""
 
-import itertools
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -10,12 +9,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.coverage import clear_of_walls
 from sionna_partial.errors import PositionError
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.learning.unobserved import unobserved_lengths_m, walled_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.tracing.trace import SHORTEST_M
 
 CLEARANCE_M = 0.1
 """How near a transmitter may come to a known wall [m], at most a tenth more by the size of cells."""
@@ -191,10 +190,7 @@ def _receivers(partial: PartialMap, rx_height_m: float) -> tuple[NDArray[np.floa
         np.arange(y0 + spacing_m / 2, y1, spacing_m),
     )
     points_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, float(rx_height_m))])
-    valid = partial.state_at(points_m) != CellState.WALL
-    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
-        valid &= partial.state_at(points_m[:, :2] + corner) != CellState.WALL
-    return points_m[valid], spacing_m
+    return points_m[clear_of_walls(partial, points_m)], spacing_m
 
 
 def _weights(area: PlacementArea, model: Predictor | None) -> NDArray[np.float64]:

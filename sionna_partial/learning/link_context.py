@@ -17,7 +17,7 @@ from sionna_partial.tracing.trace import TracedLinks, path_gain_db
 REACHES_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """How far paths are taken to get through unobserved space [m]: a path that crosses u of it counts exp(-u / reach)."""
 
-_SEEN_M = 1e-3
+SEEN_M = 1e-3
 """Unobserved length below which a path is wholly in observed space [m]."""
 
 
@@ -192,7 +192,7 @@ def path_unobserved_m(
 
 def kept_shares(unobserved_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
     """Return the share (P,) of the power of paths that gets through the unobserved space that they cross [m]."""
-    return np.exp(-unobserved_m / reach_m) if reach_m > 0.0 else (unobserved_m < _SEEN_M).astype(np.float64)
+    return np.exp(-unobserved_m / reach_m) if reach_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
 
 
 def _gain_db(link: NDArray[np.int64], power: NDArray[np.float64], links: int) -> NDArray[np.float64]:

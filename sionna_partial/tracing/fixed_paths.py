@@ -22,7 +22,7 @@ from sionna_partial.tracing.contract import contract_remedy
 from sionna_partial.tracing.generator import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.probe import fast_engine_works
-from sionna_partial.tracing.solver import SceneSolver, Variables
+from sionna_partial.tracing.solver import SceneSolver, Variables, forward_passes
 from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
@@ -321,10 +321,8 @@ class FixedPaths:
             power, vertices_m = self._moved(candidates, variables)
             results = power, vertices_m + dr.opaque(type(power), 0.0)  # power is made of them: theirs would be cleared
             for name in names:
-                for entry, leaf in enumerate(leaves[name]):
-                    dr.clear_grad(results)
-                    dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next parameter
-                    yield block, name, entry, *dr.grad(results)
+                for entry, slopes in enumerate(forward_passes(results, leaves[name])):
+                    yield block, name, entry, *slopes
 
     def _moved(self, candidates: Candidates, variables: Variables, *, differentiable: bool = True) -> tuple[Any, Any]:
         tx_m, rx_m = self.base.tx_m - self._scene.shift_m, self.rx_m - self._scene.shift_m

@@ -8,7 +8,7 @@ internal part that is used.
 Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a chain of each kind.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -375,6 +375,16 @@ class SceneSolver:
             n0=vectors(mi.Normal3f, *normal[:, 0].T, flat),
             nn=vectors(mi.Normal3f, *normal[:, 1].T, flat),
         )
+
+
+def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
+    """Yield the derivatives of results with respect to one variable after the other."""
+    import drjit as dr
+
+    for leaf in leaves:
+        dr.clear_grad(results)
+        dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next variable
+        yield dr.grad(results)
 
 
 def _points(places_m: NDArray[np.float64]) -> Any:
