@@ -237,7 +237,7 @@ class TraceSettings:
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """Errors of the exploring robot; without them all that it maps is true.
+    """What the exploring robot sees in one look, and its errors; without them all that it maps is true.
 
     Parameters
     ----------
@@ -250,6 +250,11 @@ class SensorSettings:
     missed_wall_share : float
         Share of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces.
         Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
+    field_of_view_deg : float
+        Horizontal angle [degree], in (0, 360], around where the robot is heading. The default is the camera of Active
+        Neural SLAM (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
+    range_m : float
+        How far it sees [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
 
     Raises
     ------
@@ -260,10 +265,19 @@ class SensorSettings:
     range_noise_m: float = 0.0
     drift_m_per_m: float = 0.0
     missed_wall_share: float = 0.0
+    field_of_view_deg: float = 90.0
+    range_m: float = 3.2
 
     def __post_init__(self) -> None:
         for name in ("range_noise_m", "drift_m_per_m", "missed_wall_share"):
             require_number(name, getattr(self, name), 0.0, 1.0)
+        require_number("field_of_view_deg", self.field_of_view_deg, 0.0, 360.0, open_low=True)
+        require_number("range_m", self.range_m, 0.0, 100.0, open_low=True)
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it makes no errors."""
+        return self.range_noise_m == self.drift_m_per_m == self.missed_wall_share == 0.0
 
 
 @dataclass(frozen=True)
@@ -286,6 +300,8 @@ class DatasetSettings:
         Heights of transmitters and receivers above the map's z = 0 [m].
     margin_m : float
         How far the map area reaches beyond the known cells of the complete home [m]. Maps are cut and extended to it.
+    sensor : SensorSettings
+        What the exploring robot sees, and its errors.
     scene : SceneSettings
         How maps become scenes.
     trace : TraceSettings
@@ -304,6 +320,7 @@ class DatasetSettings:
     tx_height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
     margin_m: float = 3.0
+    sensor: SensorSettings = field(default_factory=SensorSettings)
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
 
@@ -323,6 +340,7 @@ class DatasetSettings:
         for name in ("tx_height_m", "rx_height_m"):
             require_number(name, getattr(self, name), 0.0, 1000.0, open_low=True)
         require_number("margin_m", self.margin_m, 0.0, 1000.0)
+        require(isinstance(self.sensor, SensorSettings), "sensor", self.sensor, "give SensorSettings(...).")
         require(isinstance(self.scene, SceneSettings), "scene", self.scene, "give SceneSettings(...).")
         require(isinstance(self.trace, TraceSettings), "trace", self.trace, "give TraceSettings(...).")
         self.scene.material.require_frequency(self.trace.frequency_hz)
@@ -365,7 +383,7 @@ class PredictorSettings:
     networks: NetworkKind = "paper"
     frequency_hz: float = CARRIER_FREQUENCY_HZ
     diffraction: bool = True
-    passes: int = 13
+    passes: int = 26
     steps: int = 4000
     batch_size: int = 1024
     learning_rate: float = 0.01

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.camera import CAMERA_RANGE_M, FIELD_OF_VIEW_DEG, MISSED_PATCH_M, Camera, view_corners_m
+from sionna_partial.maps.camera import MISSED_PATCH_M, Camera, view_corners_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
 
@@ -68,18 +68,28 @@ def test_a_ray_straight_through_the_corner_of_two_walls_is_stopped(heading_deg, 
 
 
 @pytest.mark.parametrize("heading_deg", [0, 40, 90, 230])
-def test_cells_are_seen_just_as_far_and_wide_as_the_camera_reaches(heading_deg):
-    eye, middle = camera(np.zeros((121, 121), dtype=np.uint8)), 60.5
+@pytest.mark.parametrize("sensor", [EXACT, SensorSettings(field_of_view_deg=30.0, range_m=5.0)])
+def test_cells_are_seen_just_as_far_and_wide_as_the_camera_reaches(heading_deg, sensor):
+    eye, middle = camera(np.zeros((121, 121), dtype=np.uint8), sensor), 60.5
     eye.look(middle, middle, heading_deg, (0.0, 0.0), NOWHERE)
     rows, columns = np.indices(eye.seen.shape) + 0.5
     distance = np.hypot(rows - middle, columns - middle)
     bearing = np.degrees(np.arctan2(rows - middle, columns - middle)) - heading_deg
     off_axis_deg = np.abs((bearing + 180) % 360 - 180)
-    slack_deg = np.degrees(np.arcsin(0.75 / np.maximum(distance, 0.75)))
-    reach, half_deg = CAMERA_RANGE_M / 0.1, FIELD_OF_VIEW_DEG / 2
+    slack_deg = np.where(distance < 0.75, 180.0, np.degrees(np.arcsin(0.75 / np.maximum(distance, 0.75))))
+    reach, half_deg = sensor.range_m / 0.1, sensor.field_of_view_deg / 2
     seen = eye.seen == CellState.FREE
     assert seen[(distance < reach - 1) & (off_axis_deg < half_deg - slack_deg)].all()
     assert not seen[(distance > reach + 1) | (off_axis_deg > half_deg + slack_deg)].any()
+
+
+def test_a_lidar_sees_all_around():
+    eye, middle = camera(np.zeros((121, 121), dtype=np.uint8), SensorSettings(field_of_view_deg=360.0)), 60.5
+    eye.look(middle, middle, 0.0, (0.0, 0.0), NOWHERE)
+    distance = np.hypot(*(np.indices(eye.seen.shape) + 0.5 - middle))
+    seen = eye.seen == CellState.FREE
+    assert seen[distance < EXACT.range_m / 0.1 - 1].all()
+    assert not seen[distance > EXACT.range_m / 0.1 + 1].any()
 
 
 def test_a_wall_ends_the_view():
@@ -148,16 +158,16 @@ def test_where_the_robot_stands_is_free_whatever_was_seen():
 class TestViewCorners:
     def test_open_space_shows_a_quarter_of_a_disc(self):
         home = PartialMap(np.zeros((100, 100), dtype=np.uint8), 0.1, (5.0, -3.0))
-        corners = view_corners_m(home, np.array([10.0, 2.0, 30.0]))
+        corners = view_corners_m(home, np.array([10.0, 2.0, 30.0]), EXACT)
         assert corners[0].tolist() == [10.0, 2.0]
         away = corners[1:] - corners[0]
-        assert np.hypot(*away.T) == pytest.approx(CAMERA_RANGE_M)
+        assert np.hypot(*away.T) == pytest.approx(EXACT.range_m)
         bearing = np.degrees(np.arctan2(away[:, 1], away[:, 0]))
         assert (bearing.min(), bearing.max()) == pytest.approx((-15.0, 75.0))
 
     def test_it_ends_in_the_wall(self):
         home = PartialMap(corridor()[1:-1, 1:-1], 0.1)
-        corners = view_corners_m(home, np.array([0.25, 0.25, 0.0]))
+        corners = view_corners_m(home, np.array([0.25, 0.25, 0.0]), EXACT)
         assert corners[:, 0].max() == pytest.approx(2.05, abs=0.05 + 1e-9)
         assert (corners[:, 1].min(), corners[:, 1].max()) == pytest.approx((0.05, 0.45), abs=0.05 + 1e-9)
         assert math.isclose(corners[len(corners) // 2, 0], 2.05, abs_tol=0.06)

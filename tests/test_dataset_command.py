@@ -10,7 +10,7 @@ from typer.testing import CliRunner, Result
 from sionna_partial import cli
 from sionna_partial.commands.shell import rate_and_rest, show_rate
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.settings import DatasetSettings, Material
+from sionna_partial.settings import DatasetSettings, Material, SensorSettings
 from sionna_partial.training.dataset import DatasetReport
 
 pytestmark = pytest.mark.usefixtures("command_line")
@@ -55,6 +55,10 @@ class TestDataset:
             0,
             "--seed",
             3,
+            "--field-of-view",
+            360,
+            "--range",
+            8,
             "--material",
             "concrete",
         )
@@ -64,6 +68,7 @@ class TestDataset:
         _, homes, passed, options = calls[0]
         assert homes == [7, 8]
         assert (passed.links_per_home, passed.transmitters_per_home, passed.stages, passed.seed) == (20, 2, (0, 50), 3)
+        assert passed.sensor == SensorSettings(field_of_view_deg=360.0, range_m=8.0)
         assert passed.scene.material == Material(itu="concrete")
         assert options == {"scheduler": "tcp://host:8786", "workers": 3, "home_time_limit_s": 60.0}
 

@@ -1,5 +1,6 @@
 import json
 import re
+from dataclasses import replace
 
 import pytest
 from link_tables import make_dataset, make_table
@@ -7,6 +8,13 @@ from link_tables import make_dataset, make_table
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
+
+_AT = (("one", 28e9), ("two", 60e9))
+
+
+def new_folder(path):
+    path.mkdir()
+    return path
 
 
 class TestOpenLinks:
@@ -27,10 +35,39 @@ class TestOpenLinks:
             with pytest.raises(PredictorError, match="dataset has no links with receivers drawn indoors: build one"):
                 open_links(part)
 
-    def test_something_else(self):
-        message = "dataset is of type int: give a LinkTable, or a folder that `sionna-partial dataset` wrote."
+    def test_homes_explored_anew_in_each_of_several_folders(self, tmp_path):
+        table = make_table(homes=2)
+        folders = [make_dataset(new_folder(tmp_path / name), table) for name in ("one", "two")]
+        links, traces = open_links(folders)
+        assert len(links) == 2 * len(table)
+        assert set(links.home) == set(table.home)
+        assert traces == open_links(folders[0])[1]
+
+    def test_folders_traced_differently(self, tmp_path):
+        folders = [make_dataset(new_folder(tmp_path / name), make_table(homes=1), frequency_hz=hz) for name, hz in _AT]
+        message = (
+            f"'{folders[1]}' was traced at 60 GHz with diffraction, '{folders[0]}' at 28 GHz with diffraction: give"
+        )
         with pytest.raises(PredictorError, match=re.escape(message)):
-            open_links(3)
+            open_links(folders)
+
+    def test_another_home_of_the_same_name(self, tmp_path):
+        table = make_table(homes=1)
+        ((name, home),) = table.complete_maps.items()
+        other = replace(table, complete_maps={name: replace(home, origin_m=(1.0, 2.0))})
+        folders = [make_dataset(new_folder(tmp_path / place), each) for place, each in (("one", table), ("two", other))]
+        message = f"'{folders[1]}' has another home {name!r} than those before: give one of the two."
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            open_links(folders)
+
+    @pytest.mark.parametrize("dataset", [3, [], [3]])
+    def test_something_else(self, dataset):
+        message = (
+            f"dataset = {dataset!r} is not allowed: give a LinkTable, or one or more folders that "
+            "`sionna-partial dataset` wrote."
+        )
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            open_links(dataset)
 
     def test_no_data_set_there(self, tmp_path):
         with pytest.raises(PredictorError, match="is no data set"):

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ from scipy.spatial.distance import pdist
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.camera import CAMERA_RANGE_M
 from sionna_partial.maps.explore import Exploration, explore, explore_trajectory
 from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.map_files import load_map
@@ -106,8 +106,8 @@ def test_one_step_sees_a_quarter_of_a_disc():
         (partial,) = explore(hall, (1,), seed)
         rows, columns = np.nonzero(partial.state == CellState.FREE)
         spread_m = pdist(np.stack([rows, columns], axis=1)).max() * 0.05
-        assert spread_m <= math.sqrt(2) * (CAMERA_RANGE_M + FORWARD_M) + 0.2
-        assert len(rows) * 0.05**2 <= math.pi / 4 * CAMERA_RANGE_M**2 * 1.4
+        assert spread_m <= math.sqrt(2) * (SensorSettings.range_m + FORWARD_M) + 0.2
+        assert len(rows) * 0.05**2 <= math.pi / 4 * SensorSettings.range_m**2 * 1.4
 
 
 def test_view_has_no_gaps():
@@ -308,6 +308,18 @@ class TestSensor:
         for seed in range(4):
             maps = explore(plan(CLOSET), (50, 300), seed, sensor=SensorSettings(1.0, 1.0, 0.5))
             assert [partial.shape for partial in maps] == [(11, 18)] * 2
+
+    def test_a_wider_and_a_longer_view_show_more(self, home):
+        lidar = SensorSettings(field_of_view_deg=360.0)
+        start = explore_trajectory(home, (1,), 3, sensor=lidar)
+        assert start.sensor == lidar
+        narrow, wide, far = (
+            explore(home, (1,), 3, sensor=sensor)[0].state == CellState.FREE
+            for sensor in (None, lidar, replace(lidar, range_m=6.0))
+        )
+        assert narrow.sum() < 0.6 * wide.sum() < 0.6 * far.sum()
+        ways_m = np.hypot(*(np.argwhere(far)[:, ::-1] * home.resolution_m + home.origin_m - start.poses[0, :2]).T)
+        assert 3.2 < ways_m.max() < 6.0 + FORWARD_M + 0.1
 
     def test_sensor_must_be_settings(self):
         with pytest.raises(

@@ -13,7 +13,7 @@ from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.learning.features import link_features
 from sionna_partial.maps.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import DatasetSettings, TraceSettings
+from sionna_partial.settings import DatasetSettings, SensorSettings, TraceSettings
 from sionna_partial.tracing.trace import trace_links
 from sionna_partial.training import home_links as module
 from sionna_partial.training.home_links import NEAREST_M, home_links, map_area
@@ -175,6 +175,12 @@ class TestSeeds:
     ) -> None:
         settings, name = change(replace(SETTINGS, stages=(0,)))
         assert not np.isin(home_links(home, name, settings).context.rx_m[:, 0], table.context.rx_m[:, 0]).any()
+
+    def test_sensor_is_that_of_the_settings(self, home: PartialMap, table: LinkTable) -> None:
+        sensor = SensorSettings(field_of_view_deg=360.0, range_m=20.0)
+        far = home_links(home, "two rooms", replace(SETTINGS, sensor=sensor))
+        assert (far.observed_fraction >= table.observed_fraction).all()
+        assert (far.observed_fraction > table.observed_fraction).any()
 
     def test_size_of_the_grid_is_of_no_account(self, table: LinkTable) -> None:
         moved = two_rooms((200, 300), (120, 44))

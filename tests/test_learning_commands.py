@@ -112,7 +112,7 @@ class TestEvaluate:
 
         monkeypatch.setattr("sionna_partial.training.evaluate.evaluate", evaluate)
         run("evaluate", dataset, "--out", tmp_path / "report")
-        assert seen == ["map", dataset]
+        assert seen == ["map", [dataset]]
 
     def test_unknown_predictor(self, dataset: Path, tmp_path: Path) -> None:
         result = run("evaluate", dataset, "--predictor", "nobody", "--out", tmp_path / "report")

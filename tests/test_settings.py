@@ -76,6 +76,8 @@ RANGES = {
     (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "drift_m_per_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "missed_wall_share"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "field_of_view_deg"): ("(0, 360]", (1e-9, 90, 360.0), (0, -0.1, 360.1)),
+    (SensorSettings, "range_m"): ("(0, 100]", (1e-9, 3.2, 100), (0, -0.1, 100.1)),
     (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28, 1e12), (0, -28e9, 28, 1.1e12)),
     (TraceSettings, "max_depth"): ("[0, 10]", (0, 10), (-1, 11)),
     (TraceSettings, "diffraction_walls"): ("[0, 2]", (0, 2), (-1, 3)),
@@ -211,7 +213,7 @@ class TestDatasetSettings:
         settings = DatasetSettings()
         assert (settings.links_per_home, settings.stages) == (400, (0, 50, 100, 150, 200))
         assert (settings.tx_height_m, settings.rx_height_m) == (1.5, 1.5)
-        assert (settings.scene, settings.trace) == (SceneSettings(), TraceSettings())
+        assert (settings.sensor, settings.scene, settings.trace) == (SensorSettings(), SceneSettings(), TraceSettings())
 
     @pytest.mark.parametrize(
         ("name", "value", "remedy"),
@@ -230,6 +232,7 @@ class TestDatasetSettings:
             ("tx_height_m", 0.0, "give a number in (0, 1000]."),
             ("rx_height_m", math.nan, "give a number in (0, 1000]."),
             ("margin_m", -0.1, "give a number in [0, 1000]."),
+            ("sensor", TraceSettings(), "give SensorSettings(...)."),
             ("scene", None, "give SceneSettings(...)."),
             ("trace", SceneSettings(), "give TraceSettings(...)."),
         ],

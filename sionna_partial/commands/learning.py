@@ -1,13 +1,16 @@
 """Subcommands of learning: dataset, train, evaluate."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from sionna_partial.commands.shell import (
+    FieldOfViewOption,
     FrequencyOption,
     MaterialOption,
+    RangeOption,
     parse_material,
     print_files,
     show_progress,
@@ -15,10 +18,22 @@ from sionna_partial.commands.shell import (
 )
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.files import require_writable
-from sionna_partial.settings import DatasetSettings, NetworkKind, PredictorSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import (
+    DatasetSettings,
+    NetworkKind,
+    PredictorSettings,
+    SceneSettings,
+    SensorSettings,
+    TraceSettings,
+)
 
-DatasetArgument = Annotated[
-    Path, typer.Argument(metavar="DATASET", help="Folder that `dataset` wrote.", show_default=False)
+DatasetsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="DATASET...",
+        help="Folder that `dataset` wrote, or several; homes may be in more than one.",
+        show_default=False,
+    ),
 ]
 
 
@@ -47,6 +62,8 @@ def dataset(
         DatasetSettings.stages
     ),
     seed: Annotated[int, typer.Option(help="Seed of places and robots.")] = DatasetSettings.seed,
+    field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
+    range_m: RangeOption = SensorSettings.range_m,
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     workers: Annotated[
@@ -69,6 +86,7 @@ def dataset(
         transmitters_per_home=transmitters,
         stages=tuple(sorted(set(stages))),
         seed=seed,
+        sensor=SensorSettings(field_of_view_deg=field_of_view, range_m=range_m),
         scene=SceneSettings(material=parse_material(material)),
         trace=TraceSettings(frequency_hz=frequency),
     )
@@ -90,7 +108,7 @@ def dataset(
 
 
 def train(
-    folder: DatasetArgument,
+    folders: DatasetsArgument,
     out: Annotated[Path, typer.Option(metavar="RUN", help="Folder for predictor and baselines.", show_default=False)],
     test_share: Annotated[float, typer.Option(help="Share of the homes that is kept for testing.")] = 0.3,
     networks: Annotated[
@@ -115,7 +133,7 @@ def train(
         from sionna_partial.training.train import PREDICTOR_FILE
         from sionna_partial.training.train import train as train_predictor
 
-        links, traces = open_links(folder)
+        links, traces = open_links(folders)
         settings = settings_for(traces, networks=networks, passes=passes, seed=seed)
         run = train_predictor(links, test_share=test_share, settings=settings, progress=report)
         files = run.save(out)
@@ -123,12 +141,13 @@ def train(
     print_files(files)
     if run.evaluation:
         typer.echo(
-            f"all figures of merit: sionna-partial evaluate {folder} --predictor {out / PREDICTOR_FILE} --out REPORT"
+            f"all figures of merit: sionna-partial evaluate {shlex.join(map(str, folders))} "
+            f"--predictor {out / PREDICTOR_FILE} --out REPORT"
         )
 
 
 def evaluate(
-    folder: DatasetArgument,
+    folders: DatasetsArgument,
     out: Annotated[Path, typer.Option(metavar="REPORT", help="Folder for the report.", show_default=False)],
     predictor: Annotated[str, typer.Option(metavar="NAME|FILE", help="'map', 'paper', or a .keras file.")] = "map",
 ) -> None:
@@ -143,7 +162,7 @@ def evaluate(
         from sionna_partial.training.evaluate import evaluate as evaluate_predictor
         from sionna_partial.training.report import save_report, summary
 
-        result = evaluate_predictor(predictor, folder, progress=report)
+        result = evaluate_predictor(predictor, folders, progress=report)
         files = save_report(result, out)
     typer.echo(summary(result))
     print_files(files)

@@ -6,12 +6,14 @@ from typing import Annotated
 import typer
 
 from sionna_partial.commands.shell import (
+    FieldOfViewOption,
     FrequencyOption,
     HeightBandOption,
     MapArgument,
     MaterialOption,
     MaxDepthOption,
     PredictorOption,
+    RangeOption,
     StrictOption,
     UpOption,
     parse_material,
@@ -108,6 +110,8 @@ def explore(
     home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
     steps: Annotated[list[int], typer.Option(help="Robot steps, such as --steps 9 --steps 99.")] = [50, 100, 150, 200],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of the robot, and of the home that is made.")] = 0,
+    field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
+    range_m: RangeOption = SensorSettings.range_m,
     range_noise: Annotated[float, typer.Option(help="Standard deviation of the camera's ranges [m].")] = 0.0,
     drift: Annotated[float, typer.Option(help="Growth of the robot's error of position [m per m of way].")] = 0.0,
     missed_walls: Annotated[float, typer.Option(help="Share of walls that the camera misses, as glass [1].")] = 0.0,
@@ -118,7 +122,7 @@ def explore(
 
     The folder --out gets the partial maps, the complete one, a picture and an animation.
     """
-    sensor = SensorSettings(range_noise, drift, missed_walls)
+    sensor = SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
     require_writable(out)
     with show_progress() as report:
         report(0.0, "reading the home" if home else "making a home")

@@ -32,6 +32,8 @@ UpOption = Annotated[
 MaterialOption = Annotated[
     str, typer.Option(help="ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall.")
 ]
+FieldOfViewOption = Annotated[float, typer.Option(help="Angle that the robot sees at once, up to 360 [degree].")]
+RangeOption = Annotated[float, typer.Option("--range", help="How far it sees [m].")]
 FrequencyOption = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
 MaxDepthOption = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
 PredictorOption = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]

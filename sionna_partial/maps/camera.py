@@ -10,12 +10,6 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
 
-FIELD_OF_VIEW_DEG = 90
-"""Horizontal field of view of the camera [degree] (Active Neural SLAM, Section 4)."""
-
-CAMERA_RANGE_M = 3.2
-"""Range of the camera [m] (the 64 cells of 0.05 m that Active Neural SLAM's mapper predicts ahead)."""
-
 MISSED_PATCH_M = 0.5
 """Edge of the squares [m] whose walls are missed together, as a pane or a mirror is."""
 
@@ -56,7 +50,8 @@ class Camera:
     ) -> None:
         self._truth = np.ascontiguousarray(truth)
         self._missed = _missed_walls(truth, resolution_m, sensor.missed_wall_share, rng)
-        self._reach = CAMERA_RANGE_M / resolution_m
+        self._reach = sensor.range_m / resolution_m
+        self._view_deg = sensor.field_of_view_deg
         self._noise = sensor.range_noise_m / resolution_m
         self._rng = rng
         self._log_odds = np.zeros(truth.shape)
@@ -76,7 +71,7 @@ class Camera:
         under : (N, 2) int array
             Cells that it believes to stand on, which therefore are free: row and column.
         """
-        angles = _ray_angles(heading_deg, self._reach)
+        angles = _ray_angles(heading_deg, self._view_deg, self._reach)
         noise = self._noise * self._rng.standard_normal(len(angles))
         view = np.full_like(self._truth, _UNKNOWN)
         _cast_rays(self._truth, self._missed, view, (x, y), shift, angles, noise, self._reach)
@@ -88,7 +83,7 @@ class Camera:
         self.seen[known] = np.where(self._log_odds[known] > 0, _WALL, _FREE)
 
 
-def view_corners_m(home: PartialMap, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
     """Outline what the camera has in view: as far as it reaches, and no farther than the first wall.
 
     Parameters
@@ -96,6 +91,7 @@ def view_corners_m(home: PartialMap, pose: NDArray[np.float64]) -> NDArray[np.fl
     home : PartialMap
     pose : (3,) array
         World x, y [m], and heading from x towards y [degree].
+    sensor : SensorSettings
 
     Returns
     -------
@@ -103,18 +99,18 @@ def view_corners_m(home: PartialMap, pose: NDArray[np.float64]) -> NDArray[np.fl
         World x and y of the corners of a polygon [m], the first of them the camera.
     """
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
-    reach = CAMERA_RANGE_M / home.resolution_m
+    reach = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
-    angles = _ray_angles(float(pose[2]), reach)
+    angles = _ray_angles(float(pose[2]), sensor.field_of_view_deg, reach)
     ranges_m = _ranges(truth, float(x), float(y), angles, reach) * home.resolution_m
     ends = pose[:2] + ranges_m[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.concatenate([pose[None, :2], ends])
 
 
-def _ray_angles(heading_deg: float, reach: float) -> NDArray[np.float64]:
+def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> NDArray[np.float64]:
     """Directions of the rays [radian], at most half a cell apart where they end."""
-    rays = int(2 * math.radians(FIELD_OF_VIEW_DEG) * reach) + 2
-    return math.radians(heading_deg) + math.radians(FIELD_OF_VIEW_DEG) * (np.arange(rays) / (rays - 1) - 0.5)
+    rays = int(2 * math.radians(view_deg) * reach) + 2
+    return math.radians(heading_deg) + math.radians(view_deg) * (np.arange(rays) / (rays - 1) - 0.5)
 
 
 def _missed_walls(

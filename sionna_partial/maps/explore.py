@@ -30,6 +30,8 @@ class Exploration:
     ----------
     home : PartialMap
         What there was to be seen.
+    sensor : SensorSettings
+        What it was seen with.
     steps : (M,) tuple of int
         Numbers of actions [1], increasing.
     states : (M, ny, nx) uint8 array of CellState
@@ -42,6 +44,7 @@ class Exploration:
     """
 
     home: PartialMap
+    sensor: SensorSettings
     steps: tuple[int, ...]
     states: NDArray[np.uint8]
     poses: NDArray[np.float64]
@@ -107,7 +110,7 @@ def explore(
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
-        Errors of the robot's sensors; None is none.
+        What the robot sees in one look, and its errors; None is the defaults, without errors.
 
     Returns
     -------
@@ -159,7 +162,7 @@ def explore_trajectory(
     require_map("home", home)
     if not (home.state == _FREE).any():
         raise MapError("home has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
-    around = 1 if sensor == SensorSettings() else 1 + math.ceil(_MARGIN_M / home.resolution_m)
+    around = 1 if sensor.is_exact else 1 + math.ceil(_MARGIN_M / home.resolution_m)
     padded = np.pad(home.state, around, constant_values=_UNKNOWN)
     free = np.argwhere(padded == _FREE)
     (row0, column0), (row1, column1) = free.min(axis=0) - around, free.max(axis=0) + around + 1
@@ -179,7 +182,7 @@ def explore_trajectory(
         if progress and (done % _REPORT_STEPS == 0 or done == counts[-1]):
             progress(done / max(1, counts[-1]), f"exploring: step {done}")
     was, believed = np.array(poses).transpose(1, 0, 2)
-    return Exploration(home, tuple(counts), np.array(states), was, believed)
+    return Exploration(home, sensor, tuple(counts), np.array(states), was, believed)
 
 
 def _poses(robot: Robot, corner_m: NDArray[np.float64], resolution_m: float) -> list[tuple[float, float, float]]:

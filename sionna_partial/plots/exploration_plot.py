@@ -152,7 +152,7 @@ def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
     panel.plot(*believed[0, :2], "o", color=BLUE, markersize=4)
     x, y, heading_deg = believed[-1]
     if step:
-        view = view_corners_m(home, way[-1]) + believed[-1, :2] - way[-1, :2]
+        view = view_corners_m(home, way[-1], exploration.sensor) + believed[-1, :2] - way[-1, :2]
         panel.add_patch(Polygon(view, color=YELLOW, alpha=_VIEW_OPACITY, linewidth=0))
     panel.plot(x, y, marker=_arrow(heading_deg), color=RED, markersize=10, markeredgecolor="white")
     window = _window_m(exploration)

@@ -2,11 +2,13 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
 from sionna_partial.errors import PredictorError
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import NetworkKind, PredictorSettings
 from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.shards import INDEX_FILE, read_dataset
@@ -42,13 +44,17 @@ class LinkTraces:
         return alike and self.diffraction == other.diffraction
 
 
-def open_links(dataset: LinkTable | str | PathLike[str]) -> tuple[LinkTable, LinkTraces | None]:
-    """Return the links of a data set, and how they were traced; None for a table, which does not say so.
+Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
+"""Links, or one or more folders that `sionna-partial dataset` wrote."""
+
+
+def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
+    """Return the links of data sets, and how they were traced; None for a table, which does not say so.
 
     Parameters
     ----------
-    dataset : LinkTable or path-like
-        Links, or a folder that `sionna-partial dataset` wrote.
+    dataset : LinkTable, path-like, or sequence of path-like
+        Links, or folders that `sionna-partial dataset` wrote. A home may be in several of them, explored anew in each.
 
     Returns
     -------
@@ -57,20 +63,49 @@ def open_links(dataset: LinkTable | str | PathLike[str]) -> tuple[LinkTable, Lin
     Raises
     ------
     PredictorError
-        If the folder holds no data set, or the data set no link, or if it is damaged.
+        If a folder holds no data set, or is damaged; if the links were traced differently, or homes of one name differ;
+        or if there is no link.
     """
     if isinstance(dataset, LinkTable):
         links, traces = dataset, None
-    elif isinstance(dataset, (str, PathLike)):
-        links, traces = read_dataset(dataset), _read_traces(Path(dataset) / INDEX_FILE)
     else:
-        raise PredictorError(
-            f"dataset is of type {type(dataset).__name__}: give a LinkTable, or a folder that "
-            "`sionna-partial dataset` wrote."
-        )
+        folders = _folders(dataset)
+        tables = [read_dataset(folder) for folder in folders]
+        traces = _one_kind(folders)
+        _require_same_homes(folders, tables)
+        links = LinkTable.concatenate(tables)
     if links.anywhere.all():
         raise PredictorError("dataset has no links with receivers drawn indoors: build one that has homes and links.")
     return links, traces
+
+
+def _folders(dataset: str | PathLike[str] | Sequence[str | PathLike[str]]) -> list[Path]:
+    folders = [dataset] if isinstance(dataset, (str, PathLike)) else dataset
+    named = isinstance(folders, Sequence) and all(isinstance(each, (str, PathLike)) for each in folders)
+    if not named or not folders:
+        raise PredictorError(
+            f"dataset = {dataset!r} is not allowed: give a LinkTable, or one or more folders that "
+            "`sionna-partial dataset` wrote."
+        )
+    return [Path(each) for each in folders]
+
+
+def _one_kind(folders: Sequence[Path]) -> LinkTraces:
+    """Read how the links of data sets were traced."""
+    first, *others = (_read_traces(folder / INDEX_FILE) for folder in folders)
+    for folder, found in zip(folders[1:], others, strict=True):
+        remedy = "give data sets that were traced alike."
+        require_like(found, first, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
+    return first
+
+
+def _require_same_homes(folders: Sequence[Path], tables: Sequence[LinkTable]) -> None:
+    """Refuse two homes of one name."""
+    known: dict[str, PartialMap] = {}
+    for folder, table in zip(folders, tables, strict=True):
+        for name, home in table.complete_maps.items():
+            if known.setdefault(name, home) != home:
+                raise PredictorError(f"'{folder}' has another home {name!r} than those before: give one of the two.")
 
 
 def settings_for(
@@ -102,7 +137,9 @@ def settings_for(
     return PredictorSettings(networks, known.frequency_hz, known.diffraction, passes, seed=seed)
 
 
-def require_like(found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str) -> None:
+def require_like(
+    found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
+) -> None:
     """Raise a PredictorError if the links of a data set were traced otherwise than `wanted`.
 
     Parameters
@@ -113,9 +150,11 @@ def require_like(found: LinkTraces | None, wanted: LinkTraces, whose: str, remed
     whose : str
         Who wants them, for the message.
     remedy : str
+    dataset : str
+        What the message calls the data set.
     """
     if found is not None and not found.is_like(wanted):
-        raise PredictorError(f"dataset was traced {found}, {whose} {wanted}: {remedy}")
+        raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
 
 
 def _read_traces(index: Path) -> LinkTraces:

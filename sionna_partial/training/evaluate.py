@@ -12,7 +12,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.training.baselines import MAJORITY_FILE, Baselines, answers
-from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like
+from sionna_partial.training.dataset_links import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
 
@@ -114,7 +114,7 @@ class Evaluation:
 
 def evaluate(
     predictor: Predictor | str | Path | None,
-    dataset: LinkTable | str | Path,
+    dataset: Dataset,
     *,
     baselines: Baselines | None = None,
     progress: Progress | None = None,
@@ -128,8 +128,8 @@ def evaluate(
     Parameters
     ----------
     predictor : None, "map", "paper", path or Predictor
-    dataset : LinkTable or path
-        Links, or a folder that `sionna-partial dataset` wrote.
+    dataset : LinkTable, path, or sequence of paths
+        Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
     baselines : Baselines, optional
         Those fitted to other links; by default those in the folder of the predictor, else the shipped ones.
     progress : callable, optional

@@ -83,7 +83,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
         )
     area = map_area(home, settings.margin_m)
     rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
-    maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)))
+    maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=settings.sensor)
     places = _draw_places(area, name, settings, rng)
     truth = _truth(area, places, settings)
     seen = zip(settings.stages, maps, _features(maps, places, settings), strict=True)

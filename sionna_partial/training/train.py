@@ -12,9 +12,8 @@ from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.settings import PredictorSettings, require_number, settings_or_default
 from sionna_partial.training.baselines import Baselines
-from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
+from sionna_partial.training.dataset_links import Dataset, LinkTraces, open_links, require_like, settings_for
 from sionna_partial.training.evaluate import Evaluation, Progress, evaluate
-from sionna_partial.training.link_table import LinkTable
 
 PREDICTOR_FILE, SPLIT_FILE = "predictor.keras", "split.json"
 
@@ -117,7 +116,7 @@ def split_homes(homes: list[str], test_share: float, seed: int) -> tuple[tuple[s
 
 
 def train(
-    dataset: LinkTable | str | Path,
+    dataset: Dataset,
     *,
     test_share: float = TEST_SHARE,
     settings: PredictorSettings | None = None,
@@ -131,8 +130,8 @@ def train(
 
     Parameters
     ----------
-    dataset : LinkTable or path
-        Links, or a folder that `sionna-partial dataset` wrote.
+    dataset : LinkTable, path, or sequence of paths
+        Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
     test_share : float
         Share of the homes that is kept for testing, in [0, 1).
     settings : PredictorSettings, optional
