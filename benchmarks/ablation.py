@@ -1,13 +1,14 @@
 """What each idea of the predictor brings: one after the other is added, trained on the same links, and measured.
 
-Links are those of a data set, most of its homes to train on and the others to measure on. The ideas are measured on the
-homes of further data sets, too, such as real ones. All are trained anew, which takes minutes to hours; --also measures
-predictors that have been trained before, where none of the homes is one of theirs. Printed are Markdown tables:
-accuracy, gain error and calibration at each stage of exploration, and paired differences over homes. Run it with
+Links are those of a data set, most of its homes to train on and the others to measure on. The ideas are also measured
+on the homes of further data sets, such as real ones, explored several times. All are trained anew, which takes minutes
+to hours; --also measures predictors that have been trained before, where none of the homes is one of theirs. Printed
+are Markdown tables: accuracy, gain error and calibration at each stage of exploration, and paired differences over
+homes. Run it with
 
     sionna-partial dataset homes --homes 300 --first-seed 10000
-    sionna-partial dataset real --homes 0 --map ../shared/gibson
-    python benchmarks/ablation.py homes --test real --also shipped=map --out docs/ablation.md
+    for seed in 0 1 2 3; do sionna-partial dataset gibson-$seed --homes 0 --map ../shared/gibson --seed $seed; done
+    python benchmarks/ablation.py homes --test gibson-? --also shipped=map --out docs/ablation.md
 """
 
 import argparse
@@ -90,7 +91,7 @@ def main() -> None:
         raise SystemExit(f"--test-share {arguments.test_share:g} leaves no home to measure on: give more than 0.")
     held_out = TestSet("Homes held out", links.take(np.isin(links.home, test_homes)), traces)
     links = links.take(np.isin(links.home, train_homes))
-    sets = [held_out, *(TestSet(f"Homes of `{folder}`", *indoor_links(folder)) for folder in arguments.test)]
+    sets = [held_out, *(TestSet(f"Homes of {quoted(folders)}", *indoor_links(*folders)) for folders in arguments.test)]
     known = {name: sp.Predictor.load(path) for name, path in arguments.also}
     if len(known) < len(arguments.also):
         raise SystemExit("--also has a name twice: give each predictor a name of its own.")
@@ -113,7 +114,13 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path, help="folder that `sionna-partial dataset` wrote")
     parser.add_argument(
-        "--test", type=Path, action="append", default=[], help="data set of other homes; may be repeated"
+        "--test",
+        type=Path,
+        action="append",
+        nargs="+",
+        default=[],
+        metavar="DATASET",
+        help="data sets of other homes, measured as one; may be repeated",
     )
     parser.add_argument("--passes", type=int, default=6, help="how many times the networks see the links")
     parser.add_argument("--homes", type=int, help="of the data set, the first; default: all")
@@ -135,10 +142,15 @@ def named_predictor(text: str) -> tuple[str, str]:
     return name, path
 
 
-def indoor_links(folder: Path) -> tuple[LinkTable, LinkTraces | None]:
-    """Read the links of a data set whose receivers were drawn indoors."""
-    say(f"reading {folder}")
-    links, traces = open_links(folder)
+def quoted(folders: list[Path]) -> str:
+    """Name data sets."""
+    return ", ".join(f"`{folder}`" for folder in folders)
+
+
+def indoor_links(*folders: Path) -> tuple[LinkTable, LinkTraces | None]:
+    """Read the links of data sets whose receivers were drawn indoors."""
+    say(f"reading {', '.join(map(str, folders))}")
+    links, traces = open_links(folders)
     return links.take(~links.anywhere), traces
 
 

@@ -106,7 +106,7 @@ def _is_number(text: str) -> bool:
 
 @contextmanager
 def show_progress() -> Iterator[Callable[[float, str], None]]:
-    """Show progress on stderr: a bar on a terminal, its last state elsewhere."""
+    """Show progress on stderr: a bar on a terminal, a line a minute elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -117,12 +117,21 @@ def show_progress() -> Iterator[Callable[[float, str], None]]:
         TimeElapsedColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console) as bar:
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("starting", total=1.0)
+        said = monotonic()
+
+        def report(share: float, message: str) -> None:
+            nonlocal said
+            bar.update(task, completed=share, description=message)
+            if not console.is_terminal and monotonic() - said >= LINE_S:
+                said = monotonic()
+                typer.echo(f"{share:.0%} {message}", err=True)
+
         try:
-            yield lambda share, message: bar.update(task, completed=share, description=message)
+            yield report
         except BaseException:
-            bar.live.transient, console.quiet = True, not console.is_terminal  # the error that follows stands alone
+            bar.live.transient = True  # the error that follows stands alone
             raise
         bar.update(task, completed=1.0, description="done")
 
