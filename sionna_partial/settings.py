@@ -44,6 +44,9 @@ FREQUENCIES_HZ = (1e6, 1e12)
 NetworkKind = Literal["paper", "paths", "map"]
 """What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
 
+Objective = Literal["coverage", "percentile"]
+"""What a transmitter is placed for: the mean predicted coverage, or the gain of the worst tenth of the places."""
+
 _Settings = TypeVar("_Settings")
 
 

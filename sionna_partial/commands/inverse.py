@@ -1,6 +1,5 @@
 """Subcommands back from links to what they depend on: calibrate, place."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -22,7 +21,7 @@ from sionna_partial.commands.shell import (
 )
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import Objective, SceneSettings, TraceSettings
 
 if TYPE_CHECKING:
     from sionna_partial.inverse.calibration import MaterialCalibration
@@ -88,19 +87,12 @@ def calibrate(
     print_files([out / name for name in ("calibrated.npz", "calibration.json", "calibration.png")])
 
 
-class Objective(StrEnum):
-    """The choices of `place_transmitter`."""
-
-    COVERAGE = "coverage"
-    PERCENTILE = "percentile"
-
-
 def place(
     map_path: MapArgument,
     out: Annotated[Path, typer.Option(help="Folder for the numbers and a picture.", show_default=False)],
     objective: Annotated[
         Objective, typer.Option(help="Mean predicted coverage, or the gain of the worst tenth of the places.")
-    ] = Objective.COVERAGE,
+    ] = "coverage",
     threshold: Annotated[float, typer.Option(help="Path gain above which a place is covered [dB].")] = -100.0,
     height: Annotated[float, typer.Option(help="Height of the transmitter [m].")] = DEFAULT_HEIGHT_M,
     rx_height: Annotated[float, typer.Option(help="Height of the receivers [m].")] = DEFAULT_HEIGHT_M,
@@ -132,7 +124,7 @@ def place(
 
         result = place_transmitter(
             partial,
-            objective=objective.value,
+            objective=objective,
             threshold_db=threshold,
             height_m=height,
             seed=seed,

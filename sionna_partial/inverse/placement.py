@@ -13,13 +13,13 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S
 from sionna_partial.inverse.differentiable_links import DifferentiableScene
 from sionna_partial.inverse.placement_area import PlacementArea, placement_area
 from sionna_partial.inverse.placement_climb import Climb, climb_on, smoothed_slope
-from sionna_partial.inverse.placement_objective import OBJECTIVES, PlacementObjective
+from sionna_partial.inverse.placement_objective import PlacementObjective
 from sionna_partial.inverse.placement_state import PlacementState, search_fingerprint, write_json
 from sionna_partial.inverse.placement_views import PlacementViews
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings, is_whole, require, require_number
+from sionna_partial.settings import Objective, SceneSettings, TraceSettings, is_whole, require, require_number
 from sionna_partial.tracing.trace import Progress
 
 RECEIVERS = 120
@@ -134,7 +134,7 @@ class TransmitterPlacement:
 def place_transmitter(
     scene: PartialMap | str | Path,
     *,
-    objective: str = OBJECTIVES[0],
+    objective: Objective = "coverage",
     threshold_db: float = -100.0,
     height_m: float = DEFAULT_HEIGHT_M,
     seed: int = 0,

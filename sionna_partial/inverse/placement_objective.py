@@ -1,17 +1,14 @@
 """What a good place for a transmitter is: distributions of the gain at many receivers -> one number."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sionna_partial.learning.predictor import LinkPrediction
-from sionna_partial.settings import require, require_number
-
-OBJECTIVES = ("coverage", "percentile")
-"""What can be asked for; the first is the default."""
+from sionna_partial.settings import Objective, require, require_number
 
 THRESHOLDS_DB = (-150.0, 0.0)
 """Between what a threshold lies [dB]: above the gain of an outage."""
@@ -42,12 +39,13 @@ class PlacementObjective:
         For another objective, or a threshold out of range.
     """
 
-    name: str = OBJECTIVES[0]
+    name: Objective = "coverage"
     threshold_db: float = -100.0
     softness_db: float = 0.0
 
     def __post_init__(self) -> None:
-        require(self.name in OBJECTIVES, "objective", self.name, f"give {' or '.join(map(repr, OBJECTIVES))}.")
+        known = get_args(Objective)
+        require(self.name in known, "objective", self.name, f"give {' or '.join(map(repr, known))}.")
         require_number("threshold_db", self.threshold_db, *THRESHOLDS_DB, open_low=True)
 
     @property
