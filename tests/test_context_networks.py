@@ -64,10 +64,11 @@ def inputs(phi):
 def shaken(networks, seed=0):
     """Give networks random weights everywhere, biases included, so that they say about 1, and return them."""
     rng = np.random.default_rng(seed)
-    for network in networks.values():
-        shapes = [weight.shape for weight in network.get_weights()]
-        spreads = [1.4 / math.sqrt(math.prod(shape[:-1])) if len(shape) > 1 else 0.3 for shape in shapes]
-        network.set_weights([rng.normal(0.0, spread, shape) for spread, shape in zip(spreads, shapes, strict=True)])
+    for weight in (weight for network in networks.values() for weight in network.weights):
+        shape = tuple(weight.shape)
+        spread = 1.4 / math.sqrt(math.prod(shape[:-1])) if len(shape) > 1 else 0.3
+        value = rng.normal(0.0, spread, shape)
+        weight.assign(np.exp(value) if weight.path.endswith(("gamma", "variance")) else value)
     return networks
 
 
@@ -221,8 +222,8 @@ class TestContextNetworks:
             weights = (each[name].get_weights() for each in (one, again, other))
             for weight, same, different in zip(*weights, strict=True):
                 np.testing.assert_array_equal(weight, same)
-                assert np.any(weight != different) == np.any(weight != 0.0), name
-            assert sum(weight.any() for weight in network.get_weights()) >= 2
+                assert np.any(weight != different) == (np.ptp(weight) > 0.0), name
+            assert sum(np.ptp(weight) > 0.0 for weight in network.get_weights()) >= 2
 
     def test_single_precision_whatever_the_policy(self):
         keras = import_keras()
@@ -243,10 +244,11 @@ class TestLook:
     def told(links):
         return links[:, LINK_INPUTS : LINK_INPUTS + LINK_OUTPUTS]
 
-    def values(self, windows):
+    def values(self, windows, training):
         """Return a window's first two channels, then x, y and x y of its cells, and 100 in an empty window, too."""
         import tensorflow as tf
 
+        assert not training
         y, x = np.meshgrid(*2 * [np.arange(WINDOW_CELLS, dtype=np.float32)], indexing="ij")
         count = windows.shape[0]
         shares = windows / 255.0
@@ -323,11 +325,11 @@ class TestDecode:
         assert (std_db <= STD_RANGE_DB[1] * (1 + 1e-9)).all()
 
     def test_by_hand(self):
-        """Logits by LinkState; LOS near the gain of free space, NLOS 25 dB below it, in steps of 10 and 20 dB."""
-        outputs = [[0.0] * 7, [math.log(2.0), math.log(6.0), 0.0, 0.3, -0.5, 40.0, -40.0]]
+        """Logits by LinkState; LOS up to 10 dB over free space, NLOS 25 dB below it, in steps of 20 dB."""
+        outputs = [[0.0, 0.0, 0.0, -1e3, 0.0, 0.0, 0.0], [math.log(2.0), math.log(6.0), 0.0, 1.5, -0.5, 40.0, -40.0]]
         log_p, means_db, log_variances = decode(np.array(outputs), np.array([-70.0, -80.0]))
         np.testing.assert_allclose(np.exp(log_p), [[1 / 3] * 3, [2 / 9, 6 / 9, 1 / 9]])
-        np.testing.assert_allclose(means_db, [[-68.0, -95.0], [-75.0, -115.0]])
+        np.testing.assert_allclose(means_db, [[-70.0, -95.0], [-75.0, -115.0]])
         middle = math.sqrt(STD_RANGE_DB[0] * STD_RANGE_DB[1])
         np.testing.assert_allclose(np.exp(0.5 * log_variances), [[middle] * 2, STD_RANGE_DB[::-1]])
 
@@ -429,7 +431,8 @@ class TestEvaluateContextNetworks:
 
         phi = features(home, (1.0, 2.0, 1.5))
         probabilities, means_db, stds_db = evaluate_context_networks({LINK_NETWORK: low}, phi, FREQUENCY_HZ)
-        assert (means_db == -150.0).all()
+        assert (means_db[[LinkState.OUTAGE, LinkState.NLOS]] == -150.0).all()
+        np.testing.assert_allclose(means_db[LinkState.LOS], free_space_gain_db(phi.distance_m, FREQUENCY_HZ))
         np.testing.assert_allclose(probabilities, 1 / 3)
         np.testing.assert_allclose(stds_db[1:], STD_RANGE_DB[0])
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
 """Number of windows in a gradient step, and of links that are drawn for each of them."""
 
-LEARNING_RATE, WEIGHT_DECAY = 2e-3, 1e-4
+LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 """Of AdamW; the rate falls to 0 along a cosine."""
 
 GAIN_WEIGHT, PLAN_WEIGHT = 0.3, 0.3
@@ -196,7 +196,7 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
         plans: Any = None,
     ) -> Any:
         with tf.GradientTape() as tape:
-            outputs, plan = look(networks, windows, links, places)
+            outputs, plan = look(networks, windows, links, places, training=True)
             log_p, means_db, log_variances = decode(outputs, free_db)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             gain = 0.5 * (log_variances + tf.square(gain_db[..., None] - means_db) * tf.exp(-log_variances))

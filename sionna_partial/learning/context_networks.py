@@ -39,8 +39,12 @@ LINK_OUTPUTS = 7
 
 _WIDTHS = (16, 32, 48, 64)
 _HIDDEN_UNITS = 64
-_LOS_OFFSET_DB, _NLOS_OFFSET_DB = 2.0, -25.0
-_LOS_SCALE_DB, _NLOS_SCALE_DB = 10.0, 20.0
+_LOS_MOST_DB = 10.0
+"""Largest mean gain given LOS, over free space [dB]: other paths add power, never more than 7.5 dB in 105 homes."""
+
+_LOS_OFFSET = -1.5
+_NLOS_OFFSET_DB, _NLOS_SCALE_DB = -25.0, 20.0
+_STATISTICS_MOMENTUM = 0.9
 _SCALE_M, _SCALE_DB = 15.0, 100.0
 _NEAREST_M = 0.1
 _LINKS_AT_ONCE, _WINDOWS_AT_ONCE = 65_536, 8
@@ -191,7 +195,9 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
     return networks | ({MAP_NETWORK: _map_network(keras, start)} if with_map else {})
 
 
-def look(networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places: Any) -> tuple[Any, Any]:
+def look(
+    networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places: Any, *, training: bool = False
+) -> tuple[Any, Any]:
     """Evaluate the networks on R links of each of B windows.
 
     Parameters
@@ -203,6 +209,8 @@ def look(networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places
     links : (B, R, LINK_INPUTS) float32 tensor
     places : (B, R, 2) float32 tensor
         Of the receivers: x, y in cells of the window.
+    training : bool
+        See `read_maps`.
 
     Returns
     -------
@@ -210,11 +218,11 @@ def look(networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places
     plan : (B, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS) float32 tensor
         Logits of what the complete map shows; None without a map network.
     """
-    known, plan = read_maps(networks, windows) if MAP_NETWORK in networks else (None, None)
+    known, plan = read_maps(networks, windows, training=training) if MAP_NETWORK in networks else (None, None)
     return read_links(networks, known, links, places), plan
 
 
-def read_maps(networks: Mapping[str, "keras.Model"], windows: Any) -> tuple[Any, Any]:
+def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> tuple[Any, Any]:
     """Let the map network read windows.
 
     Parameters
@@ -223,6 +231,8 @@ def read_maps(networks: Mapping[str, "keras.Model"], windows: Any) -> tuple[Any,
         By name.
     windows : (B, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) float32 tensor
         In [0, 255].
+    training : bool
+        Whether values are normalised by the statistics of these windows, which are kept, rather than by the kept ones.
 
     Returns
     -------
@@ -233,7 +243,7 @@ def read_maps(networks: Mapping[str, "keras.Model"], windows: Any) -> tuple[Any,
     """
     import tensorflow as tf
 
-    maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0))
+    maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0), training=training)
     return maps[:-1, ..., :MAP_FEATURES] - maps[-1:, ..., :MAP_FEATURES], maps[:-1, ..., MAP_FEATURES:]
 
 
@@ -271,12 +281,13 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     log_probabilities : (..., 3) tensor
         By LinkState.
     means_db, log_variances : (..., 2) tensors
-        Of LOS and NLOS [dB, dB^2].
+        Of LOS and NLOS [dB, dB^2]. The mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
     """
     import tensorflow as tf
 
-    means_db = free_db[..., None] + outputs[..., 3:5] * (_LOS_SCALE_DB, _NLOS_SCALE_DB)
-    means_db += (_LOS_OFFSET_DB, _NLOS_OFFSET_DB)
+    los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
+    nlos_db = _NLOS_OFFSET_DB + _NLOS_SCALE_DB * outputs[..., 4]
+    means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
     low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
     return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
 
@@ -347,8 +358,10 @@ class _Seeds:
 
 def _map_network(keras: Any, start: _Seeds) -> "keras.Model":
     def convolved(x: Any, units: int, name: str) -> Any:
-        options = {"padding": "same", "activation": "relu", "kernel_initializer": start()}
-        return layer(keras, "Conv2D", name, units, 3, **options)(x)
+        options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
+        x = layer(keras, "Conv2D", name, units, 3, **options)(x)
+        x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
+        return layer(keras, "ReLU", f"{name}_active")(x)
 
     window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), name="window", dtype="float32")
     shares = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)

@@ -22,7 +22,7 @@ from sionna_partial.learning.networks import FEATURES, OUTPUT_WIDTHS, import_ker
 if TYPE_CHECKING:
     import keras
 
-FORMAT = "sionna_partial predictor 1"
+FORMAT = "sionna_partial predictor 2"
 """First entry of every card."""
 
 SUFFIX = ".keras"
@@ -30,8 +30,17 @@ SUFFIX = ".keras"
 _MAX_BYTES = 64_000_000
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _LAYERS = {"Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"}
-_LAYERS |= {"Conv2D", "MaxPooling2D", "UpSampling2D"}
-_CLASSES = _LAYERS | {"Maximum", "Log10", "DTypePolicy", "GlorotUniform", "Zeros", "Constant", "__keras_tensor__"}
+_LAYERS |= {"Conv2D", "BatchNormalization", "MaxPooling2D", "UpSampling2D"}
+_CLASSES = _LAYERS | {
+    "Maximum",
+    "Log10",
+    "DTypePolicy",
+    "GlorotUniform",
+    "Zeros",
+    "Ones",
+    "Constant",
+    "__keras_tensor__",
+}
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
 """Names that Keras numbers through a process; each of our networks has one of each."""
 
