@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     import keras
 
 FORMAT = "sionna_partial predictor 2"
+"""What files are; who raises it brings the shipped ones along, as trainings are measured beside them."""
+
 """First entry of every card."""
 
 SUFFIX = ".keras"
