@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     import keras
 
 FORMAT = "sionna_partial predictor 2"
-"""What files are; who raises it brings the shipped ones along, as trainings are measured beside them."""
-
-"""First entry of every card."""
+"""First entry of every card. Who raises it brings the shipped files along: trainings are measured beside them."""
 
 SUFFIX = ".keras"
 
