@@ -30,7 +30,7 @@ from sionna_partial.settings import (
 DatasetsArgument = Annotated[
     list[Path],
     typer.Argument(
-        metavar="DATASET...",
+        metavar="DATASET",
         help="Folder that `dataset` wrote, or several; homes may be in more than one.",
         show_default=False,
     ),
