@@ -42,7 +42,7 @@ def make_dataset(folder, table, frequency_hz=28e9, diffraction=None):
     """Write a table as a data set, as `sionna-partial dataset` does, and return its folder."""
     names = list(dict.fromkeys(map(str, table.home)))
     for name in names:
-        shard_path(folder, name).parent.mkdir(exist_ok=True)
+        shard_path(folder, name).parent.mkdir(parents=True, exist_ok=True)
         write_shard(table.take(table.home == name), shard_path(folder, name), {})
     trace = {"frequency_hz": frequency_hz, "diffraction": diffraction}
     index = {"homes": [{"name": name} for name in names], "settings": {"trace": trace}}

@@ -12,11 +12,6 @@ from sionna_partial.training.dataset_links import LinkTraces, open_links, requir
 _AT = (("one", 28e9), ("two", 60e9))
 
 
-def new_folder(path):
-    path.mkdir()
-    return path
-
-
 class TestOpenLinks:
     def test_table_does_not_say_how_it_was_traced(self):
         table = make_table(homes=1)
@@ -37,14 +32,14 @@ class TestOpenLinks:
 
     def test_homes_explored_anew_in_each_of_several_folders(self, tmp_path):
         table = make_table(homes=2)
-        folders = [make_dataset(new_folder(tmp_path / name), table) for name in ("one", "two")]
+        folders = [make_dataset(tmp_path / name, table) for name in ("one", "two")]
         links, traces = open_links(folders)
         assert len(links) == 2 * len(table)
         assert set(links.home) == set(table.home)
         assert traces == open_links(folders[0])[1]
 
     def test_folders_traced_differently(self, tmp_path):
-        folders = [make_dataset(new_folder(tmp_path / name), make_table(homes=1), frequency_hz=hz) for name, hz in _AT]
+        folders = [make_dataset(tmp_path / name, make_table(homes=1), frequency_hz=hz) for name, hz in _AT]
         message = (
             f"'{folders[1]}' was traced at 60 GHz with diffraction, '{folders[0]}' at 28 GHz with diffraction: give"
         )
@@ -55,7 +50,7 @@ class TestOpenLinks:
         table = make_table(homes=1)
         ((name, home),) = table.complete_maps.items()
         other = replace(table, complete_maps={name: replace(home, origin_m=(1.0, 2.0))})
-        folders = [make_dataset(new_folder(tmp_path / place), each) for place, each in (("one", table), ("two", other))]
+        folders = [make_dataset(tmp_path / place, each) for place, each in (("one", table), ("two", other))]
         message = f"'{folders[1]}' has another home {name!r} than those before: give one of the two."
         with pytest.raises(PredictorError, match=re.escape(message)):
             open_links(folders)

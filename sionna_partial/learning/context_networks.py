@@ -40,7 +40,7 @@ LINK_OUTPUTS = 7
 _WIDTHS = (16, 32, 48, 64)
 _HIDDEN_UNITS = 64
 _LOS_MOST_DB = 10.0
-"""Largest mean gain given LOS, over free space [dB]: other paths add power, never more than 7.5 dB in 105 homes."""
+"""Largest mean gain given LOS, over free space [dB]: other paths add power to the direct one, and never so much."""
 
 _LOS_OFFSET = -1.5
 _NLOS_OFFSET_DB, _NLOS_SCALE_DB = -25.0, 20.0
