@@ -37,14 +37,16 @@ scenes: $(READY) ## Make the demo scenes again (scenes/)
 
 predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
 	@rm -rf build/predictor
-	@$(BIN)/sionna-partial dataset build/predictor/dataset --homes 700 --first-seed 10000
+	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 700 --first-seed 10000
+	@$(BIN)/sionna-partial dataset build/predictor/lidar --homes 350 --first-seed 10700 --field-of-view 360 --range 8
+	@$(BIN)/sionna-partial dataset build/predictor/wide --homes 350 --first-seed 11050 --field-of-view 120 --range 5
 	@for networks in paper map; do \
-		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train build/predictor/dataset --networks $$networks \
-			--test-share 0.15 --out build/predictor/$$networks; \
+		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train build/predictor/{camera,lidar,wide} \
+			--networks $$networks --test-share 0.15 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
-	@$(BIN)/sionna-partial evaluate build/predictor/dataset --out build/predictor/report > /dev/null
+	@$(BIN)/sionna-partial evaluate build/predictor/{camera,lidar,wide} --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 
 wheel: $(READY) ## Build the wheel (dist/)

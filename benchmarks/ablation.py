@@ -43,22 +43,19 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Variant:
-    """A predictor to train: its networks, and whether they learn how plans go on from the complete homes."""
+    """A predictor to train: its networks, and what they see."""
 
     networks: NetworkKind
-    plans: bool
     idea: str
 
 
 VARIANTS = {
-    "paper": Variant("paper", False, "the paper's networks, which see four features of a link"),
+    "paper": Variant("paper", "the paper's networks, which see four features of a link"),
     "paths": Variant(
         "paths",
-        False,
         "a network that also sees what each path crosses, which ends are seen, and the walls on the direct line",
     ),
-    "map without plans": Variant("map", False, "beside it, a network that sees the map around the transmitter"),
-    "map": Variant("map", True, "the same, and it learns from the complete homes how plans go on"),
+    "map": Variant("map", "beside it, a network that sees the map around the transmitter"),
 }
 """What is trained, each with one more idea than the one before."""
 
@@ -181,7 +178,6 @@ def trained(links: LinkTable, traces: LinkTraces | None, passes: int) -> Iterato
             links.gain_db,
             homes=homes,
             settings=settings_for(traces, networks=variant.networks, passes=passes, seed=SEED),
-            complete=links.complete_of_maps if variant.plans else None,
             progress=narrator(name),
         )
         yield name, predictor

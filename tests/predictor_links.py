@@ -114,7 +114,7 @@ def fit_context_predictor(networks, seed=0):
     """Train a predictor that sees where links run, for two steps; its networks of the paper are untrained."""
     links = make_seen_links(300)
     settings = PredictorSettings(networks, passes=8, minimum_links=1_000_000, seed=seed)
-    return Predictor.fit(*links, homes=["a", "b"], settings=settings, complete=corridors()[-1:] * 4)
+    return Predictor.fit(*links, homes=["a", "b"], settings=settings)
 
 
 @functools.cache

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, corridors, make_seen_links
+from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, make_seen_links
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
@@ -19,18 +19,17 @@ from sionna_partial.learning.context_networks import (
     context_networks,
     evaluate_context_networks,
     link_inputs,
-    look,
 )
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import free_space_gain_db
-from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, plan_windows, transmitter_windows
+from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, transmitter_windows
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
-FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+FREE, UNKNOWN = CellState.FREE, CellState.UNKNOWN
 ROOMS, ROOM_CELLS, RESOLUTION_M = 4, 8, 0.5
 HALF_M = ROOMS * ROOM_CELLS * RESOLUTION_M / 2
 DISTANCE_M, GAIN_DB, STD_DB = 5.0, -90.0, 3.0
@@ -40,14 +39,13 @@ DISTANCE_M, GAIN_DB, STD_DB = 5.0, -90.0, 3.0
 class Links:
     """Links that differ in nothing but the rooms that their receivers are in, and the last column of indirect gains.
 
-    Half of the rooms of each map are seen, and are free on the complete map; the others are all wall there. The
-    transmitter, and receivers in rooms of both kinds, stand in cells that are not seen.
+    Half of the rooms of each map are seen. The transmitter, and receivers in rooms of both kinds, stand in cells that
+    are not.
     """
 
     phi: LinkFeatures
     in_seen_room: np.ndarray
     path_seen: np.ndarray
-    complete: tuple[PartialMap, ...]
 
     def truth(self, linked):
         """Return true states and gains where some links (N,) are NLOS, and the others in outage."""
@@ -58,15 +56,13 @@ class Links:
 @functools.cache
 def make_room_links(maps, links, seed):
     rng = np.random.default_rng(seed)
-    partial, complete, in_seen_room, rx_m = [], [], [], []
+    partial, in_seen_room, rx_m = [], [], []
     for _ in range(maps):
         seen = np.kron(rng.permutation(ROOMS**2).reshape(ROOMS, ROOMS) % 2, np.ones((ROOM_CELLS, ROOM_CELLS))) > 0
         place = rng.permutation(seen.size)[:links]
         state = np.where(seen, FREE, UNKNOWN)
         state.ravel()[place] = state[len(seen) // 2, len(seen) // 2] = UNKNOWN
-        grid = (RESOLUTION_M, (-HALF_M, -HALF_M))
-        partial.append(PartialMap(state, *grid))
-        complete.append(PartialMap(np.where(seen, FREE, WALL), *grid))
+        partial.append(PartialMap(state, RESOLUTION_M, (-HALF_M, -HALF_M)))
         in_seen_room.append(seen.ravel()[place])
         cells = np.column_stack(np.divmod(place, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
         rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
@@ -78,7 +74,7 @@ def make_room_links(maps, links, seed):
     context = LinkContext(tuple(partial), *where, gains_db, 3.0 * full)
     phi = LinkFeatures(NLOS * full, 3.0 * full, DISTANCE_M * full, -90.0 * full, context)
     order = rng.permutation(count)
-    return Links(phi.take(order), np.concatenate(in_seen_room)[order], path_seen[order], tuple(complete))
+    return Links(phi.take(order), np.concatenate(in_seen_room)[order], path_seen[order])
 
 
 TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
@@ -86,7 +82,7 @@ TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
 
 
 @functools.cache
-def trained(networks, rule, complete):
+def trained(networks, rule):
     """Return networks trained by a rule, and the losses on the way: few small steps, of greater rate, are enough."""
     links, losses = make_room_links(*TRAINING), []
     settings = PredictorSettings(networks, passes=100 if networks == "paths" else 16)
@@ -97,7 +93,6 @@ def trained(networks, rule, complete):
             links.phi,
             *links.truth(getattr(links, rule)),
             settings,
-            complete=links.complete if complete else None,
             progress=lambda share, message: losses.append(float(message.rpartition(" ")[2])),
         )
     return found, losses
@@ -111,16 +106,6 @@ def judge(networks, rule):
     accuracy = (probabilities.argmax(axis=0) == state).mean()
     entropy = -np.log(probabilities[state, np.arange(len(state))]).mean()
     return accuracy, entropy, means_db[NLOS][state == NLOS].mean()
-
-
-def plan_entropy(networks):
-    """Return the cross-entropy of what networks say that the complete plans of other maps show."""
-    links = make_room_links(*OTHERS)
-    context = dataclasses.replace(links.phi.context, maps=links.complete)
-    plans, windows = plan_windows(context) / 255.0, transmitter_windows(links.phi.context)[0].astype(np.float32)
-    nowhere = (np.zeros((len(windows), 1, LINK_INPUTS), dtype=np.float32), np.full((len(windows), 1, 2), 32.0))
-    logits = np.asarray(look(networks, windows, nowhere[0], nowhere[1].astype(np.float32))[1], dtype=np.float64)
-    return (np.logaddexp(0.0, logits) - plans * logits).mean()
 
 
 def few_links():
@@ -137,32 +122,23 @@ class TestFitContextNetworks:
         assert 0.4 < links.in_seen_room.mean() < 0.6
 
     def test_paths(self):
-        accuracy, entropy, gain_db = judge(trained("paths", "path_seen", False)[0], "path_seen")
+        accuracy, entropy, gain_db = judge(trained("paths", "path_seen")[0], "path_seen")
         assert accuracy == 1.0
         assert entropy < 0.01
         assert gain_db == pytest.approx(GAIN_DB, abs=1.0)
 
     def test_paths_do_not_show_where_receivers_are(self):
-        accuracy, entropy, _ = judge(trained("paths", "in_seen_room", False)[0], "in_seen_room")
+        accuracy, entropy, _ = judge(trained("paths", "in_seen_room")[0], "in_seen_room")
         assert accuracy < 0.6
         assert entropy > math.log(2.0) - 0.01
 
-    @pytest.mark.parametrize("complete", [False, True])
-    def test_map(self, complete):
-        accuracy, entropy, gain_db = judge(trained("map", "in_seen_room", complete)[0], "in_seen_room")
+    def test_map(self):
+        accuracy, entropy, gain_db = judge(trained("map", "in_seen_room")[0], "in_seen_room")
         assert accuracy > 0.9
         assert entropy < 0.5 * math.log(2.0)
         assert gain_db == pytest.approx(GAIN_DB, abs=4.0)
 
-    def test_complete_homes_teach_how_plans_go_on(self):
-        untaught, taught = (plan_entropy(trained("map", "in_seen_room", each)[0]) for each in (False, True))
-        assert taught < 0.6 < untaught
-
-    @pytest.mark.parametrize(
-        "arguments",
-        [("paths", "path_seen", False), ("map", "in_seen_room", False), ("map", "in_seen_room", True)],
-        ids=str,
-    )
+    @pytest.mark.parametrize("arguments", [("paths", "path_seen"), ("map", "in_seen_room")], ids=str)
     def test_the_loss_falls(self, arguments):
         found, losses = trained(*arguments)
         assert losses[-1] < 0.6 * losses[0]
@@ -187,14 +163,6 @@ class TestFitContextNetworks:
         first = context_networks(7, with_map=False)[LINK_NETWORK]
         for weight, expected in zip(found.get_weights(), first.get_weights(), strict=True):
             np.testing.assert_array_equal(weight, expected)
-
-    def test_paths_need_no_complete_homes(self):
-        settings = PredictorSettings("paths", passes=2)
-        one, other = (
-            fit_context_networks(*few_links(), settings, complete=complete)[LINK_NETWORK].get_weights()
-            for complete in (None, corridors())
-        )
-        assert all(np.array_equal(*weights) for weights in zip(one, other, strict=True))
 
     def test_progress(self, monkeypatch, caplog):
         monkeypatch.setattr(module, "_REPORT_STEPS", 2)
@@ -238,14 +206,13 @@ def examples(links):
     """Gains are the numbers of the links."""
     numbers = np.arange(len(links.phi), dtype=np.float64)
     state = links.truth(links.in_seen_room)[0]
-    return module._Examples.of_links(links.phi, state, numbers, PredictorSettings("map"), links.complete)
+    return module._Examples.of_links(links.phi, state, numbers, PredictorSettings("map"))
 
 
 class TestExamples:
     def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
         phi, context = links.phi, links.phi.context
         windows, index = transmitter_windows(context)
-        plans = plan_windows(dataclasses.replace(context, maps=links.complete))
         inputs, state = link_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
         turns = []
         for batch in examples.batches(4, np.random.default_rng(4)):
@@ -257,7 +224,6 @@ class TestExamples:
                     if np.array_equal(module._turned(windows[window], way), batch["windows"][number])
                 )
                 turns.append(turn)
-                np.testing.assert_array_equal(batch["plans"][number], module._turned(plans[window], turn))
                 places = (context.rx_m - context.tx_m)[drawn, :2] / CELL_M + WINDOW_CELLS / 2
                 expected = module._turned_places(places.astype(np.float32), turn)
                 np.testing.assert_allclose(batch["places"][number], expected, atol=1e-4)
@@ -272,7 +238,6 @@ class TestExamples:
         size, links, square = module.WINDOWS_AT_ONCE, module.LINKS_OF_WINDOW, (WINDOW_CELLS, WINDOW_CELLS)
         shapes = {
             "windows": (size, *square, len(CHANNELS)),
-            "plans": (size, *square, 2),
             "links": (size, links, LINK_INPUTS),
             "places": (size, links, 2),
             **dict.fromkeys(("free_db", "link_state", "gain_db"), (size, links)),
@@ -291,10 +256,8 @@ class TestExamples:
         passes = [sorted(drawn[start : start + count]) for start in range(0, len(drawn) - count, count)]
         assert passes == [list(range(count))] * 7
 
-    def test_without_complete_homes_or_a_map_network_there_are_no_plans(self, links):
-        for networks, complete in (("map", None), ("paths", links.complete)):
-            settings = PredictorSettings(networks)
-            found = module._Examples.of_links(links.phi, *links.truth(links.path_seen), settings, complete)
-            (batch,) = found.batches(1, np.random.default_rng(7))
-            assert "plans" not in batch
-            assert ("windows" in batch) == (networks == "map")
+    def test_without_a_map_network_there_are_no_windows(self, links):
+        truth = links.truth(links.path_seen)
+        found = module._Examples.of_links(links.phi, *truth, PredictorSettings("paths"))
+        (batch,) = found.batches(1, np.random.default_rng(7))
+        assert "windows" not in batch

@@ -28,7 +28,7 @@ from sionna_partial.learning.context_networks import (
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, own_input
-from sionna_partial.learning.windows import CELL_M, CHANNELS, PLAN_CHANNELS, WINDOW_CELLS, transmitter_windows
+from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, transmitter_windows
 from sionna_partial.maps.partial_map import PartialMap
 
 pytestmark = QUIET
@@ -254,14 +254,13 @@ class TestLook:
         shares = windows / 255.0
         known = tf.cast(tf.reduce_any(windows > 0, axis=(1, 2, 3), keepdims=True), tf.float32)
         places = np.tile(np.stack([x, y, x * y], axis=-1), (count, 1, 1, 1)) * known
-        rest = np.full((count, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES + PLAN_CHANNELS - 5), 100.0, dtype=np.float32)
+        rest = np.full((count, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES - 5), 100.0, dtype=np.float32)
         return tf.concat([shares[..., :2], places, rest], axis=-1)
 
     def seen(self, windows, places):
         links = np.zeros((*np.shape(places)[:2], LINK_INPUTS), dtype=np.float32)
         network = {MAP_NETWORK: self.values, LINK_NETWORK: self.told}
-        outputs, plan = look(network, windows.astype(np.float32), links, np.asarray(places, dtype=np.float32))
-        return np.asarray(outputs), np.asarray(plan)
+        return np.asarray(look(network, windows.astype(np.float32), links, np.asarray(places, dtype=np.float32)))
 
     @pytest.fixture
     def windows(self):
@@ -269,7 +268,7 @@ class TestLook:
 
     def test_exact_at_the_middles_of_cells(self, windows):
         rows, columns = np.random.default_rng(4).integers(0, WINDOW_CELLS, (2, 2, 300))
-        found, _ = self.seen(windows, np.stack([columns, rows], axis=-1) + 0.5)
+        found = self.seen(windows, np.stack([columns, rows], axis=-1) + 0.5)
         for number in range(2):
             row, column = rows[number], columns[number]
             expected = windows[number, row, column, :2] / 255.0
@@ -280,33 +279,27 @@ class TestLook:
         """x, y and x y are bilinear, so they are met everywhere; the noise of the windows is, from side to side."""
         places = np.random.default_rng(5).uniform(0.5, WINDOW_CELLS - 0.5, (2, 300, 2))
         x, y = np.moveaxis(places - 0.5, -1, 0)
-        found, _ = self.seen(windows, places)
+        found = self.seen(windows, places)
         np.testing.assert_allclose(found[..., 2:5], np.stack([x, y, x * y], axis=-1), rtol=1e-5, atol=1e-4)
         start = np.array([20.5, 31.5])
         for step in ((1.0, 0.0), (0.0, 1.0)):
             way = np.stack([start + share * np.array(step) for share in (0.0, 0.3, 1.0)])
-            one, between, other = self.seen(windows[:1], way[None])[0][0]
+            one, between, other = self.seen(windows[:1], way[None])[0]
             np.testing.assert_allclose(between, 0.7 * one + 0.3 * other, atol=1e-5)
             assert abs(one - other)[:2].min() > 0.01
 
     def test_what_an_empty_window_says_is_taken_off(self, windows):
-        found, _ = self.seen(windows, np.full((2, 1, 2), 32.0))
+        found = self.seen(windows, np.full((2, 1, 2), 32.0))
         assert (found[..., 5:] == 0.0).all()
-        empty, _ = self.seen(np.zeros_like(windows), np.full((2, 1, 2), 32.0))
+        empty = self.seen(np.zeros_like(windows), np.full((2, 1, 2), 32.0))
         assert not empty.any()
-
-    def test_plan_is_the_rest_of_what_the_map_network_says(self, windows):
-        plan = self.seen(windows, np.full((2, 1, 2), 32.0))[1]
-        assert plan.shape == (2, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS)
-        assert (plan == 100.0).all()
 
     def test_without_a_map_network_links_alone_are_read(self):
         links = np.random.default_rng(6).normal(size=(2, 3, LINK_INPUTS)).astype(np.float32)
-        outputs, plan = look(
+        outputs = look(
             {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]}, None, links, np.zeros((2, 3, 2), dtype=np.float32)
         )
         np.testing.assert_array_equal(outputs, links[..., :LINK_OUTPUTS])
-        assert plan is None
 
 
 class TestDecode:
@@ -402,7 +395,7 @@ class TestEvaluateContextNetworks:
         windows, _ = transmitter_windows(phi.context)
         places = (phi.context.rx_m - phi.context.tx_m)[:, :2] / CELL_M + WINDOW_CELLS / 2
         arguments = (windows, link_inputs(phi, FREQUENCY_HZ)[None], places[None])
-        outputs, _ = look(networks, *(np.asarray(each, dtype=np.float32) for each in arguments))
+        outputs = look(networks, *(np.asarray(each, dtype=np.float32) for each in arguments))
         free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
         log_p, means_db, log_variances = decode(np.asarray(outputs, dtype=np.float64)[0], free_db)
         found_p, found_db, found_std_db = evaluate_context_networks(networks, phi, FREQUENCY_HZ)

@@ -59,6 +59,12 @@ class TestDataset:
             360,
             "--range",
             8,
+            "--range-noise",
+            0.02,
+            "--drift",
+            0.01,
+            "--missed-walls",
+            0.1,
             "--material",
             "concrete",
         )
@@ -68,7 +74,7 @@ class TestDataset:
         _, homes, passed, options = calls[0]
         assert homes == [7, 8]
         assert (passed.links_per_home, passed.transmitters_per_home, passed.stages, passed.seed) == (20, 2, (0, 50), 3)
-        assert passed.sensor == SensorSettings(field_of_view_deg=360.0, range_m=8.0)
+        assert passed.sensor == SensorSettings(0.02, 0.01, 0.1, 360.0, 8.0)
         assert passed.scene.material == Material(itu="concrete")
         assert options == {"scheduler": "tcp://host:8786", "workers": 3, "home_time_limit_s": 60.0}
 

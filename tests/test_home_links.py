@@ -144,13 +144,6 @@ class TestTruthAndFeatures:
         assert table.complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
         assert table.take(slice(3)).complete_maps == table.complete_maps
 
-    def test_complete_home_of_each_map(self, table: LinkTable) -> None:
-        other = replace(table, home=np.full(len(table), "b"), complete_maps={"b": two_rooms()})
-        both = LinkTable.concatenate([other.take(other.stage == 0), table.take(table.stage == 40)])
-        area, (first, between, last) = table.complete_maps["two rooms"], table.context.maps
-        assert both.context.maps == (first, between, last)
-        assert both.complete_of_maps == [two_rooms(), between, area]
-
     def test_a_map_that_stays_is_traced_once(self, home: PartialMap, monkeypatch: Any) -> None:
         traced: list[PartialMap] = []
         trace = module.trace_each

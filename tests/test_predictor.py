@@ -247,16 +247,13 @@ class TestWhatSeesWhereLinksRun:
         assert message.startswith("step 0 of 1, loss ")
 
     def test_links_that_cannot_train_it(self, seeing):
-        phi, state, gain_db = make_seen_links(5)
+        _, state, gain_db = make_seen_links(5)
         message = (
             "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
             "or PredictorSettings(networks='paper')."
         )
         with pytest.raises(PredictorError, match=re.escape(message)):
             Predictor.fit(make_links(5)[0], state, gain_db, settings=seeing.settings)
-        message = "complete has 3 maps: give one for each of the 4 maps of the features' context."
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            Predictor.fit(phi, state, gain_db, settings=seeing.settings, complete=corridors()[:3])
         with pytest.raises(PredictorError, match="features has no links: give at least one"):
             Predictor.fit(make_seen_links(0)[0], [], [], settings=seeing.settings)
 

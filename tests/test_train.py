@@ -9,11 +9,9 @@ from predictor_links import QUICK, QUIET
 
 from sionna_partial.errors import OutputError, PredictorError, SettingsError
 from sionna_partial.learning.predictor import Predictor
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.training.baselines import Baselines
 from sionna_partial.training.evaluate import evaluate
-from sionna_partial.training.link_table import LinkTable
 from sionna_partial.training.metrics import measure
 from sionna_partial.training.train import split_homes, train
 
@@ -115,29 +113,6 @@ class TestTrain:
         assert row.metrics.as_json() == pytest.approx(expected.as_json(), rel=1e-6)
         assert [share for share, _ in calls] == sorted(share for share, _ in calls)
         assert any(message.startswith("step 0 of 1, loss ") for _, message in calls)
-
-    def test_complete_homes_are_learned_from(self, table, monkeypatch):
-        homes = {
-            name: PartialMap(np.zeros((1, size), dtype=np.uint8), 0.5)
-            for size, name in enumerate(dict.fromkeys(table.home), 1)
-        }
-        taken = []
-
-        def fit(*arguments, complete, **options):
-            taken.extend(complete)
-            raise KeyboardInterrupt
-
-        parts = []
-        for name, home in homes.items():
-            links = table.take(table.home == name)
-            maps = tuple(dataclasses.replace(each) for each in links.context.maps)
-            context = dataclasses.replace(links.context, maps=maps)
-            phi = dataclasses.replace(links.phi, context=context)
-            parts.append(dataclasses.replace(links, phi=phi, complete_maps={name: home}))
-        monkeypatch.setattr(Predictor, "fit", fit)
-        with pytest.raises(KeyboardInterrupt):
-            train(LinkTable.concatenate(parts), test_share=0.0, settings=UNTRAINED)
-        assert taken == [home for home in homes.values() for _ in range(4)]
 
     def test_no_test_homes(self, table):
         alone = train(table, test_share=0.0, settings=UNTRAINED)

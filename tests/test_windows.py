@@ -11,9 +11,7 @@ from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.windows import (
     CELL_M,
     CHANNELS,
-    PLAN_CHANNELS,
     WINDOW_CELLS,
-    plan_windows,
     transmitter_window,
     transmitter_windows,
     window_index,
@@ -240,19 +238,6 @@ class TestTransmitterWindows:
         windows, index = transmitter_windows(context_of((), [], [], []))
         assert windows.shape == (0, *SHAPE)
         assert index.shape == (0,)
-
-
-class TestPlanWindows:
-    def test_free_and_wall_of_the_windows(self):
-        state = np.random.default_rng(8).choice([FREE, WALL, UNKNOWN], size=(50, 60))
-        maps = (PartialMap(state, 0.1), PartialMap(np.full((2, 2), UNKNOWN), 0.1))
-        context = context_of(maps, [0, 1, 0], [(1.0, 2.0, 1.5), (3.1, 2.0, 1.5), (3.3, 0.1, 1.5)], np.zeros((3, 3)))
-        assert CHANNELS[:PLAN_CHANNELS] == ("free", "wall")
-        expected = transmitter_windows(context)[0][..., :PLAN_CHANNELS]
-        np.testing.assert_array_equal(plan_windows(context), expected)
-
-    def test_no_links(self):
-        assert plan_windows(context_of((), [], [], [])).shape == (0, WINDOW_CELLS, WINDOW_CELLS, 2)
 
 
 class TestWindowPlaces:

@@ -7,9 +7,12 @@ from typing import Annotated, Any
 import typer
 
 from sionna_partial.commands.shell import (
+    DriftOption,
     FieldOfViewOption,
     FrequencyOption,
     MaterialOption,
+    MissedWallsOption,
+    RangeNoiseOption,
     RangeOption,
     parse_material,
     print_files,
@@ -64,6 +67,9 @@ def dataset(
     seed: Annotated[int, typer.Option(help="Seed of places and robots.")] = DatasetSettings.seed,
     field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
     range_m: RangeOption = SensorSettings.range_m,
+    range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
+    drift: DriftOption = SensorSettings.drift_m_per_m,
+    missed_walls: MissedWallsOption = SensorSettings.missed_wall_share,
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     workers: Annotated[
@@ -86,7 +92,7 @@ def dataset(
         transmitters_per_home=transmitters,
         stages=tuple(sorted(set(stages))),
         seed=seed,
-        sensor=SensorSettings(field_of_view_deg=field_of_view, range_m=range_m),
+        sensor=SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m),
         scene=SceneSettings(material=parse_material(material)),
         trace=TraceSettings(frequency_hz=frequency),
     )

@@ -6,13 +6,16 @@ from typing import Annotated
 import typer
 
 from sionna_partial.commands.shell import (
+    DriftOption,
     FieldOfViewOption,
     FrequencyOption,
     HeightBandOption,
     MapArgument,
     MaterialOption,
     MaxDepthOption,
+    MissedWallsOption,
     PredictorOption,
+    RangeNoiseOption,
     RangeOption,
     StrictOption,
     UpOption,
@@ -112,9 +115,9 @@ def explore(
     seed: Annotated[int, typer.Option(help="Seed of the robot, and of the home that is made.")] = 0,
     field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
     range_m: RangeOption = SensorSettings.range_m,
-    range_noise: Annotated[float, typer.Option(help="Standard deviation of the camera's ranges [m].")] = 0.0,
-    drift: Annotated[float, typer.Option(help="Growth of the robot's error of position [m per m of way].")] = 0.0,
-    missed_walls: Annotated[float, typer.Option(help="Share of walls that the camera misses, as glass [1].")] = 0.0,
+    range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
+    drift: DriftOption = SensorSettings.drift_m_per_m,
+    missed_walls: MissedWallsOption = SensorSettings.missed_wall_share,
     height_band: HeightBandOption = None,
     up: UpOption = None,
 ) -> None:

@@ -1,7 +1,6 @@
 """What all subcommands share: options, numbers, progress, and the files that were written."""
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -34,6 +33,9 @@ MaterialOption = Annotated[
 ]
 FieldOfViewOption = Annotated[float, typer.Option(help="Angle that the robot sees at once, up to 360 [degree].")]
 RangeOption = Annotated[float, typer.Option("--range", help="How far it sees [m].")]
+RangeNoiseOption = Annotated[float, typer.Option(help="Standard deviation of its ranges [m].")]
+DriftOption = Annotated[float, typer.Option(help="Growth of its error of position [m per m of way].")]
+MissedWallsOption = Annotated[float, typer.Option(help="Share of walls that it misses, as glass [1].")]
 FrequencyOption = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
 MaxDepthOption = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
 PredictorOption = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
@@ -107,26 +109,15 @@ def _is_number(text: str) -> bool:
 @contextmanager
 def show_progress() -> Iterator[Callable[[float, str], None]]:
     """Show progress on stderr: a bar on a terminal, a line a minute elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:3.0f} %"),
-        TimeElapsedColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+    done = (BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn())
+    with _bar_or_lines(TextColumn("{task.description}"), *done) as (bar, say):
         task = bar.add_task("starting", total=1.0)
-        said = monotonic()
 
         def report(share: float, message: str) -> None:
-            nonlocal said
             bar.update(task, completed=share, description=message)
-            if not console.is_terminal and monotonic() - said >= LINE_S:
-                said = monotonic()
-                typer.echo(f"{share:.0%} {message}", err=True)
+            say(f"{share:.0%} {message}")
 
         try:
             yield report
@@ -140,8 +131,8 @@ def show_progress() -> Iterator[Callable[[float, str], None]]:
 def show_rate(unit: str) -> Iterator[Callable[[int, int, str], None]]:
     """Show on stderr how many things are done, how many a minute, and the time left.
 
-    A terminal has a bar, other output a line a minute. Things that were done when it was first told do not count for
-    the rate.
+    A terminal has a bar, other output a line a minute, and one at the start and the end. Things that were done when it
+    was first told do not count for the rate.
 
     Parameters
     ----------
@@ -153,27 +144,42 @@ def show_rate(unit: str) -> Iterator[Callable[[int, int, str], None]]:
     callable
         To be called as ``report(done, total, message)``.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 
-    console = Console(stderr=True)
     columns = (BarColumn(), MofNCompleteColumn(), TextColumn(unit), TextColumn("{task.fields[pace]}"))
-    with Progress(*columns, TextColumn("{task.description}"), console=console, disable=not console.is_terminal) as bar:
+    with _bar_or_lines(*columns, TextColumn("{task.description}")) as (bar, say):
         task = bar.add_task("", total=None, pace="")
         first: tuple[int, float] | None = None
-        said = -math.inf
 
         def report(done: int, total: int, message: str) -> None:
-            nonlocal first, said
-            now = monotonic()
+            nonlocal first
+            now, starting = monotonic(), first is None
             first = first or (done, now)
             pace = rate_and_rest(done - first[0], total - done, now - first[1])
             bar.update(task, completed=done, total=total, pace=pace, description=message)
-            if not console.is_terminal and (now - said >= LINE_S or done == total):
-                said = now
-                typer.echo(f"{done} of {total} {unit} {pace} {message}".replace("  ", " "), err=True)
+            line = f"{done} of {total} {unit} {pace} {message}".replace("  ", " ")
+            say(line, at_once=starting or done == total)
 
         yield report
+
+
+@contextmanager
+def _bar_or_lines(*columns: Any) -> Iterator[tuple[Any, Callable[..., None]]]:
+    """Open a bar on stderr, and what says a line where there is no terminal: once a minute, or at once."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    said = monotonic()
+
+    def say(line: str, *, at_once: bool = False) -> None:
+        nonlocal said
+        if not console.is_terminal and (at_once or monotonic() - said >= LINE_S):
+            said = monotonic()
+            typer.echo(line, err=True)
+
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        yield bar, say
 
 
 def rate_and_rest(done: int, rest: int, elapsed_s: float) -> str:

@@ -323,7 +323,7 @@ class DifferentiableLinks:
         """Return what the map network knows (1, ...) around the transmitter: linear around where it was."""
         import tensorflow as tf
 
-        known, _ = read_maps(self._scene.networks, self._windows[:1] if place is None else self._windows)
+        known = read_maps(self._scene.networks, self._windows[:1] if place is None else self._windows)
         if place is None:
             return known
         away = tf.cast(place - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)

@@ -2,8 +2,8 @@
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,8 +14,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.learning.context_networks import context_networks, decode, link_inputs, look
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.networks import free_space_gain_db, import_keras
-from sionna_partial.learning.windows import WINDOW_CELLS, plan_windows, transmitter_windows, window_index, window_places
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.learning.windows import WINDOW_CELLS, transmitter_windows, window_index, window_places
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
 
@@ -28,8 +27,8 @@ WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 """Of AdamW; the rate falls to 0 along a cosine."""
 
-GAIN_WEIGHT, PLAN_WEIGHT = 0.3, 0.3
-"""Weights of the likelihoods of gain, and of the complete plan, beside that of the link state."""
+GAIN_WEIGHT = 0.3
+"""Weight of the likelihood of gain beside that of the link state."""
 
 _REPORT_STEPS = 50
 
@@ -42,7 +41,6 @@ def fit_context_networks(
     gain_db: NDArray[np.float64],
     settings: PredictorSettings,
     *,
-    complete: Sequence[PartialMap] | None = None,
     progress: Progress | None = None,
 ) -> dict[str, "keras.Model"]:
     """Fit the networks that see where links run; every receiver is taken to be indoors.
@@ -59,8 +57,6 @@ def fit_context_networks(
         True omnidirectional path gain [dB].
     settings : PredictorSettings
         With `networks` "paths" or "map".
-    complete : sequence of M PartialMap, optional
-        The complete home of each of the context's maps, from which the map network learns how plans go on.
     progress : callable, optional
         Called as ``progress(share_done, message)``.
 
@@ -75,7 +71,7 @@ def fit_context_networks(
         If the training diverges.
     """
     networks = context_networks(settings.seed, with_map=settings.networks == "map")
-    examples = _Examples.of_links(phi, link_state, gain_db, settings, complete)
+    examples = _Examples.of_links(phi, link_state, gain_db, settings)
     steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
     step = _gradient_step(networks, steps)
     report = progress or (lambda share, message: None)
@@ -116,15 +112,12 @@ class _Examples:
         link_state: NDArray[np.uint8],
         gain_db: NDArray[np.float64],
         settings: PredictorSettings,
-        complete: Sequence[PartialMap] | None,
     ) -> "_Examples":
         context = phi.context
         assert context is not None
         index, images = window_index(context), {}
         if settings.networks == "map":
             images["windows"] = transmitter_windows(context)[0]
-            if complete is not None:
-                images["plans"] = plan_windows(replace(context, maps=tuple(complete)))
         order = np.argsort(index, kind="stable")
         columns = {
             "links": link_inputs(phi, settings.frequency_hz),
@@ -193,19 +186,15 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
         link_state: Any,
         gain_db: Any,
         windows: Any = None,
-        plans: Any = None,
     ) -> Any:
         with tf.GradientTape() as tape:
-            outputs, plan = look(networks, windows, links, places, training=True)
+            outputs = look(networks, windows, links, places, training=True)
             log_p, means_db, log_variances = decode(outputs, free_db)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             gain = 0.5 * (log_variances + tf.square(gain_db[..., None] - means_db) * tf.exp(-log_variances))
             states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
             linked = tf.cast(link_state[..., None] == states, tf.float32)
             loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(gain * linked, axis=-1))
-            if plans is not None:
-                shares = tf.nn.sigmoid_cross_entropy_with_logits(plans / 255.0, plan)
-                loss += PLAN_WEIGHT * tf.reduce_mean(shares)
         optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
         return loss
 

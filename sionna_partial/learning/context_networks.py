@@ -2,9 +2,8 @@
 
 The map network reads the window around the transmitter and writes `MAP_FEATURES` numbers into each of its cells: a
 U-Net (Ronneberger, Fischer and Brox 2015). What it makes of an empty window is taken off, so that a map says nothing
-where nothing was observed. For training, it also says what the complete map shows. The link network reads what the
-trace knows of a link, and the numbers at its receiver. It says P(link state), and mean and log-variance of the gain in
-line of sight and without.
+where nothing was observed. The link network reads what the trace knows of a link, and the numbers at its receiver. It
+says P(link state), and mean and log-variance of the gain in line of sight and without.
 """
 
 import math
@@ -21,7 +20,7 @@ from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
 from sionna_partial.learning.unobserved import walled_lengths_m
-from sionna_partial.learning.windows import CHANNELS, PLAN_CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
+from sionna_partial.learning.windows import CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
 
 if TYPE_CHECKING:
     import keras
@@ -169,7 +168,7 @@ CONTEXT_SHAPES = (
     Shapes.of(link_network=((LINK_INPUTS,), (LINK_OUTPUTS,))),
     Shapes.of(
         link_network=((LINK_INPUTS + MAP_FEATURES,), (LINK_OUTPUTS,)),
-        map_network=((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES + PLAN_CHANNELS)),
+        map_network=((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES)),
     ),
 )
 """What a predictor may have beside the networks of the paper: nothing, "paths", or "map"."""
@@ -197,7 +196,7 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
 
 def look(
     networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places: Any, *, training: bool = False
-) -> tuple[Any, Any]:
+) -> Any:
     """Evaluate the networks on R links of each of B windows.
 
     Parameters
@@ -214,15 +213,13 @@ def look(
 
     Returns
     -------
-    outputs : (B, R, LINK_OUTPUTS) float32 tensor
-    plan : (B, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS) float32 tensor
-        Logits of what the complete map shows; None without a map network.
+    (B, R, LINK_OUTPUTS) float32 tensor
     """
-    known, plan = read_maps(networks, windows, training=training) if MAP_NETWORK in networks else (None, None)
-    return read_links(networks, known, links, places), plan
+    known = read_maps(networks, windows, training=training) if MAP_NETWORK in networks else None
+    return read_links(networks, known, links, places)
 
 
-def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> tuple[Any, Any]:
+def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> Any:
     """Let the map network read windows.
 
     Parameters
@@ -236,15 +233,13 @@ def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: 
 
     Returns
     -------
-    known : (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor
+    (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor
         What each cell says beyond what one of an empty window does.
-    plan : (B, WINDOW_CELLS, WINDOW_CELLS, PLAN_CHANNELS) float32 tensor
-        Logits of what the complete map shows.
     """
     import tensorflow as tf
 
     maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0), training=training)
-    return maps[:-1, ..., :MAP_FEATURES] - maps[-1:, ..., :MAP_FEATURES], maps[:-1, ..., MAP_FEATURES:]
+    return maps[:-1] - maps[-1:]
 
 
 def read_links(networks: Mapping[str, "keras.Model"], known: Any, links: Any, places: Any) -> Any:
@@ -376,7 +371,7 @@ def _map_network(keras: Any, start: _Seeds) -> "keras.Model":
         x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), _WIDTHS[depth], f"up_{depth}")
         x = convolved(x, _WIDTHS[depth], f"up_{depth}_again") if depth else x
     joined = layer(keras, "Concatenate", "all")([x, shares])
-    values = layer(keras, "Conv2D", "values", MAP_FEATURES + PLAN_CHANNELS, 1, kernel_initializer=start())(joined)
+    values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
     return keras.Model(window, values, name=MAP_NETWORK)
 
 
@@ -396,7 +391,7 @@ def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tu
         return
     windows, index = transmitter_windows(context)
     for start in range(0, len(windows), _WINDOWS_AT_ONCE):
-        known, _ = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE].astype(np.float32))
+        known = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE].astype(np.float32))
         for number in range(len(known)):
             yield known[number : number + 1], np.flatnonzero(index == start + number)
 

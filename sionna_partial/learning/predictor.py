@@ -24,7 +24,6 @@ from sionna_partial.learning.networks import (
     parts,
 )
 from sionna_partial.learning.predictor_files import SUFFIX, digest, pack, read_files, write_files
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
@@ -203,7 +202,6 @@ class Predictor:
         *,
         homes: Sequence[str] = (),
         settings: PredictorSettings | None = None,
-        complete: Sequence[PartialMap] | None = None,
         progress: Progress | None = None,
     ) -> "Predictor":
         """Train by maximum likelihood: cross-entropy of the link state, Gaussian likelihood of the gain.
@@ -222,9 +220,6 @@ class Predictor:
             Where the links come from, to be recorded.
         settings : PredictorSettings, optional
             The paper's networks by default.
-        complete : sequence of PartialMap, optional
-            The complete home of each of the maps of the features' context, for settings with networks "map": they learn
-            how plans go on.
         progress : callable, optional
             Called as ``progress(share_done, message)``.
 
@@ -245,10 +240,8 @@ class Predictor:
         gains_db = np.maximum(link_numbers("gain_db", gain_db, len(features)), GAIN_FLOOR_DB)
         context_networks = {}
         if settings.networks != "paper":
-            _require_context(features, complete)
-            context_networks = fit_context_networks(
-                features, states, gains_db, settings, complete=complete, progress=progress
-            )
+            _require_context(features)
+            context_networks = fit_context_networks(features, states, gains_db, settings, progress=progress)
         model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
         links = {
             f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
@@ -376,16 +369,11 @@ class Predictor:
         return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
 
 
-def _require_context(features: LinkFeatures, complete: Sequence[PartialMap] | None) -> None:
+def _require_context(features: LinkFeatures) -> None:
     if features.context is None:
         raise PredictorError(
             "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
             "or PredictorSettings(networks='paper')."
-        )
-    if complete is not None and len(complete) != len(features.context.maps):
-        raise PredictorError(
-            f"complete has {len(complete)} maps: give one for each of the {len(features.context.maps)} maps of the "
-            "features' context."
         )
 
 

@@ -1,7 +1,7 @@
 """What a map shows around a transmitter, as the image that a convolutional network reads: PartialMap -> window."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -23,9 +23,6 @@ CHANNELS = ("free", "wall", "seen", "hidden", "detour")
 free, wall: share of the cell's area that is known to be so. seen: share of the direct line from the transmitter that is
 observed. hidden: whether that line meets a known wall. detour: how much longer the way on foot is, see `_detours`.
 """
-
-PLAN_CHANNELS = 2
-"""Number of the channels that a complete map has, too: free and wall, the first of them."""
 
 _WALL_COST = 100.0
 """Cost of a cell of nothing but wall to one who walks, in cells."""
@@ -51,12 +48,11 @@ def transmitter_windows(context: LinkContext) -> tuple[NDArray[np.uint8], NDArra
     index : (N,) int array
         Which of them is each link's.
     """
-    return _each(context, transmitter_window, len(CHANNELS)), window_index(context)
-
-
-def plan_windows(context: LinkContext) -> NDArray[np.uint8]:
-    """Draw free and wall of every window of `transmitter_windows`: (W, ..., PLAN_CHANNELS) uint8 array."""
-    return _each(context, _plan_window, PLAN_CHANNELS)
+    places, index = _transmitters(context)
+    windows = np.zeros((len(places), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), dtype=np.uint8)
+    for window, (number, x, y) in zip(windows, places, strict=True):
+        window[:] = transmitter_window(context.maps[int(number)], np.array([x, y]))
+    return windows, index
 
 
 def window_index(context: LinkContext) -> NDArray[np.intp]:
@@ -68,13 +64,6 @@ def window_places(context: LinkContext) -> NDArray[np.float32]:
     """Return where receivers (N, 2) are in the windows: x, y in cells, those outside at the border."""
     places = (context.rx_m - context.tx_m)[:, :2] / CELL_M + WINDOW_CELLS / 2
     return np.clip(places, 0.5, WINDOW_CELLS - 0.5).astype(np.float32)
-
-
-def _each(
-    context: LinkContext, draw: Callable[[PartialMap, NDArray[np.float64]], NDArray[np.uint8]], channels: int
-) -> NDArray[np.uint8]:
-    windows = [draw(context.maps[int(number)], np.array([x, y])) for number, x, y in _transmitters(context)[0]]
-    return np.stack(windows) if windows else np.zeros((0, WINDOW_CELLS, WINDOW_CELLS, channels), dtype=np.uint8)
 
 
 def _transmitters(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
@@ -106,11 +95,6 @@ def transmitter_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArra
     starts = np.tile(start, (len(centres), 1))
     unknown, blocked = (of(state, starts, centres).reshape(free.shape) for of in (unknown_shares, wall_shares))
     return _in_255ths([free, wall, 1.0 - unknown, blocked > _GRAZE, _detours(wall)])
-
-
-def _plan_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
-    state, start = _surroundings(partial, tx_m)
-    return _in_255ths(_plan(state, _edges(partial, start)))
 
 
 def _in_255ths(layers: Sequence[NDArray[np.generic]]) -> NDArray[np.uint8]:

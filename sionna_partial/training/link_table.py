@@ -67,16 +67,6 @@ class LinkTable:
         assert self.phi.context is not None
         return self.phi.context
 
-    @property
-    def complete_of_maps(self) -> list[PartialMap]:
-        """The complete home of each of the context's maps; of a map without links, the map itself."""
-        numbers, links = np.unique(self.context.map_index, return_index=True)
-        homes = dict(zip(numbers.tolist(), map(str, self.home[links]), strict=True))
-        return [
-            self.complete_maps[homes[number]] if number in homes else partial
-            for number, partial in enumerate(self.context.maps)
-        ]
-
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
         """Return the links that an index array, a mask (N,) or a slice selects."""
         phi = self.phi.take(index)

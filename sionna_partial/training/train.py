@@ -167,7 +167,6 @@ def train(
         indoors.gain_db,
         homes=train_homes,
         settings=settings,
-        complete=indoors.complete_of_maps,
         progress=lambda share, message: report(0.6 * share, message),
     )
     predictor = predictor.fit_indoor(unsure.phi, unsure.inside)
