@@ -213,6 +213,15 @@ class TestRefused:
         with pytest.raises(PredictorError, match=r"phi has no context: give the LinkFeatures of link_features\."):
             replace(table, phi=replace(table.phi, context=None))
 
+    def test_truth_that_is_none(self) -> None:
+        table = make_table(homes=1, links=3)
+        for change, message in (
+            ({"gain_db": np.where(np.arange(len(table)) == 1, np.nan, table.gain_db)}, r"gain_db\[1\] = nan"),
+            ({"link_state": np.full(len(table), 7, dtype=np.uint8)}, r"link_state\[0\] = 7"),
+        ):
+            with pytest.raises(PredictorError, match=message):
+                replace(table, **change)
+
     def test_no_tables(self) -> None:
         with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
             LinkTable.concatenate([])

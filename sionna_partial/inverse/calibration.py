@@ -1,7 +1,5 @@
 """Which material makes the measured gains likeliest, how sure that is, and the map with it: measurements -> scene."""
 
-import hashlib
-import json
 import logging
 import math
 import time
@@ -16,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.files import atomic_write, output_path
+from sionna_partial.inverse.checkpoint import Checkpoint, run_fingerprint
 from sionna_partial.inverse.material_fit import (
     MaterialTarget,
     Point,
@@ -189,7 +187,7 @@ def calibrate_materials(
         Seed of the rays that find the paths of a mesh, in place of that in `settings`. Nothing else is drawn.
     checkpoint : path-like, optional
         JSON file in which what has been found is kept. With the same arguments, a run that was stopped or killed goes
-        on from there, to the same result.
+        on from there, to the same result; with others the file is refused.
     progress : callable, optional
         Called as ``progress(share_done, message)``.
 
@@ -208,7 +206,7 @@ def calibrate_materials(
     BackendError
         If LLVM or Sionna RT cannot be used.
     OutputError
-        If the checkpoint cannot be written.
+        If the checkpoint cannot be written, or is of another calibration.
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     require(start is None or isinstance(start, Material), "start", start, "give a Material, or None for the scene's.")
@@ -217,16 +215,19 @@ def calibrate_materials(
     measured = measurements_of(measurements)
     require_places(partial, measured, settings.frequency_hz)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))
+    store = Checkpoint(checkpoint, _fingerprint(building, measured, settings, scene_settings))
+    known = store.read(_parsed_losses) or {}
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
     paths = building.paths(measured, settings, scene_settings, report)
     used, left_out = usable_links(paths, measured)
     target = MaterialTarget(paths.of_links(used), measured.gain_db[used])
-    state = _Checkpoint(checkpoint, _fingerprint(building, measured, settings, scene_settings), target)
+    target.known.update(known)
+    kept = _Kept(target, store)
     try:
         fit = _fit(target, building.start, settings.frequency_hz, report)
     finally:
-        state.save()
+        kept.save()
     report(1.0, "done")
     result = _result(building, fit, measured, used, left_out, paths, settings)
     for name in result.undetermined:
@@ -244,55 +245,34 @@ class _Fit:
     deviations: NDArray[np.float64]
 
 
-class _Checkpoint:
-    """Keeps the losses that a target has found in a file, and brings those of an earlier run back."""
+class _Kept:
+    """The losses that a target finds, as a checkpoint keeps them."""
 
-    def __init__(self, path: str | PathLike[str] | None, fingerprint: str, target: MaterialTarget) -> None:
-        self._path = None if path is None else output_path(path)
-        self._fingerprint, self._target, self._saved_s = fingerprint, target, time.monotonic()
-        if self._path is None:
-            return
-        if self._path.is_file():
-            target.known.update(self._read())
+    def __init__(self, target: MaterialTarget, checkpoint: Checkpoint) -> None:
+        self._target, self._checkpoint, self._saved_s = target, checkpoint, time.monotonic()
         self.save()
         target.on_progress = self._on_progress
-
-    def _read(self) -> dict[str, list[float]]:
-        assert self._path is not None  # there is a file
-        try:
-            state = json.loads(self._path.read_bytes())
-            if state["fingerprint"] == self._fingerprint:
-                return {str(key): [float(value) for value in values] for key, values in state["found"].items()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            pass
-        _log.warning("checkpoint '%s' is damaged, or of another calibration: it starts anew.", self._path)
-        return {}
 
     def _on_progress(self) -> None:
         if time.monotonic() - self._saved_s > SAVE_EVERY_S:
             self.save()
 
     def save(self) -> None:
-        """Write the file, if there is one."""
-        if self._path is not None:
-            with atomic_write(self._path, "w") as stream:
-                json.dump({"fingerprint": self._fingerprint, "found": self._target.known}, stream)
-            self._saved_s = time.monotonic()
+        """Write the checkpoint."""
+        self._checkpoint.write(self._target.known)
+        self._saved_s = time.monotonic()
+
+
+def _parsed_losses(record: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
+    return {str(key): [float(value) for value in values] for key, values in record.items()}
 
 
 def _fingerprint(
     building: MeasuredBuilding, measured: Measurements, settings: TraceSettings, scene_settings: SceneSettings
 ) -> str:
-    """Hash of all that the result depends on."""
-    partial, mesh = building.partial, building.partial.mesh
-    numbers = [partial.resolution_m, *partial.origin_m, partial.wall_height_m]
     materials = [asdict(each) for each in building.start.values()]
-    settings_text = json.dumps([asdict(settings), asdict(scene_settings), *materials])
-    digest = hashlib.sha256(f"{numbers} {partial.shape} {settings_text}".encode())
-    arrays = [partial.state, measured.tx, measured.rx, measured.gain_db]
-    for array in arrays if mesh is None else [*arrays, mesh.vertices_m, mesh.triangles, mesh.material]:
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    chosen = {"trace": asdict(settings), "scene": asdict(scene_settings), "start": materials}
+    return run_fingerprint(building.partial, chosen, measured.tx, measured.rx, measured.gain_db)
 
 
 def _fit(target: MaterialTarget, start: Mapping[str, Material], frequency_hz: float, report: Progress) -> _Fit:

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S
+from sionna_partial.inverse.checkpoint import Checkpoint, run_fingerprint, write_json
 from sionna_partial.inverse.differentiable_links import DifferentiableScene
 from sionna_partial.inverse.placement_area import PlacementArea, placement_area
 from sionna_partial.inverse.placement_climb import Climb, climb_on, smoothed_slope
 from sionna_partial.inverse.placement_objective import PlacementObjective
-from sionna_partial.inverse.placement_state import PlacementState, search_fingerprint, write_json
+from sionna_partial.inverse.placement_state import PlacementState
 from sionna_partial.inverse.placement_views import PlacementViews
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.maps.map_files import load_map
@@ -234,7 +235,7 @@ def place_transmitter(
         "scene_settings": asdict(differentiable.paths.scene_settings),
         "trace_settings": asdict(differentiable.paths.settings),
     }
-    state = PlacementState(checkpoint, search_fingerprint(partial, settings))
+    state = PlacementState(Checkpoint(checkpoint, run_fingerprint(partial, settings)))
     return _Search(differentiable, area, wanted).run(int(seed), settings, state, report)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.features import LinkFeatures, link_numbers, link_states
 from sionna_partial.learning.link_context import LinkContext
 from sionna_partial.maps.partial_map import PartialMap
 
@@ -40,7 +40,7 @@ class LinkTable:
     Raises
     ------
     PredictorError
-        If the features have no context.
+        If the features have no context, or link states or gains are of another shape or no such numbers.
     """
 
     home: NDArray[np.str_]
@@ -56,6 +56,8 @@ class LinkTable:
     def __post_init__(self) -> None:
         if self.phi.context is None:
             raise PredictorError("phi has no context: give the LinkFeatures of link_features.")
+        link_states("link_state", self.link_state, len(self))
+        link_numbers("gain_db", self.gain_db, len(self))
 
     def __len__(self) -> int:
         """Return the number of links N."""
