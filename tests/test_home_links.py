@@ -175,6 +175,17 @@ class TestSeeds:
         assert (far.observed_fraction >= table.observed_fraction).all()
         assert (far.observed_fraction > table.observed_fraction).any()
 
+    def test_places_are_not_where_errors_put_walls(self, home: PartialMap) -> None:
+        sensor = SensorSettings(range_noise_m=0.1, drift_m_per_m=0.1)
+        wrong = home_links(home, "two rooms", replace(SETTINGS, sensor=sensor))
+        area = map_area(home, SETTINGS.margin_m)
+        for number, partial in enumerate(wrong.context.maps):
+            here = wrong.context.map_index == number
+            for places_m in (wrong.context.tx_m[here], wrong.context.rx_m[here]):
+                assert (partial.state_at(places_m) != CellState.WALL).all()
+        walls = np.logical_or.reduce([each.state == CellState.WALL for each in wrong.context.maps])
+        assert (walls & (area.state == CellState.FREE)).any()
+
     def test_size_of_the_grid_is_of_no_account(self, table: LinkTable) -> None:
         moved = two_rooms((200, 300), (120, 44))
         shift = (np.array([44, 120]) - [3, 2]) * 0.1

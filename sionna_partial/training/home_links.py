@@ -48,7 +48,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
     cells, the second half (`anywhere`) from all cells of the map area that are not walls. The map area is the bounding
     box of the known cells and `margin_m` around it, whatever the size of the grid: a small home in a large empty grid
-    would have receivers outside and no others. No receiver is nearer than `NEAREST_M` to its transmitter.
+    would have receivers outside and no others. None is where a robot with errors has mapped a wall, as no link can be
+    predicted there. No receiver is nearer than `NEAREST_M` to its transmitter.
 
     The truth of a receiver that is not in a free cell of the home is outage, by definition (paper, "Indoor-Outdoor
     Estimation"); that of the others is their trace on the complete home. The places and the robot depend on `name` and
@@ -84,7 +85,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     area = map_area(home, settings.margin_m)
     rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
     maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=settings.sensor)
-    places = _draw_places(area, name, settings, rng)
+    places = _draw_places(area, maps, name, settings, rng)
     truth = _truth(area, places, settings)
     seen = zip(settings.stages, maps, _features(maps, places, settings), strict=True)
     return LinkTable.concatenate(
@@ -116,9 +117,12 @@ def map_area(home: PartialMap, margin_m: float) -> PartialMap:
     return replace(home, state=state, origin_m=corner)
 
 
-def _draw_places(home: PartialMap, name: str, settings: DatasetSettings, rng: np.random.Generator) -> _Places:
-    """Draw the transmitters, and for each of them receivers in free cells, and in all cells that are not walls."""
-    free, open_cells = home.state == CellState.FREE, home.state != CellState.WALL
+def _draw_places(
+    home: PartialMap, maps: list[PartialMap], name: str, settings: DatasetSettings, rng: np.random.Generator
+) -> _Places:
+    """Draw the transmitters, and for each receivers in free cells, and in all cells that no map has as walls."""
+    open_cells = np.logical_and.reduce([each.state != CellState.WALL for each in (home, *maps)])
+    free = open_cells & (home.state == CellState.FREE)
     count = settings.transmitters_per_home
     tx_m = list(_points_in(free, count, home, settings.tx_height_m, rng))
     receivers, drawn = [], []
