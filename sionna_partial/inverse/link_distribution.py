@@ -1,9 +1,10 @@
 """The predicted distribution of links as TensorFlow tensors: what objectives and losses are made of."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 from sionna_partial.constants import LinkState
+from sionna_partial.learning.predictor import LinkPrediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,13 @@ class LinkDistribution:
             gain_nlos_mean_db=means_db[LinkState.NLOS],
             gain_nlos_std_db=stds_db[LinkState.NLOS],
         )
+
+    @classmethod
+    def of_prediction(cls, prediction: LinkPrediction) -> "LinkDistribution":
+        """Take what was predicted as constants."""
+        import tensorflow as tf
+
+        return cls(*(tf.constant(getattr(prediction, each.name), dtype=tf.float64) for each in fields(cls)))
 
     def coverage(self, threshold_db: float, softness_db: float = 0.0) -> Any:
         """Return the probability (N,) that the gain exceeds a threshold [dB].

@@ -5,8 +5,8 @@ from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
+from sionna_partial.inverse.link_distribution import LinkDistribution
 from sionna_partial.learning.predictor import LinkPrediction
 from sionna_partial.settings import Objective, require, require_number
 
@@ -60,26 +60,23 @@ class PlacementObjective:
 
     def values(self, prediction: LinkPrediction) -> NDArray[np.float64]:
         """Return what counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
-        if self.name == "percentile":
-            return prediction.gain_mean_db
-        los = self._exceeds(prediction.gain_los_mean_db, prediction.gain_los_std_db)
-        return prediction.p_los * los + prediction.p_nlos * self._exceeds(
-            prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db
-        )
+        return np.asarray(self._values(LinkDistribution.of_prediction(prediction)))
 
     def score(self, values: NDArray[np.float64], weight: NDArray[np.float64]) -> float:
         """Join the values (N,) of receivers with weights (N,)."""
         return float(values @ self._shares(values, weight))
 
-    def tensor(self, distribution: Any, weight: NDArray[np.float64]) -> Any:
+    def tensor(self, distribution: LinkDistribution, weight: NDArray[np.float64]) -> Any:
         """Do the same with the distribution of `DifferentiableLinks`, as a tensor that can be differentiated."""
         import tensorflow as tf
 
-        if self.name == "percentile":
-            values = distribution.gain_mean_db
-        else:
-            values = distribution.coverage(self.threshold_db, softness_db=self.softness_db)
+        values = self._values(distribution)
         return tf.reduce_sum(values * tf.cast(self._shares(values.numpy(), weight), values.dtype))
+
+    def _values(self, distribution: LinkDistribution) -> Any:
+        if self.name == "percentile":
+            return distribution.gain_mean_db
+        return distribution.coverage(self.threshold_db, softness_db=self.softness_db)
 
     def _shares(self, values: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
         """How much each receiver counts (N,); the sum is 1."""
@@ -90,13 +87,6 @@ class PlacementObjective:
         shares = np.empty(len(values))
         shares[order] = np.diff(_counted(ends)) / _counted(np.ones(1))
         return shares
-
-    def _exceeds(self, mean_db: NDArray[np.float64], std_db: NDArray[np.float64]) -> NDArray[np.float64]:
-        """P(gain > threshold) of normal distributions, certain ones among them."""
-        std_db = np.hypot(std_db, self.softness_db)
-        above_db = mean_db - self.threshold_db
-        spread = std_db > 0.0
-        return np.where(spread, ndtr(above_db / np.where(spread, std_db, 1.0)), above_db > 0.0)
 
 
 def _counted(share: NDArray[np.float64]) -> NDArray[np.float64]:
