@@ -13,7 +13,7 @@ from sionna_partial.learning.link_context import SEEN_M
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.fixed_paths import PathScene
-from sionna_partial.tracing.scene import itu_constants
+from sionna_partial.tracing.scene_xml import itu_constants
 from sionna_partial.tracing.trace import Progress, nearest_m
 
 FEWEST_LINKS = 10

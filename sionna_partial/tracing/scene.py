@@ -15,13 +15,13 @@ from scipy import ndimage
 
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
-from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.mesh import SceneMesh
 from sionna_partial.maps.mesh_scene import exported_record
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
-from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, settings_or_default
+from sionna_partial.settings import Material, SceneSettings, settings_or_default
 from sionna_partial.tracing.plan import Plan, prepare_plan
+from sionna_partial.tracing.scene_xml import add_material, add_shape, write_ply, write_xml
 from sionna_partial.walls.cells import row_runs
 from sionna_partial.walls.lattice import lattice_outlines
 from sionna_partial.walls.outlines import Outlines, wall_outlines
@@ -31,9 +31,6 @@ SHAPES = ("walls", "floor", "ceiling")
 
 FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
-
-SIONNA_LOAD_GHZ = 3.5
-"""Frequency at which Sionna RT evaluates the materials of a scene while it loads it [GHz]."""
 
 
 @dataclass(frozen=True)
@@ -254,13 +251,13 @@ def write_scene(
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
     (folder / "meshes").mkdir(exist_ok=True)
     scene = ET.Element("scene", version="2.1.0")
-    _add_material(scene, "material", geometry.material, frequency_hz)
+    add_material(scene, "material", geometry.material, frequency_hz)
     for name, (vertices, faces) in _meshes(geometry).items():
         if len(faces):
             mesh = trimesh.Trimesh(vertices + shift, faces, process=False)
             mesh.export(folder / "meshes" / f"{name}.ply")
-            _add_shape(scene, name, "material")
-    return _write_xml(scene, folder)
+            add_shape(scene, name, "material")
+    return write_xml(scene, folder)
 
 
 def write_mesh_scene(
@@ -299,64 +296,10 @@ def write_mesh_scene(
     for index in np.unique(mesh.material):
         name, material = f"part{index}", mesh.materials[index] or default_material
         used, triangles = np.unique(mesh.triangles[mesh.material == index], return_inverse=True)
-        _write_ply(folder / "meshes" / f"{name}.ply", mesh.vertices_m[used] - shift, triangles.reshape(-1, 3))
-        _add_material(scene, f"material{index}", material, frequency_hz)
-        _add_shape(scene, name, f"material{index}")
-    return _write_xml(scene, folder)
-
-
-def _write_ply(path: Path, vertices_m: NDArray[np.float64], triangles: NDArray[np.integer]) -> None:
-    """Write a mesh with all digits of its vertices (trimesh would round them to float32)."""
-    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    faces["count"], faces["index"] = 3, triangles
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices_m)}"]
-    lines += [f"property double {axis}" for axis in "xyz"]
-    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
-    path.write_bytes("\n".join(lines).encode() + vertices_m.astype("<f8").tobytes() + faces.tobytes())
-
-
-def _add_shape(scene: ET.Element, name: str, material: str) -> None:
-    shape = ET.SubElement(scene, "shape", type="ply", id=name)
-    ET.SubElement(shape, "string", name="filename", value=f"meshes/{name}.ply")
-    ET.SubElement(shape, "boolean", name="face_normals", value="true")
-    ET.SubElement(shape, "ref", name="bsdf", id=material)
-
-
-def _write_xml(scene: ET.Element, folder: Path) -> Path:
-    ET.indent(scene)
-    path = folder / "scene.xml"
-    ET.ElementTree(scene).write(path, encoding="utf-8")
-    return path
-
-
-def _loads_by_name(itu: str) -> bool:
-    """Whether Sionna RT loads an ITU material by its name (2.2.0 has no display colour for vacuum, and fails)."""
-    return itu != "vacuum" and any(low <= SIONNA_LOAD_GHZ <= high for low, high in ITU_BANDS_GHZ[itu])
-
-
-def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz: float) -> None:
-    if material.itu is not None and _loads_by_name(material.itu):
-        bsdf = ET.SubElement(scene, "bsdf", type="itu-radio-material", id=name)
-        ET.SubElement(bsdf, "string", name="type", value=material.itu)
-    else:
-        permittivity, conductivity = material.relative_permittivity, material.conductivity_s_m
-        if material.itu is not None:
-            permittivity, conductivity = itu_constants(material.itu, frequency_hz)
-        bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id=name)
-        ET.SubElement(bsdf, "float", name="relative_permittivity", value=repr(float(permittivity)))
-        ET.SubElement(bsdf, "float", name="conductivity", value=repr(float(conductivity)))
-    ET.SubElement(bsdf, "float", name="thickness", value=repr(float(material.thickness_m)))
-
-
-def itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
-    """Return relative permittivity and conductivity [S/m] of an ITU material (ITU-R P.2040-3, eq. 28 and 29)."""
-    load_llvm()
-    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
-
-    frequency_ghz = frequency_hz / 1e9
-    bands = ITU_MATERIALS_PROPERTIES[name].items()
-    a, b, c, d = next(factors for (low, high), factors in bands if low <= frequency_ghz <= high)
-    return a * frequency_ghz**b, c * frequency_ghz**d
+        write_ply(folder / "meshes" / f"{name}.ply", mesh.vertices_m[used] - shift, triangles.reshape(-1, 3))
+        add_material(scene, f"material{index}", material, frequency_hz)
+        add_shape(scene, name, f"material{index}")
+    return write_xml(scene, folder)
 
 
 def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]]:
