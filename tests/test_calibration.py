@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.errors import MeasurementError, OutputError, PositionError, SettingsError
-from sionna_partial.inverse import calibration, material_fit
+from sionna_partial.inverse import calibration, material_search
 from sionna_partial.inverse.measured_building import custom_material
 from sionna_partial.inverse.slab import reflection_loss_db
 from sionna_partial.maps.mesh import merged_mesh
@@ -66,7 +66,7 @@ def short_search() -> Iterator[None]:
     """A slab of 1 cm has few teeth: few cells are enough, and quick."""
     with pytest.MonkeyPatch.context() as patch:
         for name, value in {"COARSE_PARTS": 12, "MOST_TEETH": 2, "MOST_CELLS": 120, "FEW_TEETH": 1}.items():
-            patch.setattr(material_fit, name, value)
+            patch.setattr(material_search, name, value)
         yield
 
 

@@ -54,6 +54,7 @@ MODULES = (
         "inverse.gain_errors",
         "inverse.material_paths",
         "inverse.material_fit",
+        "inverse.material_search",
     ),
     *("inverse.measured_building", "inverse.calibration"),
     *("inverse.placement_area", "inverse.placement_objective", "inverse.placement_climb"),

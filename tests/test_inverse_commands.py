@@ -9,7 +9,7 @@ from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
 from sionna_partial.cli import app
-from sionna_partial.inverse import material_fit
+from sionna_partial.inverse import material_search
 
 pytestmark = pytest.mark.usefixtures("command_line")
 
@@ -41,7 +41,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"COARSE_PARTS": 8, "MOST_TEETH": 1, "MOST_CELLS": 40, "FEW_TEETH": 1}.items():
-        monkeypatch.setattr(material_fit, name, value)
+        monkeypatch.setattr(material_search, name, value)
 
 
 def run(*arguments: object) -> Result:

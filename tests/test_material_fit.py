@@ -1,70 +1,16 @@
-"""The search finds what explains gains, on made-up gains whose posterior is known, without tracing anything."""
+"""Losses, slopes and priors of materials, on made-up gains whose posterior is known."""
 
 import math
-from typing import cast
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from material_fakes import FREQUENCY_HZ, fake_target, point, quiet
 
 from sionna_partial.inverse import material_fit
 from sionna_partial.inverse.gain_errors import GainErrors
-from sionna_partial.inverse.material_fit import (
-    MaterialTarget,
-    Point,
-    Posterior,
-    descend,
-    lossless_scale_s_m,
-    prior_posterior,
-    search,
-)
-from sionna_partial.inverse.material_paths import MaterialPaths
-from sionna_partial.inverse.slab import reflection_loss_db
+from sionna_partial.inverse.material_fit import Posterior, descend, lossless_scale_s_m, prior_posterior
 
-FREQUENCY_HZ, THICKNESS_M = 28e9, 0.03
-ANGLES_DEG = np.linspace(2.0, 78.0, 60)
 GRADIENT_STEP = 1e-5
-
-
-class FakePaths:
-    """One reflection a link, at an angle of its own, in double precision."""
-
-    link = np.arange(len(ANGLES_DEG))
-    is_direct = np.zeros(len(ANGLES_DEG), dtype=bool)
-    at_once = 7
-
-    def power(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        loss_db = reflection_loss_db(
-            float(permittivity[0]), float(conductivity_s_m[0]), THICKNESS_M, FREQUENCY_HZ, ANGLES_DEG
-        )
-        return np.asarray(10.0 ** (-(80.0 + loss_db) / 10.0))
-
-    def powers(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        assert len(permittivity) <= self.at_once
-        return np.stack([self.power(*pair) for pair in zip(permittivity, conductivity_s_m, strict=True)])
-
-    def slopes(
-        self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        at = np.concatenate([permittivity, conductivity_s_m])
-        ends = [[self.power(place[:1], place[1:]) for place in (at + move, at - move)] for move in np.eye(2) * 1e-6]
-        slopes = np.stack([(high - low) / 2e-6 for high, low in ends], axis=1)
-        return self.power(permittivity, conductivity_s_m), slopes
-
-
-def fake_target(permittivity: float, conductivity_s_m: float, noise_db: float = 1.0) -> MaterialTarget:
-    gain_db = 10.0 * np.log10(FakePaths().power(np.array([permittivity]), np.array([conductivity_s_m])))
-    noise = noise_db * np.random.default_rng(0).standard_normal(len(gain_db))
-    return MaterialTarget(cast(MaterialPaths, FakePaths()), gain_db + noise)
-
-
-def quiet(share: float, message: str) -> None:
-    assert 0.0 <= share <= 1.0
-    assert message
-
-
-def point(target: MaterialTarget, permittivity: float, conductivity_s_m: float) -> Point:
-    return target.at(np.array([permittivity]), np.array([conductivity_s_m]))
 
 
 class TestMaterialTarget:
@@ -106,33 +52,6 @@ class TestMaterialTarget:
     def test_vanishing_paths_give_a_floor(self) -> None:
         gains_db = fake_target(4.0, 0.3).gains_db(np.array([1.0]), np.array([0.0]))
         np.testing.assert_array_equal(gains_db, material_fit.LOWEST_GAIN_DB)
-
-
-class TestSearch:
-    @pytest.mark.parametrize(("permittivity", "conductivity_s_m"), [(2.94, 0.12), (3.9, 0.02), (6.3, 1e-4)])
-    def test_finds_the_tooth(self, permittivity: float, conductivity_s_m: float) -> None:
-        target = fake_target(permittivity, conductivity_s_m)
-        found, posterior = search(target, point(target, 25.0, 20.0), 0, THICKNESS_M, FREQUENCY_HZ, quiet)
-        steps, _ = descend(target, found[0], quiet)
-        truth = point(target, permittivity, conductivity_s_m)
-        assert steps[-1].loss <= truth.loss + 0.5
-        assert steps[-1].permittivity[0] == pytest.approx(permittivity, rel=0.03)
-        low, high = posterior.interval(posterior.permittivity)
-        assert low - 0.02 <= permittivity <= high + 0.02
-        assert posterior.weight.sum() == pytest.approx(1.0)
-
-    def test_opaque_slab_hides_its_conductivity(self) -> None:
-        target = fake_target(5.24, 0.8, noise_db=3.0)
-        _, posterior = search(target, point(target, 3.0, 0.1), 0, 0.1, FREQUENCY_HZ, quiet)
-        low, high = posterior.interval(posterior.conductivity_s_m)
-        assert high / low > 5.0
-
-    def test_same_answer_from_any_start(self) -> None:
-        answers = []
-        for start in ((3.0, 0.1), (30.0, 10.0)):
-            target = fake_target(4.0, 0.3)
-            answers.append(search(target, point(target, *start), 0, THICKNESS_M, FREQUENCY_HZ, quiet)[1])
-        np.testing.assert_array_equal(answers[0].weight, answers[1].weight)
 
 
 class TestDescend:

@@ -22,9 +22,9 @@ from sionna_partial.inverse.material_fit import (
     descend,
     lossless_scale_s_m,
     prior_posterior,
-    search,
 )
 from sionna_partial.inverse.material_paths import MaterialPaths, link_gains_db
+from sionna_partial.inverse.material_search import search
 from sionna_partial.inverse.measured_building import (
     MeasuredBuilding,
     require_places,

@@ -1,0 +1,54 @@
+"""Made-up gains of reflections whose posterior is known, without tracing anything."""
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.inverse.material_fit import MaterialTarget, Point
+from sionna_partial.inverse.material_paths import MaterialPaths
+from sionna_partial.inverse.slab import reflection_loss_db
+
+FREQUENCY_HZ, THICKNESS_M = 28e9, 0.03
+ANGLES_DEG = np.linspace(2.0, 78.0, 60)
+
+
+class FakePaths:
+    """One reflection a link, at an angle of its own, in double precision."""
+
+    link = np.arange(len(ANGLES_DEG))
+    is_direct = np.zeros(len(ANGLES_DEG), dtype=bool)
+    at_once = 7
+
+    def power(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        loss_db = reflection_loss_db(
+            float(permittivity[0]), float(conductivity_s_m[0]), THICKNESS_M, FREQUENCY_HZ, ANGLES_DEG
+        )
+        return np.asarray(10.0 ** (-(80.0 + loss_db) / 10.0))
+
+    def powers(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        assert len(permittivity) <= self.at_once
+        return np.stack([self.power(*pair) for pair in zip(permittivity, conductivity_s_m, strict=True)])
+
+    def slopes(
+        self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        at = np.concatenate([permittivity, conductivity_s_m])
+        ends = [[self.power(place[:1], place[1:]) for place in (at + move, at - move)] for move in np.eye(2) * 1e-6]
+        slopes = np.stack([(high - low) / 2e-6 for high, low in ends], axis=1)
+        return self.power(permittivity, conductivity_s_m), slopes
+
+
+def fake_target(permittivity: float, conductivity_s_m: float, noise_db: float = 1.0) -> MaterialTarget:
+    gain_db = 10.0 * np.log10(FakePaths().power(np.array([permittivity]), np.array([conductivity_s_m])))
+    noise = noise_db * np.random.default_rng(0).standard_normal(len(gain_db))
+    return MaterialTarget(cast(MaterialPaths, FakePaths()), gain_db + noise)
+
+
+def quiet(share: float, message: str) -> None:
+    assert 0.0 <= share <= 1.0
+    assert message
+
+
+def point(target: MaterialTarget, permittivity: float, conductivity_s_m: float) -> Point:
+    return target.at(np.array([permittivity]), np.array([conductivity_s_m]))
