@@ -173,7 +173,7 @@ class TestFitContextNetworks:
             )
         assert [share for share, _ in calls] == [0.0, 0.4, 0.8]
         assert [message.partition(", loss ")[0] for _, message in calls] == [f"step {n} of 5" for n in (0, 2, 4)]
-        (message,) = caplog.messages
+        (message,) = (record.message for record in caplog.records if record.name == module.__name__)
         assert message.startswith("5 steps on 4 windows: loss ")
 
     def test_diverging_training(self):

@@ -119,12 +119,15 @@ class TestRate:
     def test_what_was_there_does_not_count(
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        now = iter([100.0, 110.0, 130.0, 190.0])
-        monkeypatch.setattr("sionna_partial.commands.shell.monotonic", lambda: next(now))
+        now = 100.0
+        monkeypatch.setattr("sionna_partial.commands.shell.monotonic", lambda: now)
         with show_rate("homes") as report:
             report(50, 60, "starting")
+            now = 110.0
             report(52, 60, "too soon for another line")
+            now = 130.0
             report(55, 60, "too soon too")
+            now = 190.0
             report(60, 60, "the end")
         lines = ["50 of 60 homes starting", "60 of 60 homes (6.67/min, 0:00:00 left) the end"]
         assert capsys.readouterr().err.splitlines() == lines
