@@ -40,13 +40,15 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 700 --first-seed 10000
 	@$(BIN)/sionna-partial dataset build/predictor/lidar --homes 350 --first-seed 10700 --field-of-view 360 --range 8
 	@$(BIN)/sionna-partial dataset build/predictor/wide --homes 350 --first-seed 11050 --field-of-view 120 --range 5
+	@$(BIN)/sionna-partial dataset build/predictor/errors --homes 350 --first-seed 11400 \
+		--range-noise 0.03 --drift 0.01 --missed-walls 0.05
 	@for networks in paper map; do \
-		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train build/predictor/{camera,lidar,wide} \
+		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train build/predictor/{camera,lidar,wide,errors} \
 			--networks $$networks --test-share 0.15 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
-	@$(BIN)/sionna-partial evaluate build/predictor/{camera,lidar,wide} --out build/predictor/report > /dev/null
+	@$(BIN)/sionna-partial evaluate build/predictor/{camera,lidar,wide,errors} --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 
 wheel: $(READY) ## Build the wheel (dist/)

@@ -179,7 +179,7 @@ class TestFitContextNetworks:
     def test_diverging_training(self):
         phi, state, gain_db = few_links()
         with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
-            fit_context_networks(phi, state, gain_db + 1e25, PredictorSettings("paths", passes=1))
+            fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
 
 
 class TestTurning:

@@ -239,7 +239,8 @@ class DifferentiableLinks:
         import tensorflow as tf
 
         require(tf.executing_eagerly(), name, value, "call links eagerly, not within tf.function.")
-        tensor, shape = tf.cast(tf.convert_to_tensor(value, dtype_hint=tf.float64), tf.float64), getattr(self.base, name).shape
+        tensor = tf.cast(tf.convert_to_tensor(value, dtype_hint=tf.float64), tf.float64)
+        shape = getattr(self.base, name).shape
         require(tensor.shape == shape, name, value, f"give a tensor of shape {shape}.")
         low, high = _LIMITS[name]
         numbers = tensor.numpy()

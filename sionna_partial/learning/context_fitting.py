@@ -1,4 +1,4 @@
-"""Training of the networks that see where links run, by maximum likelihood, window by window."""
+"""Training of the networks that see where links run, by proper scores, window by window."""
 
 import logging
 import math
@@ -27,8 +27,8 @@ WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 """Of AdamW; the rate falls to 0 along a cosine."""
 
-GAIN_WEIGHT = 0.3
-"""Weight of the likelihood of gain beside that of the link state."""
+GAIN_WEIGHT = 0.05
+"""Weight of the score of the gain beside the log-likelihood of the link state [1/dB]."""
 
 _REPORT_STEPS = 50
 
@@ -191,12 +191,25 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
             outputs = look(networks, windows, links, places, training=True)
             log_p, means_db, log_variances = decode(outputs, free_db)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
-            gain = 0.5 * (log_variances + tf.square(gain_db[..., None] - means_db) * tf.exp(-log_variances))
+            scores_db = _ranked_score(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
             states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
             linked = tf.cast(link_state[..., None] == states, tf.float32)
-            loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(gain * linked, axis=-1))
+            loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db * linked, axis=-1))
         optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
         return loss
 
     compiled: Callable[..., Any] = tf.function(step, jit_compile=False)
     return compiled
+
+
+def _ranked_score(errors_db: Any, stds_db: Any) -> Any:
+    """Continuous ranked probability score of Gaussians [dB] (Gneiting and Raftery 2007, Eq. 21).
+
+    Gains have longer tails than Gaussians. The likelihood widens them until the tails are covered, which makes the
+    90 % interval too wide for most links; this score does not.
+    """
+    import tensorflow as tf
+
+    z = errors_db / stds_db
+    density = tf.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+    return stds_db * (z * tf.math.erf(z / math.sqrt(2.0)) + 2.0 * density - 1.0 / math.sqrt(math.pi))

@@ -204,9 +204,10 @@ class Predictor:
         settings: PredictorSettings | None = None,
         progress: Progress | None = None,
     ) -> "Predictor":
-        """Train by maximum likelihood: cross-entropy of the link state, Gaussian likelihood of the gain.
+        """Train on links of known truth; the same links and settings give the same weights.
 
-        The same links and settings give the same weights.
+        Link states are learned by cross-entropy; the gain by the paper's networks by Gaussian likelihood, and by those
+        beside them by the continuous ranked probability score.
 
         Parameters
         ----------
