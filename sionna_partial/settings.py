@@ -386,7 +386,7 @@ class PredictorSettings:
     networks: NetworkKind = "paper"
     frequency_hz: float = CARRIER_FREQUENCY_HZ
     diffraction: bool = True
-    passes: int = 12
+    passes: int = 10
     steps: int = 4000
     batch_size: int = 1024
     learning_rate: float = 0.01
