@@ -8,6 +8,8 @@ import math
 import numpy as np
 import pytest
 from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, make_seen_links
+from scipy.integrate import trapezoid
+from scipy.stats import norm
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
@@ -180,6 +182,14 @@ class TestFitContextNetworks:
         phi, state, gain_db = few_links()
         with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
             fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
+
+
+def test_ranked_score_is_the_integral_of_the_squared_difference_of_distributions():
+    gain_db = np.linspace(-60.0, 60.0, 120_001)
+    errors_db, stds_db = np.array([0.0, 2.5, -7.0, 20.0]), np.array([1.0, 4.0, 3.0, 0.5])
+    below = norm.cdf(gain_db / stds_db[:, None])
+    expected = trapezoid((below - (gain_db >= errors_db[:, None])) ** 2, gain_db)
+    np.testing.assert_allclose(module._ranked_score(errors_db, stds_db), expected, atol=2e-3)
 
 
 class TestTurning:
