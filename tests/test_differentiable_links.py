@@ -178,14 +178,15 @@ class TestSlopes:
         with tf.GradientTape(persistent=True) as tape:
             here = tf.unstack(self.outputs(links(**{name: variable}), tf) @ share[:, None])
         found = np.array([np.ravel(tape.gradient(each, variable)) for each in here])
-        value = variable.numpy()
+        value, middle = variable.numpy(), self.outputs(links(), tf).numpy()
         for entry, along in enumerate(np.eye(value.size)):
             places = [value + sign * step * along.reshape(value.shape) for sign in (1, -1)]
             ends = [self.outputs(links(**{name: place}), tf).numpy() for place in places]
             expected = (ends[0] - ends[1]) / (2 * step)
             rounding = 1e-4 / step  # networks have single precision
+            bends = np.abs(ends[0] - 2.0 * middle + ends[1]) / (2 * step)  # of networks, some of which have kinks
             off = np.abs(found[:, entry] - expected @ share)
-            assert (off <= 0.02 * np.abs(expected).sum(axis=1) + rounding).all()
+            assert (off <= 0.02 * np.abs(expected).sum(axis=1) + bends @ share + rounding).all()
             assert np.abs(expected[0]).sum() > 5 * rounding
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
