@@ -6,6 +6,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
+LEARNED_FROM := build/predictor/{camera,lidar,wide,errors}
 
 .PHONY: help demo test lint format lock scenes predictor wheel wheel-check clean
 
@@ -43,12 +44,12 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 	@$(BIN)/sionna-partial dataset build/predictor/errors --homes 350 --first-seed 11400 \
 		--range-noise 0.03 --drift 0.01 --missed-walls 0.05
 	@for networks in paper map; do \
-		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train build/predictor/{camera,lidar,wide,errors} \
+		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
 			--networks $$networks --test-share 0.15 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
-	@$(BIN)/sionna-partial evaluate build/predictor/{camera,lidar,wide,errors} --out build/predictor/report > /dev/null
+	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 
 wheel: $(READY) ## Build the wheel (dist/)

@@ -26,7 +26,7 @@ SCENE = sp.SceneSettings(material=sp.Material(thickness_m=0.02))
 RX_M = np.array(
     [[1.47, 2.51, 1.7], [3.05, 0.61, 1.2], [3.12, 2.52, 1.3], [3.7, 1.2, 1.1], [2.6, 2.45, 1.9], [0.7, 0.7, 1]]
 )
-STEPS = dict(zip(PARAMETERS, (1e-3, 4e-3, 5e-3, 1e-5, 2e7), strict=True))
+STEPS = dict(zip(PARAMETERS, (1e-3, 2e-3, 5e-3, 1e-5, 1e7), strict=True))
 OUTPUTS = tuple(field.name for field in fields(LinkDistribution))
 
 
@@ -178,15 +178,14 @@ class TestSlopes:
         with tf.GradientTape(persistent=True) as tape:
             here = tf.unstack(self.outputs(links(**{name: variable}), tf) @ share[:, None])
         found = np.array([np.ravel(tape.gradient(each, variable)) for each in here])
-        value, middle = variable.numpy(), self.outputs(links(), tf).numpy()
+        value = variable.numpy()
         for entry, along in enumerate(np.eye(value.size)):
             places = [value + sign * step * along.reshape(value.shape) for sign in (1, -1)]
             ends = [self.outputs(links(**{name: place}), tf).numpy() for place in places]
             expected = (ends[0] - ends[1]) / (2 * step)
             rounding = 1e-4 / step  # networks have single precision
-            bends = np.abs(ends[0] - 2.0 * middle + ends[1]) / (2 * step)  # of networks, some of which have kinks
             off = np.abs(found[:, entry] - expected @ share)
-            assert (off <= 0.02 * np.abs(expected).sum(axis=1) + bends @ share + rounding).all()
+            assert (off <= 0.02 * np.abs(expected).sum(axis=1) + rounding).all()
             assert np.abs(expected[0]).sum() > 5 * rounding
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
