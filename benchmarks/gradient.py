@@ -26,7 +26,7 @@ from stock import peak_memory_gb
 import sionna_partial as sp
 from sionna_partial.inverse.differentiable_links import DifferentiableLinks, DifferentiableScene
 from sionna_partial.learning.networks import import_keras
-from sionna_partial.learning.windows import CELL_M
+from sionna_partial.learning.windows import CELLS_M
 from sionna_partial.tracing.fixed_paths import FixedPaths
 
 import_keras()
@@ -97,7 +97,8 @@ def compare(
         left_out = changes(scene, paths, name, reach)
         if bends and name in ("x", "y"):
             axis = "xy".index(name)
-            left_out |= np.abs((rx - tx)[:, axis] / CELL_M % 1.0 - 0.5) * CELL_M <= reach
+            for cell_m in CELLS_M:
+                left_out |= np.abs((rx - tx)[:, axis] / cell_m % 1.0 - 0.5) * cell_m <= reach
         for output in outputs:
             values = np.stack([getattr(answer, output).numpy() for answer in answers])
             errors = differences(steps, values, exact[output, name])

@@ -25,7 +25,7 @@ from sionna_partial.learning.context_networks import (
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import free_space_gain_db
-from sionna_partial.learning.windows import CELL_M, CHANNELS, WINDOW_CELLS, transmitter_windows
+from sionna_partial.learning.windows import WINDOW_CELLS, WINDOWS, transmitter_places, transmitter_windows
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import PredictorSettings
 
@@ -119,7 +119,7 @@ class TestFitContextNetworks:
     def test_links_of_the_rules_look_alike(self):
         """The rooms are seen on the map alone, the paths in one column and what is made of it alone."""
         links = make_room_links(*OTHERS)
-        assert np.flatnonzero(np.ptp(link_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [20, 26]
+        assert np.flatnonzero(np.ptp(link_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [21, 27]
         assert not links.phi.context.rx_seen.any()
         assert 0.4 < links.in_seen_room.mean() < 0.6
 
@@ -194,15 +194,15 @@ def test_ranked_score_is_the_integral_of_the_squared_difference_of_distributions
 
 class TestTurning:
     def test_eight_ways_keep_each_place_in_its_cell(self):
-        image = np.arange(3 * WINDOW_CELLS**2).reshape(WINDOW_CELLS, WINDOW_CELLS, 3)
-        places = np.random.default_rng(3).uniform(0.5, WINDOW_CELLS - 0.5, (200, 2)).astype(np.float32)
-        expected = image[*places.T[::-1].astype(int)]
+        image, half = np.arange(3 * WINDOW_CELLS**2).reshape(1, WINDOW_CELLS, WINDOW_CELLS, 3), WINDOW_CELLS / 2
+        places = np.random.default_rng(3).uniform(0.5 - half, half - 0.5, (200, 2)).astype(np.float32)
+        expected = image[0][*(places + half).T[::-1].astype(int)]
         ways = []
         for turn in range(8):
-            turned, moved = module._turned(image, turn), module._turned_places(places, turn)
-            np.testing.assert_array_equal(turned[*moved.T[::-1].astype(int)], expected)
-            np.testing.assert_allclose(*(abs(each - 32.0).sum(axis=1) for each in (moved, places)), rtol=1e-5)
-            ways.append(turned[:, :, 0].ravel())
+            turned, moved = module._turned(image, turn), module._turned_offsets(places, turn)
+            np.testing.assert_array_equal(turned[0][*(moved + half).T[::-1].astype(int)], expected)
+            np.testing.assert_allclose(*(abs(each).sum(axis=1) for each in (moved, places)), rtol=1e-5)
+            ways.append(turned[..., 0].ravel())
         assert len(np.unique(ways, axis=0)) == 8
 
 
@@ -222,7 +222,7 @@ def examples(links):
 class TestExamples:
     def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
         phi, context = links.phi, links.phi.context
-        windows, index = transmitter_windows(context)
+        windows, (_, index) = transmitter_windows(context), transmitter_places(context)
         inputs, state = link_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
         turns = []
         for batch in examples.batches(4, np.random.default_rng(4)):
@@ -234,9 +234,9 @@ class TestExamples:
                     if np.array_equal(module._turned(windows[window], way), batch["windows"][number])
                 )
                 turns.append(turn)
-                places = (context.rx_m - context.tx_m)[drawn, :2] / CELL_M + WINDOW_CELLS / 2
-                expected = module._turned_places(places.astype(np.float32), turn)
-                np.testing.assert_allclose(batch["places"][number], expected, atol=1e-4)
+                offsets_m = (context.rx_m - context.tx_m)[drawn, :2].astype(np.float32)
+                expected = module._turned_offsets(offsets_m, turn)
+                np.testing.assert_allclose(batch["offsets_m"][number], expected, atol=1e-4)
                 np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
                 np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
                 free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
@@ -245,18 +245,18 @@ class TestExamples:
 
     def test_shapes_of_a_batch(self, examples):
         (batch,) = examples.batches(1, np.random.default_rng(5))
-        size, links, square = module.WINDOWS_AT_ONCE, module.LINKS_OF_WINDOW, (WINDOW_CELLS, WINDOW_CELLS)
+        size, links = module.WINDOWS_AT_ONCE, module.LINKS_OF_WINDOW
         shapes = {
-            "windows": (size, *square, len(CHANNELS)),
+            "windows": (size, *WINDOWS),
             "links": (size, links, LINK_INPUTS),
-            "places": (size, links, 2),
+            "offsets_m": (size, links, 2),
             **dict.fromkeys(("free_db", "link_state", "gain_db"), (size, links)),
         }
         assert {name: values.shape for name, values in batch.items()} == shapes
         assert {str(values.dtype) for values in batch.values()} == {"float32", "int32"}
 
     def test_each_pass_has_every_window_once(self, links, examples):
-        index = transmitter_windows(links.phi.context)[1]
+        _, index = transmitter_places(links.phi.context)
         drawn = [
             index[int(numbers[0])]
             for batch in examples.batches(3, np.random.default_rng(6))

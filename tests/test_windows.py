@@ -9,22 +9,27 @@ from hypothesis.extra import numpy as hnp
 from sionna_partial.constants import CellState
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.windows import (
-    CELL_M,
+    CELLS_M,
     CHANNELS,
     WINDOW_CELLS,
-    transmitter_window,
+    WINDOWS,
+    map_windows,
+    transmitter_places,
     transmitter_windows,
-    window_index,
-    window_places,
 )
 from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+CELL_M = CELLS_M[0]
 SHAPE = (WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
 HALF_M = WINDOW_CELLS * CELL_M / 2
 ROUNDING = 0.51 / 255
 TX_M = np.array([0.0, 0.0])
-FLOOR = (PartialMap(np.zeros((1, 1), dtype=np.uint8), 1.0),)
+
+
+def transmitter_window(partial, tx_m):
+    """Return the nearest of the windows around a transmitter."""
+    return map_windows(partial, tx_m[None])[0, 0]
 
 
 def channel(window, name):
@@ -220,51 +225,47 @@ def context_of(maps, map_index, tx_m, rx_m):
     return LinkContext(maps, np.array(map_index, dtype=np.int64), *places, gains_db, np.zeros(count))
 
 
+class TestScales:
+    def test_the_far_window_is_the_near_one_of_a_building_that_is_as_much_smaller(self):
+        state = np.random.default_rng(8).choice([FREE, WALL, UNKNOWN], size=(60, 90), p=[0.8, 0.05, 0.15])
+        times = CELLS_M[1] / CELLS_M[0]
+        near = map_windows(PartialMap(state, 0.1), np.array([[4.13, 2.51]]))[0, 0]
+        far = map_windows(PartialMap(state, 0.1 * times), times * np.array([[4.13, 2.51]]))[0, 1]
+        assert_alike(far, near)
+
+    def test_finer_maps_are_drawn_coarser(self):
+        """Cells of 1.2 m are drawn from cells of 0.3 m: any wall makes a wall, and half of a cell free makes it so."""
+        state = np.full((12, 18), UNKNOWN)
+        state[0, 0], state[:6, 6:9], state[6:, 12:14] = WALL, FREE, FREE
+        coarse = np.full((2, 3), UNKNOWN)
+        coarse[0, 0], coarse[0, 1] = WALL, FREE
+        tx_m = np.array([[5.03, 4.01]])
+        one, two = (map_windows(partial, tx_m)[0, 1] for partial in (PartialMap(state, 0.05), PartialMap(coarse, 0.3)))
+        names = [CHANNELS.index(name) for name in ("free", "seen")]
+        np.testing.assert_array_equal(one[..., names], two[..., names])
+
+    def test_walls_beside_the_transmitter_do_not_hide_everything_from_afar(self):
+        """They fill the coarse cell in which it stands."""
+        state = np.full((400, 400), FREE)
+        state[:, 199] = WALL
+        hidden = map_windows(PartialMap(state, 0.05), np.array([[10.02, 10.02]]))[0, 1, ..., CHANNELS.index("hidden")]
+        assert not hidden[32, 33:40].any()
+
+
 class TestTransmitterWindows:
     def test_one_for_every_transmitter_on_every_map(self):
         maps = tuple(PartialMap(np.full((9, 9), state), 0.5) for state in (FREE, WALL))
         one, other = (1.0, 2.0, 1.5), (3.1, 2.0, 1.5)
         txs, map_index = [other, one, one, other, (1.0, 2.0, 0.5)], [0, 1, 0, 0, 0]
         context = context_of(maps, map_index, txs, np.zeros((5, 3)))
-        windows, index = transmitter_windows(context)
-        assert windows.shape == (3, *SHAPE)
+        windows, (_, index) = transmitter_windows(context), transmitter_places(context)
+        assert windows.shape == (3, *WINDOWS)
         assert windows.dtype == np.uint8
         assert index.shape == (5,)
         for number, tx, found in zip(map_index, txs, index, strict=True):
-            np.testing.assert_array_equal(windows[found], transmitter_window(maps[number], np.array(tx[:2])))
-        np.testing.assert_array_equal(window_index(context), index)
+            np.testing.assert_array_equal(windows[found], map_windows(maps[number], np.array([tx[:2]]))[0])
 
     def test_no_links(self):
-        windows, index = transmitter_windows(context_of((), [], [], []))
-        assert windows.shape == (0, *SHAPE)
-        assert index.shape == (0,)
-
-
-class TestWindowPlaces:
-    def test_by_hand(self):
-        tx = (3.0, -2.0, 1.5)
-        rxs = [tx, (3.0 + CELL_M, -2.0, 0.5), (3.0, -2.0 - 2 * CELL_M, 1.5), (3.0 + 0.3 * CELL_M, -2.0, 1.5)]
-        middle = WINDOW_CELLS / 2
-        found = window_places(context_of(FLOOR, [0] * 4, [tx] * 4, rxs))
-        assert found.dtype == np.float32
-        expected = [(middle, middle), (middle + 1, middle), (middle, middle - 2), (middle + 0.3, middle)]
-        np.testing.assert_allclose(found, expected, atol=1e-5)
-
-    def test_no_links(self):
-        assert window_places(context_of((), [], [], [])).shape == (0, 2)
-
-    def test_outside_at_the_border(self):
-        rxs = [(100.0, 0.0, 1.5), (-100.0, HALF_M + 0.01, 1.5)]
-        found = window_places(context_of(FLOOR, [0, 0], np.zeros((2, 3)), rxs))
-        assert found.tolist() == [[WINDOW_CELLS - 0.5, WINDOW_CELLS / 2], [0.5, WINDOW_CELLS - 0.5]]
-
-    @settings(max_examples=20, deadline=None)
-    @given(st.floats(-0.98, 0.98), st.floats(-0.98, 0.98))
-    def test_the_cell_is_that_of_the_window(self, x, y):
-        """A wall around a receiver is seen in the cell that holds it."""
-        tx = np.array([5.3, -1.2, 1.5])
-        rx = tx + np.array([x, y, 0.0]) * HALF_M
-        post = PartialMap(np.full((1, 1), WALL), 0.1, tuple(rx[:2] - 0.05))
-        column, row = window_places(context_of((post,), [0], tx, rx))[0]
-        wall = channel(transmitter_window(post, tx[:2]), "wall")
-        assert wall[int(row), int(column)] > 0.0
+        context = context_of((), [], [], [])
+        assert transmitter_windows(context).shape == (0, *WINDOWS)
+        assert [each.shape for each in transmitter_places(context)] == [(0, 3), (0,)]

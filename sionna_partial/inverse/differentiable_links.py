@@ -57,14 +57,14 @@ from sionna_partial.learning.networks import (
 )
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.learning.unobserved import unobserved_lengths_m
-from sionna_partial.learning.windows import CELL_M, WINDOW_CELLS, transmitter_window
+from sionna_partial.learning.windows import CELLS_M, map_windows
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, require
 from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
 from sionna_partial.tracing.trace import Progress
 
-WINDOW_STEP_M = CELL_M / 2
+WINDOW_STEP_M = CELLS_M[0] / 2
 """How far from the transmitter further windows are drawn [m]."""
 
 _NEAREST_M = 1e-6
@@ -168,7 +168,7 @@ class DifferentiableLinks:
 
     Examples
     --------
-    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m away:
+    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m:
 
     >>> import numpy as np
     >>> import sionna_partial as sp
@@ -313,10 +313,9 @@ class DifferentiableLinks:
         marks = tf.constant(link_marks(self._phi))
         columns = input_columns(marks, numbers, frequency_hz, keras.ops)
         away_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if place is None else place)
-        places = tf.clip_by_value(away_m[:, :2] / CELL_M + WINDOW_CELLS / 2, 0.5, WINDOW_CELLS - 0.5)
         known = self._known(place) if MAP_NETWORK in self._scene.networks else None
         outputs = read_links(
-            self._scene.networks, known, tf.cast(columns, tf.float32)[None], tf.cast(places, tf.float32)[None]
+            self._scene.networks, known, tf.cast(columns, tf.float32)[None], tf.cast(away_m, tf.float32)[None, :, :2]
         )
         free_db = free_space_gain_db(numbers.distance_m, frequency_hz, keras.ops)
         possible = possible_states(self._phi)
@@ -336,8 +335,7 @@ class DifferentiableLinks:
     def _windows(self) -> NDArray[np.float32]:
         """Windows around the transmitter, and around places to the right, left, top and bottom of it."""
         steps_m = WINDOW_STEP_M * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        places_m = self.base.tx_m[:2] + steps_m
-        return np.stack([transmitter_window(self._scene.partial, at_m) for at_m in places_m]).astype(np.float32)
+        return map_windows(self._scene.partial, self.base.tx_m[:2] + steps_m).astype(np.float32)
 
 
 class _Legs:

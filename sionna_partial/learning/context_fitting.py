@@ -11,10 +11,16 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.context_networks import context_networks, decode, link_inputs, look
+from sionna_partial.learning.context_networks import (
+    context_networks,
+    decode,
+    link_inputs,
+    look,
+    receiver_offsets_m,
+)
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.networks import free_space_gain_db, import_keras
-from sionna_partial.learning.windows import WINDOW_CELLS, transmitter_windows, window_index, window_places
+from sionna_partial.learning.windows import transmitter_places, transmitter_windows
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
 
@@ -93,7 +99,7 @@ class _Examples:
 
     Parameters
     ----------
-    images : mapping of str to (W, S, S, ...) uint8 arrays
+    images : mapping of str to (W, K, S, S, ...) uint8 arrays
         Of the windows, by the names of the arguments of a gradient step; none without a map network.
     first : (W + 1,) int array
         Where the links of each window begin.
@@ -115,13 +121,13 @@ class _Examples:
     ) -> "_Examples":
         context = phi.context
         assert context is not None
-        index, images = window_index(context), {}
+        (_, index), images = transmitter_places(context), {}
         if settings.networks == "map":
-            images["windows"] = transmitter_windows(context)[0]
+            images["windows"] = transmitter_windows(context)
         order = np.argsort(index, kind="stable")
         columns = {
             "links": link_inputs(phi, settings.frequency_hz),
-            "places": window_places(context),
+            "offsets_m": receiver_offsets_m(context),
             "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
             "link_state": link_state.astype(np.int32),
             "gain_db": gain_db.astype(np.float32),
@@ -150,23 +156,23 @@ class _Examples:
         for name, images in self.images.items():
             turned = [_turned(image, turn) for image, turn in zip(images[chosen], turns, strict=True)]
             batch[name] = np.stack(turned).astype(np.float32)
-        places = zip(batch["places"], turns, strict=True)
-        batch["places"] = np.stack([_turned_places(place, turn) for place, turn in places])
+        offsets_m = zip(batch["offsets_m"], turns, strict=True)
+        batch["offsets_m"] = np.stack([_turned_offsets(offset_m, turn) for offset_m, turn in offsets_m])
         return batch
 
 
 def _turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
-    """One of the eight ways to lay a square (S, S, C)."""
-    image = image[:, ::-1] if turn & 1 else image
-    image = image[::-1] if turn & 2 else image
-    return image.transpose(1, 0, 2) if turn & 4 else image
+    """One of the eight ways to lay squares (K, S, S, C)."""
+    image = image[:, :, ::-1] if turn & 1 else image
+    image = image[:, ::-1] if turn & 2 else image
+    return image.transpose(0, 2, 1, 3) if turn & 4 else image
 
 
-def _turned_places(places: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
-    """Where places (R, 2) are when the window is laid that way [cells]."""
-    x, y = places.T
-    x = WINDOW_CELLS - x if turn & 1 else x
-    y = WINDOW_CELLS - y if turn & 2 else y
+def _turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
+    """Where offsets (R, 2) from the middle are when the window is laid that way [m]."""
+    x, y = offsets_m.T
+    x = -x if turn & 1 else x
+    y = -y if turn & 2 else y
     return np.stack([y, x] if turn & 4 else [x, y], axis=1)
 
 
@@ -181,14 +187,14 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
 
     def step(
         links: Any,
-        places: Any,
+        offsets_m: Any,
         free_db: Any,
         link_state: Any,
         gain_db: Any,
         windows: Any = None,
     ) -> Any:
         with tf.GradientTape() as tape:
-            outputs = look(networks, windows, links, places, training=True)
+            outputs = look(networks, windows, links, offsets_m, training=True)
             log_p, means_db, log_variances = decode(outputs, free_db)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             scores_db = _ranked_score(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))

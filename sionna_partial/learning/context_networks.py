@@ -1,9 +1,10 @@
 """The networks that see where links run, as Keras 3 models: a map network and a link network.
 
-The map network reads the window around the transmitter and writes `MAP_FEATURES` numbers into each of its cells: a
-U-Net (Ronneberger, Fischer and Brox 2015). What it makes of an empty window is taken off, so that a map says nothing
-where nothing was observed. The link network reads what the trace knows of a link, and the numbers at its receiver. It
-says P(link state), and mean and log-variance of the gain in line of sight and without.
+The map network reads the windows around the transmitter, near and far, and writes `MAP_FEATURES` numbers into each of
+their cells: a U-Net (Ronneberger, Fischer and Brox 2015), the same for all scales. What it makes of an empty window is
+taken off, so that a map says nothing where nothing was observed, and the numbers fade to 0 towards the border of each
+window: nothing changes where one ends. The link network reads what the trace gives of a link, and the numbers of all
+windows at its receiver. It returns P(link state), and mean and log-variance of the gain in line of sight and without.
 """
 
 import math
@@ -20,7 +21,7 @@ from sionna_partial.learning.certainty import possible_states
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
-from sionna_partial.learning.windows import CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
+from sionna_partial.learning.windows import CELLS_M, CHANNELS, WINDOW_CELLS, map_windows, transmitter_places
 
 if TYPE_CHECKING:
     import keras
@@ -44,10 +45,13 @@ _LOS_MOST_DB = 10.0
 _LOS_OFFSET = -1.5
 _NLOS_OFFSET_DB, _NLOS_SCALE_DB = -25.0, 20.0
 _STATISTICS_MOMENTUM = 0.9
-_SCALE_M, _SCALE_DB = 15.0, 100.0
+_FADE_CELLS = 8.0
+"""Width of the rim of a window in which its numbers fade to 0 [cells]."""
+
+_SCALE_M, _SCALE_DB = 3.0, 100.0
 _NEAREST_M = 0.1
 _IMPOSSIBLE = -1e30
-_LINKS_AT_ONCE, _WINDOWS_AT_ONCE = 65_536, 8
+_LINKS_AT_ONCE, _WINDOWS_AT_ONCE = 16_384, 8
 
 
 @dataclass(frozen=True)
@@ -96,11 +100,8 @@ def context_of(phi: LinkFeatures) -> LinkContext:
 
 def link_marks(phi: LinkFeatures) -> NDArray[np.float64]:
     """Return binary features (N, `LINK_MARKS`) of N links, which have a context: 0 or 1."""
-    context, los = context_of(phi), phi.link_state == LinkState.LOS
-    walled = context.walled_m > 0.0
-    certain = los & (phi.unobserved_distance_m == 0.0) & ~walled
-    states = (phi.link_state == state for state in LinkState)
-    return np.stack([*states, context.tx_seen, context.rx_seen, certain, los & walled], axis=1) * 1.0
+    context, states = context_of(phi), (phi.link_state == state for state in LinkState)
+    return np.stack([*states, context.tx_seen, context.rx_seen, *possible_states(phi).T], axis=1) * 1.0
 
 
 def input_columns(marks: Any, numbers: LinkNumbers, frequency_hz: float, ops: ModuleType = np) -> Any:
@@ -118,10 +119,10 @@ def input_columns(marks: Any, numbers: LinkNumbers, frequency_hz: float, ops: Mo
     distance_m, unobserved_m = numbers.distance_m, numbers.unobserved_distance_m
     free_db, near_m = free_space_gain_db(distance_m, frequency_hz, ops), ops.maximum(distance_m, _NEAREST_M)
     indirect_db = [numbers.indirect_gain_db[:, reach] for reach in range(len(REACHES_M))]
+    lengths_m = (distance_m, unobserved_m, distance_m - unobserved_m, numbers.strongest_unobserved_m)
     columns = [
-        *(ops.minimum(numbers.walled_m, 1.0), distance_m / _SCALE_M, ops.log(near_m)),
-        *(unobserved_m / _SCALE_M, unobserved_m / near_m, (distance_m - unobserved_m) / _SCALE_M),
-        numbers.strongest_unobserved_m / _SCALE_M,
+        *(ops.minimum(numbers.walled_m, 1.0), ops.log(near_m), unobserved_m / near_m),
+        *(ops.log(1.0 + length_m / _SCALE_M) for length_m in lengths_m),
         *((gain_db - GAIN_FLOOR_DB) / _SCALE_DB for gain_db in (numbers.gain_db, free_db, *indirect_db)),
         *(ops.clip((gain_db - free_db) / 30.0, -2.0, 0.5) for gain_db in (numbers.gain_db, *indirect_db)),
     ]
@@ -133,7 +134,7 @@ def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
     return input_columns(link_marks(phi), LinkNumbers.of(phi), frequency_hz).astype(np.float32)
 
 
-LINK_MARKS = len(LinkState) + 4
+LINK_MARKS = len(LinkState) + 2 + len(LinkState)
 """Number of values that `link_marks` gives of a link."""
 
 LINK_INPUTS = LINK_MARKS + 7 + 2 + len(REACHES_M) + 1 + len(REACHES_M)
@@ -160,8 +161,8 @@ CONTEXT_SHAPES = (
     Shapes.of(),
     Shapes.of(link_network=((LINK_INPUTS,), (LINK_OUTPUTS,))),
     Shapes.of(
-        link_network=((LINK_INPUTS + MAP_FEATURES,), (LINK_OUTPUTS,)),
-        map_network=((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES)),
+        link_network=((LINK_INPUTS + len(CELLS_M) * MAP_FEATURES,), (LINK_OUTPUTS,)),
+        map_network=((*_SQUARE, len(CHANNELS) + 1), (*_SQUARE, MAP_FEATURES)),
     ),
 )
 """What a predictor may have beside the networks of the paper: nothing, "paths", or "map"."""
@@ -183,24 +184,25 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
     """
     keras = import_keras()
     start = _Seeds(keras, seed)
-    networks = {LINK_NETWORK: _link_network(keras, start, LINK_INPUTS + (MAP_FEATURES if with_map else 0))}
+    told = len(CELLS_M) * MAP_FEATURES if with_map else 0
+    networks = {LINK_NETWORK: _link_network(keras, start, LINK_INPUTS + told)}
     return networks | ({MAP_NETWORK: _map_network(keras, start)} if with_map else {})
 
 
 def look(
-    networks: Mapping[str, "keras.Model"], windows: Any, links: Any, places: Any, *, training: bool = False
+    networks: Mapping[str, "keras.Model"], windows: Any, links: Any, offsets_m: Any, *, training: bool = False
 ) -> Any:
-    """Evaluate the networks on R links of each of B windows.
+    """Evaluate the networks on R links of each of B transmitters.
 
     Parameters
     ----------
     networks : mapping of str to keras.Model
         By name.
-    windows : (B, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) float32 tensor
+    windows : (B, *WINDOWS) float32 tensor
         In [0, 255]; without a map network they are not read, and may be None.
     links : (B, R, LINK_INPUTS) float32 tensor
-    places : (B, R, 2) float32 tensor
-        Of the receivers: x, y in cells of the window.
+    offsets_m : (B, R, 2) float32 tensor
+        Of the receivers from the transmitter: x, y [m].
     training : bool
         See `read_maps`.
 
@@ -209,7 +211,7 @@ def look(
     (B, R, LINK_OUTPUTS) float32 tensor
     """
     known = read_maps(networks, windows, training=training) if MAP_NETWORK in networks else None
-    return read_links(networks, known, links, places)
+    return read_links(networks, known, links, offsets_m)
 
 
 def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> Any:
@@ -219,40 +221,45 @@ def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: 
     ----------
     networks : mapping of str to keras.Model
         By name.
-    windows : (B, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) float32 tensor
+    windows : (B, *WINDOWS) float32 tensor
         In [0, 255].
     training : bool
         Whether values are normalised by the statistics of these windows, which are kept, rather than by the kept ones.
 
     Returns
     -------
-    (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor
+    (B, len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor
         What each cell says beyond what one of an empty window does.
     """
     import tensorflow as tf
 
-    maps = networks[MAP_NETWORK](tf.concat([windows, tf.zeros_like(windows[:1])], axis=0), training=training)
+    windows = tf.concat([windows, tf.zeros_like(windows[:1])], axis=0)
+    scale = 255.0 * tf.range(len(CELLS_M), dtype=tf.float32)[:, None, None, None]
+    inputs = tf.concat([windows, tf.zeros_like(windows[..., :1]) + scale], axis=-1)
+    maps = networks[MAP_NETWORK](tf.reshape(inputs, (-1, *inputs.shape[2:])), training=training)
+    maps = tf.reshape(maps, (-1, *inputs.shape[1:-1], maps.shape[-1]))
     return maps[:-1] - maps[-1:]
 
 
-def read_links(networks: Mapping[str, "keras.Model"], known: Any, links: Any, places: Any) -> Any:
-    """Let the link network read R links of each of B windows: (B, R, LINK_OUTPUTS) float32 tensor.
+def read_links(networks: Mapping[str, "keras.Model"], known: Any, links: Any, offsets_m: Any) -> Any:
+    """Let the link network read R links of each of B transmitters: (B, R, LINK_OUTPUTS) float32 tensor.
 
     Parameters
     ----------
     networks : mapping of str to keras.Model
         By name.
-    known : (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor or None
+    known : (B, len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor or None
         From `read_maps`; None without a map network.
-    links, places : tensors
+    links, offsets_m : tensors
         See `look`.
     """
     import tensorflow as tf
 
     if known is not None:
-        links = tf.concat([links, _between(known, places)], axis=-1)
+        at_scales = [_between(known[:, scale], offsets_m / cell_m) for scale, cell_m in enumerate(CELLS_M)]
+        links = tf.concat([links, *at_scales], axis=-1)
     outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
-    return tf.reshape(outputs, (tf.shape(places)[0], -1, LINK_OUTPUTS))
+    return tf.reshape(outputs, (tf.shape(offsets_m)[0], -1, LINK_OUTPUTS))
 
 
 def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
@@ -300,12 +307,12 @@ def evaluate_context_networks(
         Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
     """
     context = context_of(phi)
-    inputs, places = link_inputs(phi, frequency_hz), window_places(context)
+    inputs, offsets_m = link_inputs(phi, frequency_hz), receiver_offsets_m(context)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for known, links in _by_window(networks, context):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
-            outputs[here] = read_links(networks, known, inputs[None, here], places[None, here])[0]
+            outputs[here] = read_links(networks, known, inputs[None, here], offsets_m[None, here])[0]
     free_db = free_space_gain_db(phi.distance_m, frequency_hz)
     possible = possible_states(phi)
     probabilities, means_db, stds_db = distribution(outputs, free_db, possible)
@@ -357,7 +364,7 @@ def _map_network(keras: Any, start: _Seeds) -> "keras.Model":
         x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
         return layer(keras, "ReLU", f"{name}_active")(x)
 
-    window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), name="window", dtype="float32")
+    window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS) + 1), name="window", dtype="float32")
     shares = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
     x = convolved(shares, _WIDTHS[0], "down_0")
     levels = []
@@ -383,22 +390,36 @@ def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
     return keras.Model(link, outputs, name=LINK_NETWORK)
 
 
+def receiver_offsets_m(context: LinkContext) -> NDArray[np.float32]:
+    """Return where receivers (N, 2) are as seen from their transmitters: x, y [m]."""
+    return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
+
+
 def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tuple[Any, NDArray[np.intp]]]:
-    """Yield what the map network knows of each window (1, ...), and its links; without one None and all links."""
+    """Yield what the map network reads for each transmitter (1, ...), and its links; without one None and all links."""
     if MAP_NETWORK not in networks:
         yield None, np.arange(len(context))
         return
-    windows, index = transmitter_windows(context)
-    for start in range(0, len(windows), _WINDOWS_AT_ONCE):
-        known = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE].astype(np.float32))
-        for number in range(len(known)):
-            yield known[number : number + 1], np.flatnonzero(index == start + number)
+    places, index = transmitter_places(context)
+    links = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index, minlength=len(places)))[:-1])
+    for number in np.unique(places[:, 0]).astype(int):
+        rows = np.flatnonzero(places[:, 0] == number)
+        windows = map_windows(context.maps[number], places[rows, 1:]).astype(np.float32)
+        for start in range(0, len(rows), _WINDOWS_AT_ONCE):
+            known = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE])
+            for here in range(len(known)):
+                yield known[here : here + 1], links[rows[start + here]]
 
 
-def _between(maps: Any, places: Any) -> Any:
-    """Values (B, R, C) of maps (B, S, S, C) at places (B, R, 2) [cells], bilinear between the middles of cells."""
+def _between(maps: Any, offsets: Any) -> Any:
+    """Values (B, R, C) of maps (B, S, S, C) at offsets (B, R, 2) from their middles [cells].
+
+    They are bilinear between the middles of cells, and fade to 0 towards the border.
+    """
     import tensorflow as tf
 
-    middles = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5
-    x, y = tf.unstack(tf.maximum(1.0 - tf.abs(places[..., None] - middles), 0.0), axis=2)
+    half = WINDOW_CELLS / 2
+    inside = tf.clip_by_value((half - tf.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
+    middles = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5 - half
+    x, y = tf.unstack(inside[..., None] * tf.maximum(1.0 - tf.abs(offsets[..., None] - middles), 0.0), axis=2)
     return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))

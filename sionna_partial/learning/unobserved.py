@@ -12,7 +12,7 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 
-_FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
+_FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
 GRAZE = 1e-9
 """Fraction of a line up to which a wall is only grazed: lines between grid points meet many corners, to rounding."""
@@ -85,42 +85,42 @@ def unknown_shares(
     state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] that are unknown."""
-    return _shares(state, _UNKNOWN, starts, ends)
+    return line_shares(state, starts, ends)[:, CellState.UNKNOWN]
 
 
 def wall_shares(
     state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] in known walls."""
-    walls = np.where(state == CellState.WALL, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
-    return _shares(walls, _FREE, starts, ends)
+    return line_shares(state, starts, ends)[:, CellState.WALL]
 
 
-def _shares(
-    state: NDArray[np.uint8], outside: int, starts: NDArray[np.float64], ends: NDArray[np.float64]
+def line_shares(
+    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the shares of segments that are unknown, where all cells outside the grid are in one state."""
-    shares, alike = np.empty(len(ends)), _alike_cells(state == _UNKNOWN)
+    """Return the shares (N, 3), in [0, 1], of segments in cells of each CellState; all outside the grid is unknown."""
+    shares, alike = np.zeros((len(ends), len(CellState))), _alike_cells(state)
     bounds = np.linspace(0, len(ends), 1 + min(len(os.sched_getaffinity(0)), 1 + len(ends) // _SEGMENTS_OF_CORE))
     blocks = [slice(int(low), int(high)) for low, high in itertools.pairwise(bounds)]
 
     def fill(block: slice) -> None:
-        _fill_shares(state, alike, outside, starts[block], ends[block], shares[block])
+        _fill_shares(state, alike, starts[block], ends[block], shares[block])
 
     if len(blocks) == 1:
         fill(blocks[0])
     else:
         with ThreadPoolExecutor(len(blocks)) as pool:
             list(pool.map(fill, blocks))
-    return shares
+    return np.clip(shares, 0.0, 1.0)
 
 
-def _alike_cells(unknown: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Return how many cells in every direction, corners included, are unknown or known as the cell is."""
-    alike = np.full(unknown.shape, max(unknown.shape), dtype=np.int32)
-    for kind in (unknown, ~unknown):
-        if not kind.all():
-            alike[kind] = ndimage.distance_transform_cdt(kind, "chessboard")[kind] - 1
+def _alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return how many cells in every direction, corners included, are in the state of the cell."""
+    alike = np.full(state.shape, max(state.shape), dtype=np.int32)
+    for kind in CellState:
+        cells = state == kind
+        if cells.any() and not cells.all():
+            alike[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
     return alike
 
 
@@ -128,37 +128,37 @@ def _alike_cells(unknown: NDArray[np.bool_]) -> NDArray[np.int32]:
 def _fill_shares(
     state: NDArray[np.uint8],
     alike: NDArray[np.int32],
-    outside: int,
     starts: NDArray[np.float64],
     ends: NDArray[np.float64],
     shares: NDArray[np.float64],
 ) -> None:
+    """Add the shares of segments in cells of each state to `shares` (N, 3)."""
     for i in range(len(ends)):
         start_x, start_y = starts[i, 0], starts[i, 1]
         step_x, step_y = ends[i, 0] - start_x, ends[i, 1] - start_y
         if min(abs(step_x), abs(step_y)) < _ALONG_CELLS:
-            shares[i] = _share_along_axis(state, outside, start_x, start_y, step_x, step_y)
+            _add_along_axis(state, start_x, start_y, step_x, step_y, shares[i])
         else:
-            shares[i] = _share_across(state, alike, outside, start_x, start_y, step_x, step_y)
+            _add_across(state, alike, start_x, start_y, step_x, step_y, shares[i])
 
 
 @njit(cache=True)
-def _share_across(
+def _add_across(
     state: NDArray[np.uint8],
     alike: NDArray[np.int32],
-    outside: int,
     start_x: float,
     start_y: float,
     step_x: float,
     step_y: float,
-) -> float:
-    """Return the share of a segment that is unknown, where it runs along no border of cells.
+    shares: NDArray[np.float64],
+) -> None:
+    """Add the shares of a segment that runs along no border of cells.
 
     The grid is walked from line to line (Amanatides and Woo 1987), and over cells that are all alike at once. The
     distance to each line is computed afresh, so that rounding does not add up.
     """
     ny, nx = state.shape
-    here, leave, share = _inside_grid(state, outside, start_x, start_y, step_x, step_y)
+    here, leave = _inside_grid(state, start_x, start_y, step_x, step_y, shares)
     turn_x, turn_y = (1 if step_x > 0.0 else -1), (1 if step_y > 0.0 else -1)
     pace_x, pace_y = 1.0 / step_x, 1.0 / step_y
     line_x = int(first_line(start_x + here * step_x, step_x))
@@ -171,8 +171,7 @@ def _share_across(
         reach_x = (line_x + turn_x * over - start_x) * pace_x
         reach_y = (line_y + turn_y * over - start_y) * pace_y
         there = min(max(here, min(reach_x, reach_y)), leave)
-        if (state[row, column] if within else outside) == _UNKNOWN:
-            share += there - here
+        shares[state[row, column] if within else _UNKNOWN] += there - here
         if reach_x <= there:
             line_x += turn_x * (over + 1)
         elif over:
@@ -182,15 +181,14 @@ def _share_across(
         elif over:
             line_y = int(first_line(start_y + there * step_y, step_y))
         here = there
-    return min(max(share, 0.0), 1.0)
 
 
 @njit(cache=True)
-def _share_along_axis(
-    state: NDArray[np.uint8], outside: int, start_x: float, start_y: float, step_x: float, step_y: float
-) -> float:
-    """Return the share of a segment along an axis that is unknown: it may run along the border of cells for a while."""
-    here, leave, share = _inside_grid(state, outside, start_x, start_y, step_x, step_y)
+def _add_along_axis(
+    state: NDArray[np.uint8], start_x: float, start_y: float, step_x: float, step_y: float, shares: NDArray[np.float64]
+) -> None:
+    """Add the shares of a segment along an axis, which may run along the border of cells for a while."""
+    here, leave = _inside_grid(state, start_x, start_y, step_x, step_y, shares)
     line_x = first_line(start_x + here * step_x, step_x)
     line_y = first_line(start_y + here * step_y, step_y)
     while here < leave:
@@ -198,26 +196,25 @@ def _share_along_axis(
         reach_y = (line_y - start_y) / step_y if step_y != 0.0 else np.inf
         there = min(max(here, min(reach_x, reach_y)), leave)
         middle = 0.5 * (here + there)
-        if _is_unknown(state, outside, start_x + middle * step_x, start_y + middle * step_y):
-            share += there - here
+        shares[_freest(state, start_x + middle * step_x, start_y + middle * step_y)] += there - here
         if reach_x <= there:
             line_x += np.sign(step_x)
         if reach_y <= there:
             line_y += np.sign(step_y)
         here = there
-    return min(max(share, 0.0), 1.0)
 
 
 @njit(cache=True)
 def _inside_grid(
-    state: NDArray[np.uint8], outside: int, start_x: float, start_y: float, step_x: float, step_y: float
-) -> tuple[float, float, float]:
-    """Return the shares of a segment at which it enters and leaves the grid, and the unknown share of it outside."""
+    state: NDArray[np.uint8], start_x: float, start_y: float, step_x: float, step_y: float, shares: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Return the shares of a segment at which it enters and leaves the grid, and add that outside as unknown."""
     ny, nx = state.shape
     enter_x, leave_x = shares_inside(start_x, step_x, nx)
     enter_y, leave_y = shares_inside(start_y, step_y, ny)
     enter, leave = max(enter_x, enter_y), min(leave_x, leave_y)
-    return enter, leave, (1.0 - max(0.0, leave - enter) if outside == _UNKNOWN else 0.0)
+    shares[_UNKNOWN] += 1.0 - max(0.0, leave - enter)
+    return enter, leave
 
 
 @njit(cache=True)
@@ -236,20 +233,20 @@ def first_line(place: float, step: float) -> float:
 
 
 @njit(cache=True)
-def _is_unknown(state: NDArray[np.uint8], outside: int, x: float, y: float) -> bool:
-    """Whether the freest cell within 1e-6 cells of a point [cells] is unknown."""
+def _freest(state: NDArray[np.uint8], x: float, y: float) -> int:
+    """Return the state of the freest cell within 1e-6 cells of a point [cells]: FREE before UNKNOWN before WALL."""
     ny, nx = state.shape
     row, column = int(np.floor(y)), int(np.floor(x))
     deep_x = _BORDER_CELLS < x - column < 1.0 - _BORDER_CELLS
     deep_y = _BORDER_CELLS < y - row < 1.0 - _BORDER_CELLS
     if deep_x and deep_y and 0 <= row < ny and 0 <= column < nx:
-        return state[row, column] == _UNKNOWN
-    found = False
+        return int(state[row, column])
+    found = _WALL
     for row in range(int(np.floor(y - _BORDER_CELLS)), int(np.floor(y + _BORDER_CELLS)) + 1):
         for column in range(int(np.floor(x - _BORDER_CELLS)), int(np.floor(x + _BORDER_CELLS)) + 1):
-            within = 0 <= row < ny and 0 <= column < nx
-            cell = state[row, column] if within else outside
+            cell = state[row, column] if 0 <= row < ny and 0 <= column < nx else _UNKNOWN
             if cell == _FREE:
-                return False
-            found |= cell == _UNKNOWN
+                return _FREE
+            if cell == _UNKNOWN:
+                found = _UNKNOWN
     return found

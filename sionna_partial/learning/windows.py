@@ -11,11 +11,11 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.learning.link_context import LinkContext
-from sionna_partial.learning.unobserved import GRAZE, in_cells, unknown_shares, wall_shares
+from sionna_partial.learning.unobserved import GRAZE, in_cells, line_shares
 from sionna_partial.maps.partial_map import PartialMap
 
-WINDOW_CELLS, CELL_M = 64, 0.3
-"""Number of cells along each side of a window, and their edge [m]. The transmitter is in the middle."""
+WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
+"""Number of cells along each side of a window, and their edge in each of a transmitter's windows, near to far [m]."""
 
 CHANNELS = ("free", "wall", "seen", "hidden", "detour")
 """What a cell of a window says, each in 255ths, and 0 where nothing was observed.
@@ -24,83 +24,98 @@ free, wall: share of the cell's area that is known to be so. seen: share of the 
 observed. hidden: whether that line meets a known wall. detour: how much longer the way on foot is, see `_detours`.
 """
 
+WINDOWS = (len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
+"""Shape of the windows of a transmitter."""
+
+_FINEST = 4
+"""Number of cells of the map along a cell of the window, at most: finer maps are made coarser, once for all windows."""
+
 _WALL_COST = 100.0
 """Cost of a cell of nothing but wall to one who walks, in cells."""
 
-_LONGEST_DETOUR_M = 12.0
+_LONGEST_DETOUR = 40.0
+"""[cells]"""
 
 
-def transmitter_windows(context: LinkContext) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Draw the window of every transmitter on every map.
-
-    Parameters
-    ----------
-    context : LinkContext
-        Of N links.
-
-    Returns
-    -------
-    windows : (W, WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) uint8 array
-        Row 0 has the smallest y.
-    index : (N,) int array
-        Which of them is each link's.
-    """
-    places, index = _transmitters(context)
-    windows = np.zeros((len(places), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), dtype=np.uint8)
-    for window, (number, x, y) in zip(windows, places, strict=True):
-        window[:] = transmitter_window(context.maps[int(number)], np.array([x, y]))
-    return windows, index
-
-
-def window_index(context: LinkContext) -> NDArray[np.intp]:
-    """Return which of the windows of `transmitter_windows` is each link's (N,), without drawing them."""
-    return _transmitters(context)[1]
-
-
-def window_places(context: LinkContext) -> NDArray[np.float32]:
-    """Return where receivers (N, 2) are in the windows: x, y in cells, those outside at the border."""
-    places = (context.rx_m - context.tx_m)[:, :2] / CELL_M + WINDOW_CELLS / 2
-    return np.clip(places, 0.5, WINDOW_CELLS - 0.5).astype(np.float32)
-
-
-def _transmitters(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def transmitter_places(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Return map number, x and y (W, 3) of every transmitter on every map, and which of them is each link's (N,)."""
     keys = np.column_stack([context.map_index, context.tx_m[:, :2]])
     places, index = np.unique(keys, axis=0, return_inverse=True)
     return places, index.reshape(-1)
 
 
-def transmitter_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Draw the window around one transmitter.
+def transmitter_windows(context: LinkContext) -> NDArray[np.uint8]:
+    """Draw the windows (W, *WINDOWS) of every transmitter on every map, in the order of `transmitter_places`."""
+    places, _ = transmitter_places(context)
+    windows = np.zeros((len(places), *WINDOWS), dtype=np.uint8)
+    for number in np.unique(places[:, 0]).astype(int):
+        here = places[:, 0] == number
+        windows[here] = map_windows(context.maps[number], places[here, 1:])
+    return windows
+
+
+def map_windows(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Draw the windows around the transmitters of one map.
 
     Parameters
     ----------
     partial : PartialMap
-    tx_m : (2,) float64 array
-        Its x and y [m].
+    tx_m : (T, 2) float64 array
+        Their x and y [m].
 
     Returns
     -------
-    (WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)) uint8 array
+    (T, *WINDOWS) uint8 array
+        Row 0 of a window has the smallest y, and the transmitter is in the middle.
     """
-    if (partial.state == CellState.UNKNOWN).all():
-        return np.zeros((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), dtype=np.uint8)
-    state, start = _surroundings(partial, tx_m)
-    edges = _edges(partial, start)
+    windows = np.zeros((len(tx_m), *WINDOWS), dtype=np.uint8)
+    if not (partial.state == CellState.UNKNOWN).all():
+        for scale, cell_m in enumerate(CELLS_M):
+            plan = _coarser(partial, cell_m / _FINEST)
+            for window, at_m in zip(windows[:, scale], tx_m, strict=True):
+                window[:] = _window(plan, at_m, cell_m, beside_walls=plan is not partial)
+    return windows
+
+
+def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
+    """Return a map with the largest multiple of its cells that is no larger than `cell_m`: any wall makes a wall."""
+    factor = math.floor(cell_m / partial.resolution_m + 1e-9)
+    if factor < 2:
+        return partial
+    padding = [(0, -count % factor) for count in partial.shape]
+    state = np.pad(partial.state, padding, constant_values=CellState.UNKNOWN)
+    blocks = state.reshape(state.shape[0] // factor, factor, state.shape[1] // factor, factor)
+    wall, free = (blocks == CellState.WALL).any(axis=(1, 3)), (blocks == CellState.FREE).mean(axis=(1, 3)) >= 0.5
+    coarse = np.select([wall, free], [CellState.WALL, CellState.FREE], CellState.UNKNOWN).astype(np.uint8)
+    return PartialMap(coarse, factor * partial.resolution_m, partial.origin_m)
+
+
+def _window(partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float, *, beside_walls: bool) -> NDArray[np.uint8]:
+    """Draw the window with cells of `cell_m` around a transmitter, which may stand in a wall that was drawn coarser."""
+    state, start = _surroundings(partial, tx_m, cell_m)
+    if beside_walls:
+        column, row = np.floor(start).astype(int)
+        beside = state[row - 1 : row + 2, column - 1 : column + 2]
+        beside[beside == CellState.WALL] = CellState.FREE
+    steps = cell_m / partial.resolution_m * (np.arange(WINDOW_CELLS + 1) - WINDOW_CELLS / 2)
+    edges = start[:, None] + steps
     free, wall = _plan(state, edges)
     centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
     starts = np.tile(start, (len(centres), 1))
-    unknown, blocked = (of(state, starts, centres).reshape(free.shape) for of in (unknown_shares, wall_shares))
-    return _in_255ths([free, wall, 1.0 - unknown, blocked > GRAZE, _detours(wall)])
+    lines = line_shares(state, starts, centres).reshape(*free.shape, -1)
+    hidden = lines[..., CellState.WALL] > GRAZE
+    return _in_255ths([free, wall, 1.0 - lines[..., CellState.UNKNOWN], hidden, _detours(wall)])
 
 
 def _in_255ths(layers: Sequence[NDArray[np.generic]]) -> NDArray[np.uint8]:
     return np.round(255.0 * np.stack(layers, axis=-1)).astype(np.uint8)
 
 
-def _surroundings(partial: PartialMap, tx_m: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def _surroundings(
+    partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float
+) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Extend or cut a map to what a window covers, and say where the transmitter is in it [cells]."""
-    reach = int(np.ceil(0.5 * WINDOW_CELLS * CELL_M / partial.resolution_m)) + 1
+    reach = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
     start = in_cells(partial, tx_m)
     column, row = np.floor(start).astype(int)
     spans = [(low - reach, low + reach + 1) for low in (row, column)]
@@ -111,12 +126,6 @@ def _surroundings(partial: PartialMap, tx_m: NDArray[np.float64]) -> tuple[NDArr
         top, left = inner[0][0] - spans[0][0], inner[1][0] - spans[1][0]
         state[top : top + known.shape[0], left : left + known.shape[1]] = known
     return state, start - np.array([spans[1][0], spans[0][0]])
-
-
-def _edges(partial: PartialMap, start: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Borders (2, WINDOW_CELLS + 1) of the window's cells along x and y [cells of the map]."""
-    steps = np.arange(WINDOW_CELLS + 1) - WINDOW_CELLS / 2
-    return start[:, None] + CELL_M / partial.resolution_m * steps
 
 
 def _plan(state: NDArray[np.uint8], edges: NDArray[np.float64]) -> list[NDArray[np.float64]]:
@@ -133,7 +142,7 @@ def _overlaps(edges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
 
 
 def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much longer the way around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR_M`.
+    """How much longer the way around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR`.
 
     Ways go from the four cells in the middle from cell to cell, also across corners. Walls are crossed at a price.
     """
@@ -149,7 +158,7 @@ def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
     offsets = np.abs(np.arange(WINDOW_CELLS) - half + 0.5) - 0.5
     short, long = np.minimum.outer(offsets, offsets), np.maximum.outer(offsets, offsets)
     straight = long + (math.sqrt(2.0) - 1.0) * short
-    return np.clip((costs - straight) * CELL_M / _LONGEST_DETOUR_M, 0.0, 1.0)
+    return np.clip((costs - straight) / _LONGEST_DETOUR, 0.0, 1.0)
 
 
 @cache
