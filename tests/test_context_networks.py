@@ -19,7 +19,7 @@ from sionna_partial.learning.context_networks import (
     LINK_NETWORK,
     LINK_OUTPUTS,
     MAP_FEATURES,
-    MAP_NETWORK,
+    MAP_NETWORKS,
     context_networks,
     decode,
     evaluate_context_networks,
@@ -104,7 +104,7 @@ class TestLinkInputs:
         st.sampled_from(LinkState), st.just(0.0) | st.floats(1e-3, 900.0), st.floats(0.0, 1.0), st.floats(-150.0, 30.0)
     )
     def test_a_few_units_whatever_the_link(self, state, distance_m, share, gain_db):
-        """In a building of any size, and at the transmitter's own position."""
+        """In a building of any size."""
         floor = PartialMap(np.zeros((1, 100), dtype=np.uint8), 10.0, (-5.0, -5.0))
         place = (distance_m, 0.0, 1.5)
         phi = features(floor, place, unobserved_m=share * distance_m, state=state, gain_db=gain_db)
@@ -250,7 +250,7 @@ class TestLook:
         import tensorflow as tf
 
         count = windows.shape[0]
-        known = tf.cast(tf.reduce_any(windows[..., :-1] > 0, axis=(1, 2, 3), keepdims=True), tf.float32)
+        known = tf.cast(tf.reduce_any(windows > 0, axis=(1, 2, 3), keepdims=True), tf.float32)
         y, x = np.mgrid[:WINDOW_CELLS, :WINDOW_CELLS].astype(np.float32)
         places = np.tile(np.stack([x, y], axis=-1), (count, 1, 1, 1)) * known
         rest = np.full((count, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES - 3), 100.0, dtype=np.float32)
@@ -259,7 +259,7 @@ class TestLook:
     def seen(self, windows, offsets_m):
         offsets_m = np.asarray(offsets_m, dtype=np.float32)
         links = np.zeros((*offsets_m.shape[:2], LINK_INPUTS), dtype=np.float32)
-        network = {MAP_NETWORK: self.values, LINK_NETWORK: self.told}
+        network = {**dict.fromkeys(MAP_NETWORKS, self.values), LINK_NETWORK: self.told}
         found = np.asarray(look(network, windows.astype(np.float32), links, offsets_m))
         return found[..., :-1].reshape(*offsets_m.shape[:2], self.SCALES, 3), found[..., -1]
 

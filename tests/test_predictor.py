@@ -18,7 +18,7 @@ from predictor_links import (
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning import predictor as predictor_module
-from sionna_partial.learning.context_networks import LINK_NETWORK, MAP_NETWORK, evaluate_context_networks
+from sionna_partial.learning.context_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.learning.networks import STD_RANGE_DB, parts
 from sionna_partial.learning.predictor import SHIPPED, LinkPrediction, Predictor
 from sionna_partial.maps.partial_map import PartialMap
@@ -236,7 +236,7 @@ class TestWhatSeesWhereLinksRun:
 
     def test_networks_by_settings(self, quick):
         own = {name: set(parts(context_predictor(name).model)) - set(parts(quick.model)) for name in ("paths", "map")}
-        assert own == {"paths": {LINK_NETWORK}, "map": {LINK_NETWORK, MAP_NETWORK}}
+        assert own == {"paths": {LINK_NETWORK}, "map": {LINK_NETWORK, *MAP_NETWORKS}}
 
     def test_progress(self):
         calls = []

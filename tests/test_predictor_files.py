@@ -22,7 +22,7 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.learning.context_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORK
+from sionna_partial.learning.context_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
 from sionna_partial.learning.networks import FEATURES, assemble, import_keras, parts
 from sionna_partial.learning.predictor import Predictor
 from sionna_partial.learning.predictor_files import FORMAT, digest, pack
@@ -207,7 +207,7 @@ def _dense(inputs, outputs, name=LINK_NETWORK):
     [
         {LINK_NETWORK: lambda: _dense(LINK_INPUTS, LINK_OUTPUTS)},
         {LINK_NETWORK: None},
-        {MAP_NETWORK: None},
+        {MAP_NETWORKS[1]: None},
         {"third_network": lambda: _dense(LINK_INPUTS, LINK_OUTPUTS, "third_network")},
     ],
     ids=["link network without what the map says", "map alone", "reader of a map alone", "one too many"],

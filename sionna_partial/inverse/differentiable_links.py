@@ -36,13 +36,14 @@ from sionna_partial.inverse.smooth_lengths import SmoothLengths
 from sionna_partial.learning.certainty import possible_states
 from sionna_partial.learning.context_networks import (
     LINK_NETWORK,
-    MAP_NETWORK,
+    MAP_NETWORKS,
     LinkNumbers,
     distribution,
     input_columns,
     link_marks,
     read_links,
     read_maps,
+    reads_maps,
 )
 from sionna_partial.learning.features import link_features
 from sionna_partial.learning.link_context import REACHES_M, kept_shares
@@ -119,7 +120,7 @@ class DifferentiableScene:
     @property
     def weights(self) -> list[Any]:
         """Variables of the networks that answer."""
-        seeing = [name for name in (MAP_NETWORK, LINK_NETWORK) if name in self.networks]
+        seeing = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
         answering = seeing or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in answering for weight in self.networks[name].trainable_variables]
 
@@ -313,7 +314,7 @@ class DifferentiableLinks:
         marks = tf.constant(link_marks(self._phi))
         columns = input_columns(marks, numbers, frequency_hz, keras.ops)
         away_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if place is None else place)
-        known = self._known(place) if MAP_NETWORK in self._scene.networks else None
+        known = self._known(place) if reads_maps(self._scene.networks) else []
         outputs = read_links(
             self._scene.networks, known, tf.cast(columns, tf.float32)[None], tf.cast(away_m, tf.float32)[None, :, :2]
         )
@@ -321,15 +322,15 @@ class DifferentiableLinks:
         possible = possible_states(self._phi)
         return LinkDistribution.of_parts(*distribution(tf.cast(outputs[0], tf.float64), free_db, possible))
 
-    def _known(self, place: Any) -> Any:
-        """Return what the map network knows (1, ...) around the transmitter: linear around where it was."""
+    def _known(self, place: Any) -> list[Any]:
+        """Return what the map networks read (1, ...) around the transmitter: linear around where it was."""
         import tensorflow as tf
 
         known = read_maps(self._scene.networks, self._windows[:1] if place is None else self._windows)
         if place is None:
             return known
         away = tf.cast(place - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)
-        return known[:1] + away[0] * (known[1:2] - known[2:3]) + away[1] * (known[3:4] - known[4:5])
+        return [maps[:1] + away[0] * (maps[1:2] - maps[2:3]) + away[1] * (maps[3:4] - maps[4:5]) for maps in known]
 
     @cached_property
     def _windows(self) -> NDArray[np.float32]:

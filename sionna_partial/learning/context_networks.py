@@ -1,14 +1,14 @@
-"""The networks that see where links run, as Keras 3 models: a map network and a link network.
+"""The networks that see where links run, as Keras 3 models: two map networks and a link network.
 
-The map network reads the windows around the transmitter, near and far, and writes `MAP_FEATURES` numbers into each of
-their cells: a U-Net (Ronneberger, Fischer and Brox 2015), the same for all scales. What it makes of an empty window is
+The map networks read the windows around the transmitter, near and far, and write `MAP_FEATURES` numbers into each of
+their cells: U-Nets (Ronneberger, Fischer and Brox 2015), a smaller one for afar. What they make of an empty window is
 taken off, so that a map says nothing where nothing was observed, and the numbers fade to 0 towards the border of each
 window: nothing changes where one ends. The link network reads what the trace gives of a link, and the numbers of all
 windows at its receiver. It returns P(link state), and mean and log-variance of the gain in line of sight and without.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 Shape = tuple[int | None, ...]
 
-MAP_NETWORK, LINK_NETWORK = "map_network", "link_network"
-"""Names of the two networks."""
+MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
+"""Names of the networks; those of maps are in the order of `CELLS_M`."""
 
 MAP_FEATURES = 16
 """Number of values of a cell that the link network reads."""
@@ -37,7 +37,7 @@ MAP_FEATURES = 16
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
 
-_WIDTHS = (16, 32, 48, 64)
+_WIDTHS = ((16, 32, 48, 64), (8, 16, 24, 32))
 _HIDDEN_UNITS = 64
 _LOS_MOST_DB = 10.0
 """Largest mean gain given LOS, over free space [dB]: other paths add power to the direct one, and never so much."""
@@ -162,7 +162,7 @@ CONTEXT_SHAPES = (
     Shapes.of(link_network=((LINK_INPUTS,), (LINK_OUTPUTS,))),
     Shapes.of(
         link_network=((LINK_INPUTS + len(CELLS_M) * MAP_FEATURES,), (LINK_OUTPUTS,)),
-        map_network=((*_SQUARE, len(CHANNELS) + 1), (*_SQUARE, MAP_FEATURES)),
+        **dict.fromkeys(MAP_NETWORKS, ((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES))),
     ),
 )
 """What a predictor may have beside the networks of the paper: nothing, "paths", or "map"."""
@@ -176,7 +176,7 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
     seed : int
         Of the first weights.
     with_map : bool
-        Whether there is a map network; without one, the link network knows nothing but the trace.
+        Whether there are map networks; without them, the link network knows nothing but the trace.
 
     Returns
     -------
@@ -186,7 +186,11 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
     start = _Seeds(keras, seed)
     told = len(CELLS_M) * MAP_FEATURES if with_map else 0
     networks = {LINK_NETWORK: _link_network(keras, start, LINK_INPUTS + told)}
-    return networks | ({MAP_NETWORK: _map_network(keras, start)} if with_map else {})
+    if with_map:
+        networks |= {
+            name: _map_network(keras, start, name, each) for name, each in zip(MAP_NETWORKS, _WIDTHS, strict=True)
+        }
+    return networks
 
 
 def look(
@@ -199,7 +203,7 @@ def look(
     networks : mapping of str to keras.Model
         By name.
     windows : (B, *WINDOWS) float32 tensor
-        In [0, 255]; without a map network they are not read, and may be None.
+        In [0, 255]; without map networks they are not read, and may be None.
     links : (B, R, LINK_INPUTS) float32 tensor
     offsets_m : (B, R, 2) float32 tensor
         Of the receivers from the transmitter: x, y [m].
@@ -210,12 +214,17 @@ def look(
     -------
     (B, R, LINK_OUTPUTS) float32 tensor
     """
-    known = read_maps(networks, windows, training=training) if MAP_NETWORK in networks else None
+    known = read_maps(networks, windows, training=training) if reads_maps(networks) else []
     return read_links(networks, known, links, offsets_m)
 
 
-def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> Any:
-    """Let the map network read windows.
+def reads_maps(networks: Mapping[str, "keras.Model"]) -> bool:
+    """Whether there are map networks."""
+    return MAP_NETWORKS[0] in networks
+
+
+def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> list[Any]:
+    """Let the map networks read windows.
 
     Parameters
     ----------
@@ -228,36 +237,32 @@ def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: 
 
     Returns
     -------
-    (B, len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor
-        What each cell says beyond what one of an empty window does.
+    list of (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensors
+        What each cell says beyond what one of an empty window does, near and far.
     """
     import tensorflow as tf
 
     windows = tf.concat([windows, tf.zeros_like(windows[:1])], axis=0)
-    scale = 255.0 * tf.range(len(CELLS_M), dtype=tf.float32)[:, None, None, None]
-    inputs = tf.concat([windows, tf.zeros_like(windows[..., :1]) + scale], axis=-1)
-    maps = networks[MAP_NETWORK](tf.reshape(inputs, (-1, *inputs.shape[2:])), training=training)
-    maps = tf.reshape(maps, (-1, *inputs.shape[1:-1], maps.shape[-1]))
-    return maps[:-1] - maps[-1:]
+    maps = [networks[name](windows[:, scale], training=training) for scale, name in enumerate(MAP_NETWORKS)]
+    return [each[:-1] - each[-1:] for each in maps]
 
 
-def read_links(networks: Mapping[str, "keras.Model"], known: Any, links: Any, offsets_m: Any) -> Any:
+def read_links(networks: Mapping[str, "keras.Model"], known: Sequence[Any], links: Any, offsets_m: Any) -> Any:
     """Let the link network read R links of each of B transmitters: (B, R, LINK_OUTPUTS) float32 tensor.
 
     Parameters
     ----------
     networks : mapping of str to keras.Model
         By name.
-    known : (B, len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensor or None
-        From `read_maps`; None without a map network.
+    known : sequence of (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensors
+        From `read_maps`; none without map networks.
     links, offsets_m : tensors
         See `look`.
     """
     import tensorflow as tf
 
-    if known is not None:
-        at_scales = [_between(known[:, scale], offsets_m / cell_m) for scale, cell_m in enumerate(CELLS_M)]
-        links = tf.concat([links, *at_scales], axis=-1)
+    at_receivers = [_between(maps, offsets_m / cell_m) for maps, cell_m in zip(known, CELLS_M, strict=False)]
+    links = tf.concat([links, *at_receivers], axis=-1)
     outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
     return tf.reshape(outputs, (tf.shape(offsets_m)[0], -1, LINK_OUTPUTS))
 
@@ -357,28 +362,28 @@ class _Seeds:
         return self._keras.initializers.GlorotUniform(seed=self._next)
 
 
-def _map_network(keras: Any, start: _Seeds) -> "keras.Model":
+def _map_network(keras: Any, start: _Seeds, name: str, widths: tuple[int, ...]) -> "keras.Model":
     def convolved(x: Any, units: int, name: str) -> Any:
         options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
         x = layer(keras, "Conv2D", name, units, 3, **options)(x)
         x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
         return layer(keras, "ReLU", f"{name}_active")(x)
 
-    window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS) + 1), name="window", dtype="float32")
+    window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), name="window", dtype="float32")
     shares = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
-    x = convolved(shares, _WIDTHS[0], "down_0")
+    x = convolved(shares, widths[0], "down_0")
     levels = []
-    for depth, units in enumerate(_WIDTHS[1:], 1):
+    for depth, units in enumerate(widths[1:], 1):
         levels.append(x)
         x = layer(keras, "MaxPooling2D", f"pool_{depth}")(x)
         x = convolved(convolved(x, units, f"down_{depth}"), units, f"down_{depth}_again")
     for depth in reversed(range(len(levels))):
         x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
-        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), _WIDTHS[depth], f"up_{depth}")
-        x = convolved(x, _WIDTHS[depth], f"up_{depth}_again") if depth else x
+        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), widths[depth], f"up_{depth}")
+        x = convolved(x, widths[depth], f"up_{depth}_again") if depth else x
     joined = layer(keras, "Concatenate", "all")([x, shares])
     values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
-    return keras.Model(window, values, name=MAP_NETWORK)
+    return keras.Model(window, values, name=name)
 
 
 def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
@@ -395,10 +400,10 @@ def receiver_offsets_m(context: LinkContext) -> NDArray[np.float32]:
     return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
 
 
-def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tuple[Any, NDArray[np.intp]]]:
-    """Yield what the map network reads for each transmitter (1, ...), and its links; without one None and all links."""
-    if MAP_NETWORK not in networks:
-        yield None, np.arange(len(context))
+def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tuple[list[Any], NDArray[np.intp]]]:
+    """Yield what the map networks read around each transmitter, and its links; without them nothing, and all links."""
+    if not reads_maps(networks):
+        yield [], np.arange(len(context))
         return
     places, index = transmitter_places(context)
     links = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index, minlength=len(places)))[:-1])
@@ -407,8 +412,8 @@ def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tu
         windows = map_windows(context.maps[number], places[rows, 1:]).astype(np.float32)
         for start in range(0, len(rows), _WINDOWS_AT_ONCE):
             known = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE])
-            for here in range(len(known)):
-                yield known[here : here + 1], links[rows[start + here]]
+            for here, row in enumerate(rows[start : start + _WINDOWS_AT_ONCE]):
+                yield [maps[here : here + 1] for maps in known], links[row]
 
 
 def _between(maps: Any, offsets: Any) -> Any:
