@@ -122,11 +122,12 @@ class TestValues:
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     def test_moved_as_a_new_trace(self, predictor, links_of):
-        """Nearly, for half of the receivers at least, where no path comes or goes, and the map says little."""
+        """Nearer than where it was for all, and nearly so for some, where no path comes or goes and the map is flat."""
         links, place = links_of("partial", predictor), TX_M + np.array([0.04, -0.03, 0.02])
         there = links._scene.links(place, RX_M)
         here, moved, traced = (each.gain_mean_db.numpy() for each in (links(), links(tx_m=place), there()))
-        assert (np.abs(moved - traced) < 0.3 * np.abs(here - traced)).sum() >= 3
+        assert (np.abs(moved - traced) < np.abs(here - traced)).all()
+        assert (np.abs(moved - traced) < 0.3 * np.abs(here - traced)).sum() >= 2
 
     def test_two_runs_give_the_same_bytes(self, links_of):
         one, other = links_of("partial"), scene_of("partial").links(TX_M, RX_M)
