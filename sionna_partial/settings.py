@@ -199,6 +199,9 @@ class TraceSettings:
         Largest number of walls of a floor plan that mirror a path before its diffraction, and after it: 0, 1 or 2.
     open_ends : bool
         Whether a wall of a floor plan diffracts also where it ends because observation did.
+    power_tolerance_db : float
+        By how much the power of a link's indirect paths may be changed by leaving out weak paths of a floor plan [dB],
+        0 to 1; 0 keeps every path. Bounds of the power of all candidates, before any is verified, guarantee it.
     refraction, diffuse_reflection : bool
         Further interactions. With either of them, every path is found by shooting rays (Sionna RT's own candidate
         generator), which is slower than exact beams.
@@ -218,6 +221,7 @@ class TraceSettings:
     diffraction: bool | None = None
     diffraction_walls: int = 2
     open_ends: bool = False
+    power_tolerance_db: float = 0.1
     refraction: bool = False
     diffuse_reflection: bool = False
     samples_per_tx: int = 1_000_000
@@ -232,6 +236,7 @@ class TraceSettings:
             ("seed", 0, 2**31 - 1),
         ):
             require_whole(name, getattr(self, name), low, high)
+        require_number("power_tolerance_db", self.power_tolerance_db, 0.0, 1.0)
         for name in ("diffraction", "open_ends", "refraction", "diffuse_reflection"):
             value = getattr(self, name)
             unset = name == "diffraction" and value is None

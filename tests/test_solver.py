@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from extruded import ROOM, extrude
+from extruded import ROOM, diffracted_blocks, extrude, specular_blocks
 from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import Candidates, specular_candidates
-from sionna_partial.tracing.diffraction import diffraction_candidates, find_wedges
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.diffraction import find_wedges
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.scene import SHAPES, SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing.solver import SceneSolver, _to_device
@@ -27,12 +26,11 @@ def _solver(geometry: SceneGeometry, folder: Path) -> SceneSolver:
 
 
 def _specular(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
-    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], depth)
-    return next(specular_candidates(beams, geometry, tx, rx, depth))[0]
+    return specular_blocks(geometry, tx, rx, depth)[0][0]
 
 
 def _diffracted(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
-    return next(diffraction_candidates(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth))[0]
+    return diffracted_blocks(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth)[0][0]
 
 
 def _rows(candidates: Candidates, rows: NDArray[np.intp]) -> Candidates:

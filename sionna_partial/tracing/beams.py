@@ -24,6 +24,9 @@ TOLERANCE_M = 1e-4
 """Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that
 checks the candidates computes in single precision."""
 
+_STRIP_CELLS = 6.0
+"""Depth of the strips in which a narrow beam is searched for walls [cells of the index]."""
+
 _FAR_M = 1e6
 """Length at which beams that hit nothing are cut off [m]. It is fixed, so that no receiver depends on the others."""
 
@@ -110,13 +113,14 @@ class _Room(NamedTuple):
     found: NDArray[np.float64]
     wall: NDArray[np.int32]
     order: NDArray[np.int32]
+    active: NDArray[np.int32]
     edge: NDArray[np.float64]
     piece: NDArray[np.float64]
     piece_wall: NDArray[np.int32]
     visit: NDArray[np.int64]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
     """Breadth-first beam trees and the points inside each beam (see `trace_beams`).
 
@@ -130,6 +134,7 @@ def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
     size = len(walls)
     room = _Room(
         np.empty((size, 4)),
+        np.empty(size, np.int32),
         np.empty(size, np.int32),
         np.empty(size, np.int32),
         np.empty(2 * size + 2),
@@ -199,12 +204,17 @@ def _visible_pieces(plan, beam, own, room):  # type: ignore[no-untyped-def]
     for i in range(count):
         edge[2 * i + 2], edge[2 * i + 3] = min(max(found[i, 0], 0.0), 1.0), min(max(found[i, 2], 0.0), 1.0)
     _sort(edge, 2 * count + 2)
-    pieces = 0
+    pieces = begun = active = 0
     for i in range(2 * count + 1):
         t0, t1 = edge[i], edge[i + 1]
         if t1 - t0 < 1e-12:
             continue
-        best, w0, w1 = _nearest(found, room.order[:count], t0, t1)
+        middle = 0.5 * (t0 + t1)
+        while begun < count and found[room.order[begun], 0] <= middle:
+            room.active[active] = room.order[begun]
+            begun, active = begun + 1, active + 1
+        active = _without_ended(found, room.active, active, middle)
+        best, w0, w1 = _nearest(found, room.active[:active], t0, t1)
         wall = index[best] if best >= 0 else -1
         same = pieces > 0 and (
             room.piece_wall[pieces - 1] == wall
@@ -227,7 +237,7 @@ def _walls_in(plan, beam, own, room):  # type: ignore[no-untyped-def]
     Cells of the index are visited in strips across the beam. What has not been visited lies beyond all strips, so that
     walls which fill the whole view within them hide it.
     """
-    x0, y0, edge, columns, rows = plan.index.grid
+    x0, y0, edge, columns, rows = plan.cells.grid
     x1, y1 = x0 + columns * edge, y0 + rows * edge
     sx, sy = beam[0], beam[1]
     ax, ay, bx, by = beam[2] - sx, beam[3] - sy, beam[4] - sx, beam[5] - sy
@@ -236,9 +246,9 @@ def _walls_in(plan, beam, own, room):  # type: ignore[no-untyped-def]
     near, count = 1.0 if own >= 0 else 0.0, 0
     room.visit[-1] += 1
     while True:
-        far = near + max(edge, near * width) / length
-        corner[0, 0], corner[0, 1], corner[1, 0], corner[1, 1] = sx + near * ax, sy + near * ay, sx + near * bx, sy + near * by
-        corner[2, 0], corner[2, 1], corner[3, 0], corner[3, 1] = sx + far * bx, sy + far * by, sx + far * ax, sy + far * ay
+        far = near + max(_STRIP_CELLS * edge, near * width) / length
+        for k, (r, dx, dy) in enumerate(((near, ax, ay), (near, bx, by), (far, bx, by), (far, ax, ay))):
+            corner[k, 0], corner[k, 1] = sx + r * dx, sy + r * dy
         if _leaves(corner, x0 - edge, x1 + edge, 0, ax, bx) or _leaves(corner, y0 - edge, y1 + edge, 1, ay, by):
             return count
         count = _clip_cells(plan, beam, own, corner, count, room)
@@ -258,7 +268,7 @@ def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-
 @njit(cache=True)
 def _clip_cells(plan, beam, own, corner, count, room):  # type: ignore[no-untyped-def]
     """Clip the walls in the cells of a strip which were not clipped before, and give their number with the others."""
-    x0, y0, edge, columns, rows = plan.index.grid
+    x0, y0, edge, columns, rows = plan.cells.grid
     columns, rows, visit = int(columns), int(rows), room.visit[-1]
     low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
     high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
@@ -271,8 +281,8 @@ def _clip_cells(plan, beam, own, corner, count, room):  # type: ignore[no-untype
         stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
         if start > stop:
             continue
-        for entry in range(plan.index.start[row * columns + start], plan.index.start[row * columns + stop + 1]):
-            wall = plan.index.piece[entry]
+        for entry in range(plan.cells.start[row * columns + start], plan.cells.start[row * columns + stop + 1]):
+            wall = plan.cells.piece[entry]
             if room.visit[wall] == visit:
                 continue
             room.visit[wall] = visit
@@ -324,21 +334,26 @@ def _sort(values, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _nearest(found, order, t0, t1):  # type: ignore[no-untyped-def]
-    """Find the nearest of the clipped walls from t0 to t1, where none of them ends: its index (or -1), w0, w1.
+def _without_ended(found, active, count, place):  # type: ignore[no-untyped-def]
+    """Leave out the clipped walls that end before a place; the number of the others."""
+    kept = 0
+    for k in range(count):
+        if found[active[k], 2] >= place:
+            active[kept] = active[k]
+            kept += 1
+    return kept
 
-    `order` lists them by where they begin.
-    """
+
+@njit(cache=True)
+def _nearest(found, active, t0, t1):  # type: ignore[no-untyped-def]
+    """Find the nearest of the clipped walls that reach from t0 to t1: its index (or -1), w0, w1."""
     middle = 0.5 * (t0 + t1)
     best, best_w, best_slope = -1, 0.0, 0.0
-    for k in order:
-        if found[k, 0] > middle:
-            break
-        if middle <= found[k, 2]:
-            slope = (found[k, 3] - found[k, 1]) / (found[k, 2] - found[k, 0])
-            w = found[k, 1] + slope * (middle - found[k, 0])
-            if w > best_w or (w == best_w and k < best):
-                best, best_w, best_slope = k, w, slope
+    for k in active:
+        slope = (found[k, 3] - found[k, 1]) / (found[k, 2] - found[k, 0])
+        w = found[k, 1] + slope * (middle - found[k, 0])
+        if w > best_w or (w == best_w and k < best):
+            best, best_w, best_slope = k, w, slope
     return best, best_w + best_slope * (t0 - middle), best_w + best_slope * (t1 - middle)
 
 

@@ -15,7 +15,7 @@ from sionna_partial.planar import cross, span_in_strip
 _SAME_LINE_M = 1e-6
 """Distance from a line within which the ends of collinear walls lie [m]."""
 
-_WALLS_PER_CELL = 2.0
+_WALLS_PER_CELL = 4.0
 """Number of wall pieces in a cell of the index, on average over the cells that hold any."""
 
 
@@ -46,13 +46,13 @@ class Plan(NamedTuple):
         End points of the pieces [m].
     owner, line : (K,) int32 arrays
         Wall segment that each piece is a part of, and number of the infinite line that it lies on.
-    index : WallIndex
+    cells : WallIndex
     """
 
     pieces_m: NDArray[np.float64]
     owner: NDArray[np.int32]
     line: NDArray[np.int32]
-    index: WallIndex
+    cells: WallIndex
 
 
 class PointBins(NamedTuple):
