@@ -247,7 +247,7 @@ class TestMovedLengths:
             assert found_m.numpy()[0] >= 0.0
 
     def test_complete_map_and_no_segments(self, tf):
-        complete = sp.PartialMap(np.zeros((10, 10), dtype=np.uint8), 0.5)
+        complete = sp.PartialMap(np.pad(np.zeros((8, 8), dtype=np.uint8), 1, constant_values=1), 0.5)
         lengths, nothing = SmoothLengths(complete, CellState.UNKNOWN), np.zeros((0, 3))
         assert moved_lengths_m(lengths, np.zeros(0), (nothing, nothing), (tf.constant(nothing),) * 2).shape == (0,)
         ends = np.array([[1.0, 1.0, 1.0]]), np.array([[99.0, 1.0, 1.0]])

@@ -359,7 +359,7 @@ class TestEvaluateContextNetworks:
         place = np.array([[2.5, 0.5, 1.5], [0.5, 2.5, 1.5]])
         state = home.state.copy()
         state[8:12, 8:12] = FREE
-        phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), place, tx_m=(0.5, 0.5, 1.5))
+        phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), place, tx_m=(0.5, 0.5, 1.5), unobserved_m=1.0)
         one, other = link_inputs(phi, FREQUENCY_HZ)
         np.testing.assert_array_equal(one, other)
         probabilities, *_ = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
@@ -391,7 +391,7 @@ class TestEvaluateContextNetworks:
             np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
 
     def test_they_are_what_the_networks_say(self, networks, home):
-        phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)])
+        phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)], unobserved_m=1.0)
         windows, _ = transmitter_windows(phi.context)
         places = (phi.context.rx_m - phi.context.tx_m)[:, :2] / CELL_M + WINDOW_CELLS / 2
         arguments = (windows, link_inputs(phi, FREQUENCY_HZ)[None], places[None])
@@ -422,7 +422,7 @@ class TestEvaluateContextNetworks:
         def low(links):
             return np.full((len(links), LINK_OUTPUTS), -50.0, dtype=np.float32)
 
-        phi = features(home, (1.0, 2.0, 1.5))
+        phi = features(home, (1.0, 2.0, 1.5), unobserved_m=1.0)
         probabilities, means_db, stds_db = evaluate_context_networks({LINK_NETWORK: low}, phi, FREQUENCY_HZ)
         assert (means_db[[LinkState.OUTAGE, LinkState.NLOS]] == -150.0).all()
         np.testing.assert_allclose(means_db[LinkState.LOS], free_space_gain_db(phi.distance_m, FREQUENCY_HZ))

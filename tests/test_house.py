@@ -36,7 +36,7 @@ MODULES = (
     *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.chain", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.fixed_paths", "tracing.gradients"),
-    *("learning.unobserved", "learning.link_context", "learning.features", "learning.windows"),
+    *("learning.unobserved", "learning.link_context", "learning.features", "learning.certainty", "learning.windows"),
     *("learning.networks", "learning.fitting", "learning.context_networks", "learning.context_fitting"),
     *("learning.predictor_files", "learning.predictor"),
     "coverage",

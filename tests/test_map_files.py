@@ -467,7 +467,9 @@ def test_every_gibson_plan_loads(tmp_path: Path) -> None:
         partial = load_map(sheet)
         assert partial.shape == (480, 480)
         assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
-        assert partial.is_complete
+        assert partial.is_complete == (sheet.parent.name != "Kerrtown"), (
+            "that of Kerrtown is cut off at its right border"
+        )
         save_map(partial, tmp_path / "copy.yaml")
         assert load_map(tmp_path / "copy.yaml") == partial
         assert (tmp_path / "copy.pgm").read_bytes()[-partial.state.size :] == (sheet.parent / "map.pgm").read_bytes()[

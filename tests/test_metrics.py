@@ -101,14 +101,14 @@ class TestMeasure:
     def test_a_trace_has_no_likelihood_and_no_interval(self):
         phi, state, gain_db = make_links(500)
         found = measure(LinkPrediction.of_trace(phi), state, gain_db)
-        assert all(map(math.isnan, (found.nll_state, found.nll, found.coverage_90)))
+        assert all(map(math.isnan, (found.nll, found.coverage_90)))
         assert found.calibration_error == pytest.approx(1.0 - found.accuracy)
         assert found.rmse_db > 0.0
 
-    def test_a_state_held_impossible_has_no_likelihood(self):
+    def test_a_state_held_impossible_has_the_least_probability(self):
         answer = prediction([0.0, 0.5], [1.0, 0.5], [0.0, 0.0])
         found = measure(answer, np.array([OUTAGE, LOS], dtype=np.uint8), np.array([-150.0, -60.0]))
-        assert math.isnan(found.nll_state)
+        assert found.nll_state == pytest.approx(-0.5 * (math.log(1e-4) + math.log(0.5)))
         assert math.isfinite(found.coverage_90)
 
     def test_no_links_and_none_but_outages(self):

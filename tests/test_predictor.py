@@ -187,7 +187,7 @@ class TestWhatSeesWhereLinksRun:
     @pytest.mark.parametrize("complete", [range(4), [], [1, 3]], ids=str)
     def test_the_trace_answers_where_maps_are_complete(self, seeing, complete):
         phi = make_seen_links(200, seed=3)[0]
-        whole = PartialMap(np.zeros((2, 32), dtype=np.uint8), 0.5, (-0.25, -0.25))
+        whole = PartialMap(np.pad(np.zeros((2, 32), dtype=np.uint8), 1, constant_values=1), 0.5, (-0.75, -0.75))
         assert whole.is_complete
         maps = tuple(whole if number in complete else each for number, each in enumerate(corridors()))
         mixed = dataclasses.replace(phi, context=dataclasses.replace(phi.context, maps=maps))

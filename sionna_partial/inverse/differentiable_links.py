@@ -7,8 +7,8 @@ distribution is that of `Predictor.predict`.
 What gradients see, and what they do not:
 
 - Paths are those of the trace. One that would appear elsewhere is not there; one that is no longer valid loses its
-  power in a step, and no derivative sees that step. Link states of the partial trace, and whether the ends were seen,
-  are those of the trace too.
+  power in a step, and no derivative sees that step. Link states of the partial trace, which states the map leaves
+  possible, and whether the ends were seen, are those of the trace too.
 - The unobserved length of a line, d_unobs, has a derivative that jumps from cell to cell. Where the transmitter moves,
   the length is that of the trace times s(tx) / s(tx at the trace), and s is `SmoothLengths`: so are the lengths of all
   paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
@@ -33,6 +33,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.inverse.bridges import moved_lengths_m, moved_paths
 from sionna_partial.inverse.link_distribution import LinkDistribution
 from sionna_partial.inverse.smooth_lengths import SmoothLengths
+from sionna_partial.learning.certainty import possible_states
 from sionna_partial.learning.context_networks import (
     LINK_NETWORK,
     MAP_NETWORK,
@@ -167,13 +168,13 @@ class DifferentiableLinks:
 
     Examples
     --------
-    In the open, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m away:
+    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m away:
 
     >>> import numpy as np
     >>> import sionna_partial as sp
     >>> import tensorflow as tf
-    >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
-    >>> scene = sp.DifferentiableScene(field, scene_settings=sp.SceneSettings(floor_extent="none"))
+    >>> room = sp.PartialMap(np.pad(np.zeros((18, 58), dtype=np.uint8), 1, constant_values=1), resolution_m=0.1)
+    >>> scene = sp.DifferentiableScene(room, trace_settings=sp.TraceSettings(max_depth=0))
     >>> links = scene.links((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
     >>> place = tf.Variable(links.base.tx_m)
     >>> with tf.GradientTape() as tape:
@@ -309,7 +310,7 @@ class DifferentiableLinks:
         import tensorflow as tf
 
         keras, frequency_hz = import_keras(), self._scene.predictor.settings.frequency_hz
-        marks = tf.constant(link_marks(self._phi, self._numbers.walled_m))
+        marks = tf.constant(link_marks(self._phi))
         columns = input_columns(marks, numbers, frequency_hz, keras.ops)
         away_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if place is None else place)
         places = tf.clip_by_value(away_m[:, :2] / CELL_M + WINDOW_CELLS / 2, 0.5, WINDOW_CELLS - 0.5)
@@ -318,7 +319,8 @@ class DifferentiableLinks:
             self._scene.networks, known, tf.cast(columns, tf.float32)[None], tf.cast(places, tf.float32)[None]
         )
         free_db = free_space_gain_db(numbers.distance_m, frequency_hz, keras.ops)
-        return LinkDistribution.of_parts(*distribution(tf.cast(outputs[0], tf.float64), free_db))
+        possible = possible_states(self._phi)
+        return LinkDistribution.of_parts(*distribution(tf.cast(outputs[0], tf.float64), free_db, possible))
 
     def _known(self, place: Any) -> Any:
         """Return what the map network knows (1, ...) around the transmitter: linear around where it was."""

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.learning.certainty import possible_states
 from sionna_partial.learning.features import LinkFeatures
 from sionna_partial.learning.link_context import REACHES_M, LinkContext
 from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
-from sionna_partial.learning.unobserved import walled_lengths_m
 from sionna_partial.learning.windows import CHANNELS, WINDOW_CELLS, transmitter_windows, window_places
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ _NLOS_OFFSET_DB, _NLOS_SCALE_DB = -25.0, 20.0
 _STATISTICS_MOMENTUM = 0.9
 _SCALE_M, _SCALE_DB = 15.0, 100.0
 _NEAREST_M = 0.1
+_IMPOSSIBLE = -1e30
 _LINKS_AT_ONCE, _WINDOWS_AT_ONCE = 65_536, 8
 
 
@@ -80,7 +81,7 @@ class LinkNumbers:
         return cls(
             phi.distance_m,
             phi.unobserved_distance_m,
-            _walled_m(context),
+            context.walled_m,
             phi.gain_db,
             context.indirect_gain_db,
             context.strongest_unobserved_m,
@@ -93,20 +94,13 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     return phi.context
 
 
-def link_marks(phi: LinkFeatures, walled_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return what is either so or not of N links (N, `LINK_MARKS`): 0 or 1.
-
-    Parameters
-    ----------
-    phi : LinkFeatures
-        With a context.
-    walled_m : (N,) float64 array
-        Length of the direct lines in cells of known walls [m].
-    """
+def link_marks(phi: LinkFeatures) -> NDArray[np.float64]:
+    """Return binary features (N, `LINK_MARKS`) of N links, which have a context: 0 or 1."""
     context, los = context_of(phi), phi.link_state == LinkState.LOS
-    certain = los & (phi.unobserved_distance_m == 0.0) & (walled_m == 0.0)
+    walled = context.walled_m > 0.0
+    certain = los & (phi.unobserved_distance_m == 0.0) & ~walled
     states = (phi.link_state == state for state in LinkState)
-    return np.stack([*states, context.tx_seen, context.rx_seen, certain, los & (walled_m > 0.0)], axis=1) * 1.0
+    return np.stack([*states, context.tx_seen, context.rx_seen, certain, los & walled], axis=1) * 1.0
 
 
 def input_columns(marks: Any, numbers: LinkNumbers, frequency_hz: float, ops: ModuleType = np) -> Any:
@@ -136,8 +130,7 @@ def input_columns(marks: Any, numbers: LinkNumbers, frequency_hz: float, ops: Mo
 
 def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
     """Return the inputs (N, `LINK_INPUTS`) of the link network for the features of N links, which have a context."""
-    numbers = LinkNumbers.of(phi)
-    return input_columns(link_marks(phi, numbers.walled_m), numbers, frequency_hz).astype(np.float32)
+    return input_columns(link_marks(phi), LinkNumbers.of(phi), frequency_hz).astype(np.float32)
 
 
 LINK_MARKS = len(LinkState) + 4
@@ -313,18 +306,22 @@ def evaluate_context_networks(
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, known, inputs[None, here], places[None, here])[0]
-    probabilities, means_db, stds_db = distribution(outputs, free_space_gain_db(phi.distance_m, frequency_hz))
+    free_db = free_space_gain_db(phi.distance_m, frequency_hz)
+    possible = possible_states(phi)
+    probabilities, means_db, stds_db = distribution(outputs, free_db, possible)
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
-def distribution(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
-    """Read the outputs of the link network for N links.
+def distribution(outputs: Any, free_db: Any, possible: NDArray[np.bool_]) -> tuple[Any, Any, Any]:
+    """Read the outputs of the link network for N links; states that the map excludes have probability 0.
 
     Parameters
     ----------
     outputs : (N, LINK_OUTPUTS) float64 tensor
     free_db : (N,) float64 tensor
         Gain of free space [dB].
+    possible : (N, 3) bool array
+        From `possible_states`.
 
     Returns
     -------
@@ -333,6 +330,8 @@ def distribution(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     """
     import tensorflow as tf
 
+    states = tf.where(possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
+    outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
     log_probabilities, gains_db, log_variances = decode(outputs, free_db)
     outage = tf.fill([1, len(free_db)], tf.constant(GAIN_FLOOR_DB, tf.float64))
     means_db = tf.concat([outage, tf.transpose(tf.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
@@ -394,15 +393,6 @@ def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tu
         known = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE].astype(np.float32))
         for number in range(len(known)):
             yield known[number : number + 1], np.flatnonzero(index == start + number)
-
-
-def _walled_m(context: LinkContext) -> NDArray[np.float64]:
-    """Length of the direct lines (N,) in cells of known walls [m]: outlines of walls may leave them open."""
-    walled_m = np.zeros(len(context))
-    for number in np.unique(context.map_index):
-        here = context.map_index == number
-        walled_m[here] = walled_lengths_m(context.maps[number], context.tx_m[here], context.rx_m[here])
-    return walled_m
 
 
 def _between(maps: Any, places: Any) -> Any:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.learning.unobserved import unobserved_lengths_m, walled_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.tracing.trace import TracedLinks, path_gain_db
 
@@ -80,6 +80,15 @@ class LinkContext:
     def rx_seen(self) -> NDArray[np.bool_]:
         """Whether each receiver (N,) is in an observed cell of its map."""
         return self._seen(self.rx_m)
+
+    @cached_property
+    def walled_m(self) -> NDArray[np.float64]:
+        """Length of the direct line of each link (N,) in cells of known walls [m]: outlines may leave them open."""
+        walled_m = np.zeros(len(self))
+        for number in np.unique(self.map_index):
+            here = self.map_index == number
+            walled_m[here] = walled_lengths_m(self.maps[number], self.tx_m[here], self.rx_m[here])
+        return walled_m
 
     @cached_property
     def complete(self) -> NDArray[np.bool_]:

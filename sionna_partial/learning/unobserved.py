@@ -14,6 +14,9 @@ from sionna_partial.maps.partial_map import PartialMap
 
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
 
+GRAZE = 1e-9
+"""Fraction of a line up to which a wall is only grazed: lines between grid points meet many corners, to rounding."""
+
 _BORDER_CELLS = 1e-6
 """Distance within which a segment runs along the border of cells [cells]."""
 

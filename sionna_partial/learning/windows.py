@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.learning.link_context import LinkContext
-from sionna_partial.learning.unobserved import in_cells, unknown_shares, wall_shares
+from sionna_partial.learning.unobserved import GRAZE, in_cells, unknown_shares, wall_shares
 from sionna_partial.maps.partial_map import PartialMap
 
 WINDOW_CELLS, CELL_M = 64, 0.3
@@ -28,9 +28,6 @@ _WALL_COST = 100.0
 """Cost of a cell of nothing but wall to one who walks, in cells."""
 
 _LONGEST_DETOUR_M = 12.0
-
-_GRAZE = 1e-9
-"""Share of a line up to which a wall is only grazed: lines between grid points meet many corners, to rounding."""
 
 
 def transmitter_windows(context: LinkContext) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
@@ -94,7 +91,7 @@ def transmitter_window(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArra
     centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
     starts = np.tile(start, (len(centres), 1))
     unknown, blocked = (of(state, starts, centres).reshape(free.shape) for of in (unknown_shares, wall_shares))
-    return _in_255ths([free, wall, 1.0 - unknown, blocked > _GRAZE, _detours(wall)])
+    return _in_255ths([free, wall, 1.0 - unknown, blocked > GRAZE, _detours(wall)])
 
 
 def _in_255ths(layers: Sequence[NDArray[np.generic]]) -> NDArray[np.uint8]:

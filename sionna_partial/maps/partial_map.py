@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Integral
 
 import numpy as np
@@ -113,20 +114,17 @@ class PartialMap:
             return 0.0, self.wall_height_m
         return self.mesh.height_range_m
 
-    @property
+    @cached_property
     def is_complete(self) -> bool:
         """Whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
 
-        A map without free cells is not complete.
+        What lies beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
+        out of a larger one. A map without free cells is not complete.
         """
-        free, unknown = self.state == CellState.FREE, self.state == CellState.UNKNOWN
-        touches = (
-            (free[1:] & unknown[:-1]).any()
-            or (free[:-1] & unknown[1:]).any()
-            or (free[:, 1:] & unknown[:, :-1]).any()
-            or (free[:, :-1] & unknown[:, 1:]).any()
-        )
-        return bool(free.any() and not touches)
+        free = self.state == CellState.FREE
+        reached = np.pad(self.state == CellState.UNKNOWN, 1, constant_values=True)
+        touches = reached[2:, 1:-1] | reached[:-2, 1:-1] | reached[1:-1, 2:] | reached[1:-1, :-2]
+        return bool(free.any() and not (free & touches).any())
 
     @property
     def observed_fraction(self) -> float:

@@ -23,13 +23,17 @@ INTERVAL = (0.05, 0.95)
 _NO_SPREAD_DB = 1e-6
 """A standard deviation below this is rounding [dB]."""
 
+LEAST_PROBABILITY = 1e-4
+"""Of the true link state in a likelihood: a map with errors excludes true states now and then."""
+
 DEFINITIONS = {
     "links": "number of links that were measured.",
     "accuracy": "share of links whose likeliest link state is the true one.",
     "rmse_db": "root mean square of predictive mean minus true path gain [dB]; an outage counts -150 dB on both sides.",
     "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
-    "nll_state": "mean of -log P(true link state) [nat].",
-    "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat]; an outage has no second term.",
+    "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
+    "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat], P as before; an outage has no second "
+    "term.",
     "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
     f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
     "likeliest state.",
@@ -43,8 +47,8 @@ DEFINITIONS = {
 class Metrics:
     """Figures of merit of one prediction of N links, as `DEFINITIONS` says; nan where one has no finite value.
 
-    That is so without links; for `rmse_linked_db` if all links are in outage; for the likelihoods if a true link state
-    was held impossible, or a gain is predicted without spread; and for `coverage_90` of an answer without any spread.
+    That is so without links; for `rmse_linked_db` if all links are in outage; for `nll` if a gain is predicted without
+    spread; and for `coverage_90` of an answer without any spread.
     """
 
     links: int
@@ -213,7 +217,7 @@ def _negative_log_likelihoods(
     mean_db = np.where(los, answer.gain_los_mean_db, answer.gain_nlos_mean_db)
     std_db = np.where(los, answer.gain_los_std_db, answer.gain_nlos_std_db)
     with np.errstate(divide="ignore", invalid="ignore"):
-        state = -np.log(p)
+        state = -np.log(np.maximum(p, LEAST_PROBABILITY))
         gain = 0.5 * ((gain_db - mean_db) / std_db) ** 2 + np.log(std_db * math.sqrt(2.0 * math.pi))
         means = _mean(state), _mean(state + np.where(outage, 0.0, gain))
     nll_state, nll = (value if math.isfinite(value) else math.nan for value in means)
