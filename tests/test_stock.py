@@ -77,7 +77,7 @@ class TestStockPaths:
         settings = TraceSettings(max_depth=2, samples_per_tx=100_000)
         geometry, solver = build_scene(_room()), SceneSolver(room_xml, SHAPES, settings)
         blocks = specular_blocks(geometry, TX, RX, settings.max_depth)
-        exact = join_paths([solver.verify(block, TX, RX) for block, _ in blocks], settings.max_depth)
+        exact = join_paths([solver.verify(block, TX, RX)[0] for block, _ in blocks], settings.max_depth)
         shot = _solve(room_xml, settings, TX, RX)
         assert len(exact.a) > 30
         np.testing.assert_array_equal(shot.path_rx, exact.path_rx)

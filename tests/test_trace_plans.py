@@ -49,7 +49,7 @@ def _trace(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.floa
         write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, TraceSettings(power_tolerance_db=0.0)
     )
     blocks = specular_blocks(geometry, tx, rx, 2)
-    return join_paths([solver.verify(block, tx, rx) for block, _ in blocks], 2)
+    return join_paths([solver.verify(block, tx, rx)[0] for block, _ in blocks], 2)
 
 
 def _matched(lengths: NDArray[np.float64], others: NDArray[np.float64]) -> bool:

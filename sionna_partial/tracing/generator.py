@@ -138,7 +138,7 @@ def _plan_paths(
     First the bounds of all candidates are added up. Those that a link can do without, if its strongest candidates are
     as strong as their bounds, are left out. Where Sionna RT finds less than that, more of them follow.
     """
-    material = next(iter(solver.materials.values()), np.array([1.0, 0.0, 1.0]))  # none is needed without surfaces
+    material = next(iter(solver.materials.values()), np.array([2.0, 0.0, 1.0]))  # none is needed without surfaces
     bounds, tolerance_db = strengths_of(material, settings.frequency_hz, len(rx_m)), settings.power_tolerance_db
     candidates = _PlanCandidates(geometry, wedges, settings, tx_m, rx_m)
     if tolerance_db == 0.0:
@@ -220,7 +220,7 @@ def _verified(
         full = sum(len(each.rx) for each in waiting) >= CANDIDATES_AT_ONCE
         if waiting and (candidates is None or full or not candidates.is_like(waiting[0])):
             together = Candidates.concatenate(waiting)
-            paths, rows = solver.verify_rows(together, tx_m, rx_m)
+            paths, rows = solver.verify(together, tx_m, rx_m)
             yield together.rows(rows), paths, share, message
             waiting = []
         if candidates is not None and len(candidates.rx):
@@ -232,4 +232,4 @@ def _nothing(
 ) -> tuple[Candidates, SolvedPaths]:
     """No path at all."""
     none = Candidates(np.zeros(0, np.int32), np.zeros((0, 1), np.int32), np.zeros((0, 1, 3)))
-    return none, solver.verify_rows(none, tx_m, rx_m)[0]
+    return none, solver.verify(none, tx_m, rx_m)[0]
