@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
 from sionna_partial.learning.features import LinkFeatures, features_of_paths
@@ -23,7 +23,7 @@ from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
-from sionna_partial.tracing.trace import MEMORY_GB, SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
+from sionna_partial.tracing.trace import SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
@@ -317,8 +317,8 @@ def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: fl
     needed_gb = kept_gb + _WORK_BYTES * min(count, _FEWEST_RECEIVERS) / 1e9
     if needed_gb > memory_gb:
         raise MemoryLimitError(
-            f"memory_gb = {memory_gb:g} is too little: this map of {partial.state.size:,} cells and {count:,} receivers "
-            f"takes about {needed_gb:.2g} GB. Give more memory_gb, a larger spacing_m, or a part of the map."
+            f"memory_gb = {memory_gb:g} is too little: {count:,} receivers on a map of {partial.state.size:,} cells "
+            f"take about {needed_gb:.2g} GB. Give more memory_gb, a larger spacing_m, or a part of the map."
         )
     most = (memory_gb - kept_gb) / _WORK_BYTES * 1e9
     return int(min(max(most, _FEWEST_RECEIVERS), _MOST_RECEIVERS))

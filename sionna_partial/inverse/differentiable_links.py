@@ -168,7 +168,8 @@ class DifferentiableLinks:
 
     Examples
     --------
-    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m away:
+    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m
+    away:
 
     >>> import numpy as np
     >>> import sionna_partial as sp

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -40,9 +40,6 @@ each time."""
 
 SAMPLE = 100
 """Number of receivers from which the number of all paths is estimated."""
-
-MEMORY_GB = 2.0
-"""How much memory a job may take, unless the user gives another limit [GB]."""
 
 Solve = Callable[[NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[SolvedPaths, float, str]]]
 """Solves the paths from one transmitter (3,) to receivers (N, 3), in scene coordinates, block by block: the paths of a

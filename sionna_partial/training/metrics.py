@@ -32,8 +32,8 @@ DEFINITIONS = {
     "rmse_db": "root mean square of predictive mean minus true path gain [dB]; an outage counts -150 dB on both sides.",
     "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
     "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
-    "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat], P as before; an outage has no second "
-    "term.",
+    "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat], P as before; an outage has no "
+    "second term.",
     "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
     f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
     "likeliest state.",
