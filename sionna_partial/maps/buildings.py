@@ -52,7 +52,9 @@ def floor_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> La
         small = [room for part in parts_of(rest.intersection(service)) for room in _halved(rng, part, _SERVICE_M2)]
         rooms += [room for room in small if rng.random() < 0.8]  # the others are shafts
         rest = rest.difference(service)
-    for part in parts_of(rest):
+    west, _, east, _ = corridor.bounds
+    slabs = [box(x0, -_FAR_M, x1, _FAR_M) for x0, x1 in ((-_FAR_M, west), (west, east), (east, _FAR_M))]
+    for part in [part for slab in slabs for part in parts_of(rest.intersection(slab))]:
         x0, y0, x1, y1 = part.bounds
         if min(x1 - x0, y1 - y0) > _BROAD_M:
             rooms += _halved(rng, part, _log_uniform(rng, _HALL_M2))
@@ -204,21 +206,21 @@ def _machines(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
 
 def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
     """Blocks of shelves with aisles between; of some, only the legs and what lies on the floor is as low as a robot."""
-    x0, y0, x1, y1 = hall.bounds
     inner = hall.buffer(-rng.uniform(1.5, 4.0), join_style="mitre")
+    if inner.is_empty:
+        return
+    x0, y0, x1, y1 = inner.bounds
     upright, on_legs = bool(rng.random() < 0.5), rng.random() < 0.4
     deep_m, aisle_m, long_m, gap_m = rng.uniform((0.8, 1.5, 5.0, 2.0), (2.8, 4.0, 25.0, 4.5))
-    full, half_leg_m = rng.uniform(0.6, 1.0), rng.uniform(0.05, 0.12)
-    starts = np.arange(0, max(x1 - x0, y1 - y0), deep_m + aisle_m), np.arange(0, max(x1 - x0, y1 - y0), long_m + gap_m)
-    for across in starts[0]:
-        for along in starts[1]:
-            corner = (across, along) if upright else (along, across)
-            sides = (deep_m, long_m) if upright else (long_m, deep_m)
-            low = np.add((x0, y0), corner)
-            block = box(*low, *(low + sides))
-            if rng.random() > full or not inner.contains(block):
-                continue
-            yield from _legs(rng, block, half_leg_m) if on_legs else [block]
+    full, half_leg_m = rng.uniform(0.75, 1.0), rng.uniform(0.05, 0.12)
+    reach_m = max(x1 - x0, y1 - y0)
+    for across in np.arange(0.0, reach_m, deep_m + aisle_m):
+        for along in np.arange(0.0, reach_m, long_m + gap_m):
+            low = np.array((across, along) if upright else (along, across)) + (x0, y0)
+            high = low + ((deep_m, long_m) if upright else (long_m, deep_m))
+            block = box(*low, *high).intersection(inner)
+            if block.area > 0.4 * deep_m * long_m and rng.random() < full:
+                yield from _legs(rng, block, half_leg_m) if on_legs else [block]
 
 
 def _legs(rng: np.random.Generator, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
