@@ -74,14 +74,22 @@ class Camera:
         """
         angles = _ray_angles(heading_deg, self._view_deg, self._reach)
         noise = self._noise * self._rng.standard_normal(len(angles))
-        view = np.full_like(self._truth, _UNKNOWN)
-        _cast_rays(self._truth, self._missed, view, (x, y), shift, angles, noise, self._reach)
-        view[under[:, 0], under[:, 1]] = _FREE
-        self._log_odds[under[:, 0], under[:, 1]] = LOG_ODDS_LIMITS[0]
+        middle = np.array([y + shift[1], x + shift[0]])
+        reach = max(self._reach, float(np.abs(under - middle).max(initial=0.0)))
+        corner = np.clip(middle - reach - 1, 0, self.seen.shape).astype(np.intp)
+        end = np.clip(middle + reach + 2, 0, self.seen.shape).astype(np.intp)
+        part = slice(corner[0], end[0]), slice(corner[1], end[1])
+        log_odds, seen = self._log_odds[part], self.seen[part]
+        view = np.full_like(seen, _UNKNOWN)
+        rays = _Rays((x, y), shift, angles, noise, self._reach)
+        _cast_rays(self._truth, self._missed, view, (int(corner[0]), int(corner[1])), rays)
+        rows, columns = (under - corner).T
+        view[rows, columns] = _FREE
+        log_odds[rows, columns] = LOG_ODDS_LIMITS[0]
         known = view != _UNKNOWN
         change = np.where(view[known] == _WALL, HIT_LOG_ODDS, MISS_LOG_ODDS)
-        self._log_odds[known] = np.clip(self._log_odds[known] + change, *LOG_ODDS_LIMITS)
-        self.seen[known] = np.where(self._log_odds[known] > 0, _WALL, _FREE)
+        log_odds[known] = np.clip(log_odds[known] + change, *LOG_ODDS_LIMITS)
+        seen[known] = np.where(log_odds[known] > 0, _WALL, _FREE)
 
 
 def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
@@ -123,35 +131,47 @@ def _missed_walls(
     return squares[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
 
 
+class _Rays(NamedTuple):
+    """Rays of one look: where they start and how far from there the robot believes it [cells], angles [radian],
+    errors of their readings and the range [cells]."""
+
+    place: tuple[float, float]
+    shift: tuple[float, float]
+    angles: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    reach: float
+
+
 @njit(cache=True)
 def _cast_rays(
     truth: NDArray[np.uint8],
     missed: NDArray[np.bool_],
     view: NDArray[np.uint8],
-    place: tuple[float, float],
-    shift: tuple[float, float],
-    angles: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    reach: float,
+    corner: tuple[int, int],
+    rays: _Rays,
 ) -> None:
     """Write what one picture reports into `view`: free up to the reading, a wall there.
 
-    Where several rays disagree about a cell, a wall counts (as in OctoMap).
+    The first cell of `view` is row and column `corner` of the home. Where several rays disagree about a cell, a wall
+    counts (as in OctoMap).
     """
+    (x, y), shift, angles, noise, reach = rays
     for ray in range(len(angles)):
-        echo, reading = _read(truth, missed, place[0], place[1], angles[ray], reach)
+        echo, reading = _read(truth, missed, x, y, angles[ray], reach)
         reading += noise[ray]
-        walk = _start(place[0] + shift[0], place[1] + shift[1], angles[ray])
-        while 0 <= walk.row < view.shape[0] and 0 <= walk.column < view.shape[1]:
+        walk = _start(x + shift[0], y + shift[1], angles[ray])
+        row, column = walk.row - corner[0], walk.column - corner[1]
+        while 0 <= row < view.shape[0] and 0 <= column < view.shape[1]:
             if echo != _FAR and walk.leaves > reading:
                 if echo == _WALL_ECHO:
-                    view[walk.row, walk.column] = _WALL
+                    view[row, column] = _WALL
                 break
             if walk.enters > reach:
                 break
-            if view[walk.row, walk.column] == _UNKNOWN:
-                view[walk.row, walk.column] = _FREE
+            if view[row, column] == _UNKNOWN:
+                view[row, column] = _FREE
             walk = _next(walk)
+            row, column = walk.row - corner[0], walk.column - corner[1]
 
 
 @njit(cache=True)
