@@ -93,7 +93,7 @@ class Robot:
         self._given_up = np.zeros(truth.shape, dtype=bool)
         self._bumps = np.zeros(truth.shape, dtype=bool)
         self._goal: _Goal | None = None
-        self._finished = False
+        self.is_finished = False
         row, column = self._rng.choice(np.argwhere(self._roomy))
         self.place = column + 0.5, row + 0.5
         self.heading_deg = float(self._rng.integers(360 // TURN_DEG) * TURN_DEG)
@@ -115,13 +115,13 @@ class Robot:
 
     def act(self) -> None:
         """Do one action towards a frontier, and look; do nothing once no frontier can be reached."""
-        if self._finished:
+        if self.is_finished:
             return
         goal = self._goal
         if goal is None or goal.steps >= self._goal_steps or self._is_done(goal.cell):
             goal = self._goal = self._choose_goal()
         if goal is None:
-            self._finished = True
+            self.is_finished = True
             return
         goal.steps += 1
         row, column = self._waypoint(goal)
