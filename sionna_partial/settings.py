@@ -44,6 +44,11 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 FREQUENCIES_HZ = (1e6, 1e12)
 """Lowest and highest carrier frequency [Hz]."""
 
+HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
+"""Kinds of procedural homes; the last three are large."""
+
+HOME_KINDS = get_args(HomeKind)
+
 NetworkKind = Literal["paper", "paths", "map"]
 """What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
 
@@ -304,7 +309,11 @@ MIXED_SENSORS = {
     "drift_m_per_m": (0.0, 0.02),
     "missed_wall_share": (0.0, 0.1),
 }
-"""Ranges of the sensors of a data set with `sensor="mixed"`; that of `range_m` is drawn on a logarithmic scale."""
+"""Ranges of the sensors of a data set with `sensor="mixed"`.
+
+The range is drawn uniformly on a logarithmic scale, the field of view of cameras uniformly, and errors more often small
+than large (the square of a uniform number).
+"""
 
 
 @dataclass(frozen=True)

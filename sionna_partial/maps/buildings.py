@@ -127,7 +127,11 @@ def _sections(rng: np.random.Generator, corridor: shapely.Geometry) -> list[Poly
     x0, y0, x1, y1 = corridor.bounds
     for x in rng.uniform(x0, x1, rng.choice(3, p=[0.6, 0.25, 0.15])):
         corridor = shapely.GeometryCollection(
-            [piece for part in parts_of(corridor) for piece in parts_of(split(part, LineString([(x, y0 - 1), (x, y1 + 1)])))]
+            [
+                piece
+                for part in parts_of(corridor)
+                for piece in parts_of(split(part, LineString([(x, y0 - 1), (x, y1 + 1)])))
+            ]
         )
     return parts_of(corridor)
 
@@ -155,7 +159,7 @@ def _halved(rng: np.random.Generator, part: Polygon, largest_m2: float) -> Itera
     x0, y0, x1, y1 = part.bounds
     x, y = x0 + rng.uniform(0.3, 0.7) * (x1 - x0), y0 + rng.uniform(0.3, 0.7) * (y1 - y0)
     half = box(-_FAR_M, -_FAR_M, x, _FAR_M) if x1 - x0 > y1 - y0 else box(-_FAR_M, -_FAR_M, _FAR_M, y)
-    for piece in parts_of(part.intersection(half)) + parts_of(part.difference(half)):
+    for piece in (*parts_of(part.intersection(half)), *parts_of(part.difference(half))):
         yield from _halved(rng, piece, largest_m2)
 
 
@@ -179,7 +183,9 @@ def _columns(rng: np.random.Generator, rooms: list[Polygon], chance: float) -> l
         return []
     large = union_of([room.buffer(-1.0) for room in rooms if room.area > _COLUMNED_ROOM_M2])
     half_m, apart_m, start_m = rng.uniform(0.12, 0.4), rng.uniform(4.0, 12.0, 2), rng.uniform(0.0, 12.0, 2)
-    x, y = np.meshgrid(*(np.arange(first, side, step) for first, side, step in zip(start_m, LARGEST_M, apart_m)))
+    x, y = np.meshgrid(
+        *(np.arange(first, side, step) for first, side, step in zip(start_m, LARGEST_M, apart_m, strict=True))
+    )
     inside = shapely.contains_xy(large, x, y)
     return list(shapely.box(x - half_m, y - half_m, x + half_m, y + half_m)[inside])
 
@@ -216,7 +222,7 @@ def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
     reach_m = max(x1 - x0, y1 - y0)
     for across in np.arange(0.0, reach_m, deep_m + aisle_m):
         for along in np.arange(0.0, reach_m, long_m + gap_m):
-            low = np.array((across, along) if upright else (along, across)) + (x0, y0)
+            low = (*np.array((across, along) if upright else (along, across)), x0, y0)
             high = low + ((deep_m, long_m) if upright else (long_m, deep_m))
             block = box(*low, *high).intersection(inner)
             if block.area > 0.4 * deep_m * long_m and rng.random() < full:

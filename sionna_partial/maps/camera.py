@@ -132,8 +132,7 @@ def _missed_walls(
 
 
 class _Rays(NamedTuple):
-    """Rays of one look: where they start and how far from there the robot believes it [cells], angles [radian],
-    errors of their readings and the range [cells]."""
+    """Rays of one look: angles [radian]; start, how far from there the robot believes to be, errors, range [cells]."""
 
     place: tuple[float, float]
     shift: tuple[float, float]
@@ -240,6 +239,4 @@ def _next(walk: _Walk) -> _Walk:
     else:
         row, next_y = row + walk.step_y, next_y + walk.pace_y
     leaves = max(min(next_x, next_y), walk.leaves + 1e-9)
-    return _Walk(
-        row, column, walk.leaves, leaves, walk.step_x, walk.step_y, walk.pace_x, walk.pace_y, next_x, next_y
-    )
+    return _Walk(row, column, walk.leaves, leaves, walk.step_x, walk.step_y, walk.pace_x, walk.pace_y, next_x, next_y)

@@ -9,7 +9,6 @@ they do on the maps that robots and scanners make. `docs/homes.md` compares the 
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import shapely
@@ -26,9 +25,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
 from sionna_partial.maps.furniture import GRID_M, NEAR_M, furnish, parts_of, union_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import is_whole, require, require_number
-
-HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
+from sionna_partial.settings import HOME_KINDS, HomeKind, is_whole, require, require_number
 
 RESOLUTION_M = 0.05
 """Edge of a cell of the other kinds where none is given [m]."""
@@ -143,7 +140,7 @@ def make_home(
         For a seed, kind or resolution that is not allowed.
     """
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
-    require(kind is None or kind in STYLES, "kind", kind, f"choose one of {get_args(HomeKind)} or None.")
+    require(kind is None or kind in STYLES, "kind", kind, f"choose one of {HOME_KINDS} or None.")
     if resolution_m is not None:
         require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)

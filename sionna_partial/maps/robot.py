@@ -172,7 +172,7 @@ class Robot:
         for label, place in enumerate(ndimage.find_objects(labels), start=1):
             if sizes[label - 1] < _SMALLEST_FRONTIER_CELLS:
                 continue
-            cells = np.argwhere(labels[place] == label) + (place[0].start + corner[0], place[1].start + corner[1])
+            cells = np.argwhere(labels[place] == label) + np.add(corner, [side.start for side in place])
             row, column = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
             middles.append((int(row), int(column)))
             steps = self._steps_to(middles[-1], router.cost_to(middles[-1]))
@@ -254,7 +254,9 @@ class Robot:
     def _cells_around(self, row: float, column: float, reach: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
         spans = zip((row, column), self.seen.shape, strict=True)
-        rows, columns = (np.arange(max(0, int(at - reach)), max(0, min(size, int(at + reach) + 2))) for at, size in spans)
+        rows, columns = (
+            np.arange(max(0, int(at - reach)), max(0, min(size, int(at + reach) + 2))) for at, size in spans
+        )
         return rows[:, None], columns[None]
 
 
@@ -301,7 +303,9 @@ class _Router:
             weights.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
         size = len(self._cells)
         graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(size, size)).tocsr()
-        cheapest, self._before = dijkstra(graph, directed=False, indices=self._index[self._of_part(start)], return_predecessors=True)
+        cheapest, self._before = dijkstra(
+            graph, directed=False, indices=self._index[self._of_part(start)], return_predecessors=True
+        )
         self._costs = np.full(cost.shape, np.inf)
         self._costs[tuple(self._cells.T)] = cheapest
 

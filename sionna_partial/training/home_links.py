@@ -112,7 +112,8 @@ def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
     if isinstance(settings.sensor, SensorSettings):
         return settings.sensor
     rng = np.random.default_rng([1, *_home_seed(name, settings)])
-    values = {key: float(rng.uniform(*between)) for key, between in MIXED_SENSORS.items()}
+    values = {key: low + rng.random() ** 2 * (high - low) for key, (low, high) in MIXED_SENSORS.items()}
+    values["field_of_view_deg"] = float(rng.uniform(*MIXED_SENSORS["field_of_view_deg"]))
     values["range_m"] = float(np.exp(rng.uniform(*np.log(MIXED_SENSORS["range_m"]))))
     if rng.random() < _LIDAR_FRACTION:
         values["field_of_view_deg"] = 360.0
