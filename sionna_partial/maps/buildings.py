@@ -222,7 +222,7 @@ def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
     reach_m = max(x1 - x0, y1 - y0)
     for across in np.arange(0.0, reach_m, deep_m + aisle_m):
         for along in np.arange(0.0, reach_m, long_m + gap_m):
-            low = (*np.array((across, along) if upright else (along, across)), x0, y0)
+            low = np.add((across, along) if upright else (along, across), (x0, y0))
             high = low + ((deep_m, long_m) if upright else (long_m, deep_m))
             block = box(*low, *high).intersection(inner)
             if block.area > 0.4 * deep_m * long_m and rng.random() < full:
