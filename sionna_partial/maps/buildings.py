@@ -23,7 +23,7 @@ _CORRIDOR_M = (1.6, 4.5)
 _BROAD_M = 11.0
 _MODULE_M = (2.4, 4.0)
 _HALL_M2 = (60.0, 1200.0)
-_SERVICE_M2 = 14.0
+_SERVICE_M2 = 20.0
 _COLUMNED_ROOM_M2 = 120.0
 _FAR_M = 1e3
 
@@ -117,7 +117,7 @@ def _corridors(rng: np.random.Generator, length_m: float, width_m: float) -> tup
         reach = (low, high) if low < high else [(0, high), (low, width_m)][int(rng.integers(2))]
         narrow_m = rng.uniform(min(1.6, wide_m), wide_m)
         across.append(box(x, reach[0], x + narrow_m, reach[1] + wide_m))
-        if rng.random() < 0.7:
+        if rng.random() < 0.5:
             services.append(box(x + narrow_m, reach[0], x + narrow_m + rng.uniform(3.0, 12.0), reach[1] + wide_m))
     return along + across, services
 
