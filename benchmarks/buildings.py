@@ -74,9 +74,7 @@ def measure(home: sp.PartialMap, seed: int) -> dict[str, float]:
     return values
 
 
-def lines_of_sight(
-    free: NDArray[np.bool_], cell_m: float, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def lines_of_sight(free: NDArray[np.bool_], cell_m: float, seed: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Length [m] of links between random free places, half of them within 25 m; whether free cells join the ends."""
     rng = np.random.default_rng(seed)
     cells = np.argwhere(free)
