@@ -268,7 +268,7 @@ class Tracer:
 
         Raises a MemoryLimitError if that is more than `memory_gb`.
         """
-        if len(tx_m) * len(rx_m) <= self._solver[1] or len(rx_m) == 0:
+        if len(tx_m) * len(rx_m) <= RECEIVERS_OF_PLAN:
             return
         some = rx_m[np.linspace(0, len(rx_m) - 1, min(len(rx_m), SAMPLE)).astype(int)]
         found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, lambda share, message: None))
