@@ -47,10 +47,10 @@ class CleanWalls:
 def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     """Clean the wall cells of a map.
 
-    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled, on
-    thick walls also tilted ones; gaps of at most two cells in straight walls are closed (gaps of FREE cells up to
-    `MAX_FREE_GAP_M`); walls two cells thick are thinned to the cells that face FREE ones. Thin walls, posts and
-    specks stay.
+    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
+    UNKNOWN cells in seen walls are closed, and short ones of FREE cells in straight walls (`MAX_FREE_GAP_M`). Of walls
+    that were seen from FREE cells, only the cells beside these are left: what is behind was not seen. Walls two cells
+    thick are thinned. Thin walls, posts and specks stay.
 
     Parameters
     ----------
@@ -63,16 +63,44 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     CleanWalls
     """
     wall = _fill_pinholes(partial.state == CellState.WALL)
-    free = partial.state == CellState.FREE
+    free = (partial.state == CellState.FREE) & ~wall
+    _close_unknown_gaps(wall, free, round(bridge_gap_m / partial.resolution_m + 1e-6))
     for _ in range(2):
-        for view in _orientations(wall):
-            _shave_bumps(view)
-        for view in _orientations(wall):
-            _fill_notches(view)
-    _level_spikes(wall)
+        for wall_view, free_view in _orientations(wall, free):
+            _shave_bumps(wall_view, free_view)
+        for wall_view, free_view in _orientations(wall, free):
+            _fill_notches(wall_view, free_view)
+    _level_spikes(wall, free)
+    _close_unknown_gaps(wall, free, round(bridge_gap_m / partial.resolution_m + 1e-6))
     for cells, is_free in ((wall, free), (wall.T, free.T)):
         _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
-    return _thin(wall, free)
+    return _thin(_seen(wall, free), free)
+
+
+def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longest: int) -> None:
+    """Fill, in place, gaps of UNKNOWN cells: short rows of them beside FREE cells that end at two pieces of wall."""
+    gap = ndimage.binary_dilation(free) & ~free & ~wall
+    label, count = ndimage.label(gap, structure=_SQUARE)
+    extent = [0] + [max(s.stop - s.start for s in box) for box in ndimage.find_objects(label)]
+    touched, _ = ndimage.label(wall & ndimage.binary_dilation(gap, structure=_SQUARE), structure=_SQUARE)
+    padded = np.pad(touched, 1)
+    pairs = [
+        np.stack([label[gap], padded[1 + dy :, 1 + dx :][: gap.shape[0], : gap.shape[1]][gap]], axis=1)
+        for dy in (-1, 0, 1)
+        for dx in (-1, 0, 1)
+    ]
+    both = np.unique(np.concatenate(pairs), axis=0)
+    pieces = np.bincount(both[both[:, 1] > 0, 0], minlength=count + 1)
+    wall |= ((pieces >= 2) & (np.array(extent) <= longest))[label]
+
+
+def _seen(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Wall cells beside FREE ones, and pieces of wall that have none."""
+    seen = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    label, count = ndimage.label(wall, structure=_SQUARE)
+    unseen = np.ones(count + 1, dtype=bool)
+    unseen[label[seen]] = False
+    return seen | (wall & unseen[label])
 
 
 def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
@@ -82,9 +110,10 @@ def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp
     return row, start, np.nonzero(step == -1)[1]
 
 
-def _orientations(mask: NDArray[np.bool_]) -> Iterator[NDArray[np.bool_]]:
-    """Yield views of a mask with each of its four sides at row 0."""
-    yield from (mask, mask[::-1], mask.T, mask.T[::-1])
+def _orientations(*masks: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], ...]]:
+    """Yield views of masks with each of their four sides at row 0."""
+    for turned in (lambda m: m, lambda m: m[::-1], lambda m: m.T, lambda m: m.T[::-1]):
+        yield tuple(turned(mask) for mask in masks)
 
 
 def _fill_pinholes(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -94,27 +123,28 @@ def _fill_pinholes(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return wall | (size <= PINHOLE_CELLS)[label[1:-1, 1:-1]]
 
 
-def _fill_notches(wall: NDArray[np.bool_]) -> None:
-    """Fill, in place, notches of one or two cells in faces that look towards larger rows."""
+def _fill_notches(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+    """Fill, in place, notches of one or two FREE cells in faces that look towards larger rows."""
     before = wall.copy()
-    row, start, end = row_runs(~wall)
+    row, start, end = row_runs(free)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        if before[i - 1, a - 1 : b + 1].all():
-            wall[i, a:b] = True
+        if before[i, a - 1] and before[i, b] and not free[i - 1, a - 1 : b + 1].any():
+            wall[i, a:b], free[i, a:b] = True, False
 
 
-def _shave_bumps(wall: NDArray[np.bool_]) -> None:
-    """Remove, in place, bumps of one or two cells from faces that look towards larger rows."""
-    before = wall.copy()
+def _shave_bumps(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+    """Move, in place, bumps of one or two cells back into faces that look towards larger rows."""
+    before, was_free = wall.copy(), free.copy()
     row, start, end = row_runs(wall)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        if before[i - 1, a - 1 : b + 1].all() and not before[i + 1 : i + 2, a - 1 : b + 1].any():
-            wall[i, a:b] = False
+        sides = was_free[i, a - 1] and was_free[i, b] and before[i - 1, a - 1] and before[i - 1, b]
+        if sides and not was_free[i - 1, a:b].any() and was_free[i + 1 : i + 2, a - 1 : b + 1].all():
+            wall[i, a:b], free[i, a:b], wall[i - 1, a:b] = False, True, True
 
 
-def _level_spikes(wall: NDArray[np.bool_]) -> None:
+def _level_spikes(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
     """Fill, in place, cells that a thick wall has on three sides, and remove those that stick out of one."""
     beside = ndimage.binary_dilation(_thick(wall))
     for _ in range(2):
@@ -122,6 +152,8 @@ def _level_spikes(wall: NDArray[np.bool_]) -> None:
         wall |= beside & (sides >= 3)
         padded = np.pad(wall, 1)
         _peel(padded, np.pad(beside & wall & (sides <= 1), 1))
+        free |= wall & ~padded[1:-1, 1:-1]
+        free &= ~padded[1:-1, 1:-1]
         wall[:] = padded[1:-1, 1:-1]
 
 

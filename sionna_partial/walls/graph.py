@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.walls.bridges import find_bridges
 from sionna_partial.walls.chains import WallGraph
 
 _KEY = 1 << 32
@@ -33,10 +32,8 @@ def wall_graph(partial: PartialMap, wall: NDArray[np.bool_], bridge_gap_m: float
     """
     posts = _lone_cells(wall)
     graph = _cut_spurs(_index(_lattice_edges(wall), posts))
-    bridges = find_bridges(graph, partial, bridge_gap_m)
-    ends = graph.points[np.concatenate([graph.edges, bridges])]
-    lone = posts[~np.isin(_key(posts), _key(ends))]
-    return _index(np.concatenate([ends, _squares(lone)]), np.zeros((0, 2), dtype=np.int64))
+    ends = graph.points[graph.edges]
+    return _index(np.concatenate([ends, _squares(posts)]), np.zeros((0, 2), dtype=np.int64))
 
 
 def lattice_graph(wall: NDArray[np.bool_]) -> WallGraph:

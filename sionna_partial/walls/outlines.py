@@ -44,7 +44,7 @@ class _Fit:
     lines: NDArray[np.float64]
 
 
-def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.2) -> Outlines:
+def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.5) -> Outlines:
     """Outline the walls of a map.
 
     A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Only WALL cells,
