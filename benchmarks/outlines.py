@@ -122,7 +122,11 @@ def print_leaks(homes: list[sp.PartialMap], floors: list[sp.PartialMap]) -> None
     lidar = sp.SensorSettings(**LIDAR)
     print("| maps | steps | links | blocked by a seen wall | leaks | blocked on the partial map only |")
     print("|---|---|---|---|---|---|")
-    cases = (("homes", homes, STEPS, None), ("floors", floors[::3], FLOOR_STEPS, lidar), ("floors, camera", floors[::3], FLOOR_STEPS, None))
+    cases = (
+        ("homes", homes, STEPS, None),
+        ("floors", floors[::3], FLOOR_STEPS, lidar),
+        ("floors, camera", floors[::3], FLOOR_STEPS, None),
+    )
     for kind, buildings, steps, sensor in cases:
         maps = [sp.explore(building, steps, 0, sensor=sensor) for building in buildings]
         for stage, count in enumerate(steps):

@@ -63,7 +63,7 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     CleanWalls
     """
     wall = _fill_pinholes(partial.state == CellState.WALL)
-    free = (partial.state == CellState.FREE) & ~wall
+    free = ~_fill_pinholes((partial.state != CellState.FREE) | wall)
     _close_unknown_gaps(wall, free, round(bridge_gap_m / partial.resolution_m + 1e-6))
     for _ in range(2):
         for wall_view, free_view in _orientations(wall, free):
@@ -152,7 +152,7 @@ def _level_spikes(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
         wall |= beside & (sides >= 3)
         padded = np.pad(wall, 1)
         _peel(padded, np.pad(beside & wall & (sides <= 1), 1))
-        free |= wall & ~padded[1:-1, 1:-1]
+        free |= wall & ~padded[1:-1, 1:-1] & ndimage.binary_dilation(free)
         free &= ~padded[1:-1, 1:-1]
         wall[:] = padded[1:-1, 1:-1]
 

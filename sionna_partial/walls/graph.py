@@ -4,27 +4,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.walls.chains import WallGraph
 
 _KEY = 1 << 32
 
 
-def wall_graph(partial: PartialMap, wall: NDArray[np.bool_], bridge_gap_m: float) -> WallGraph:
+def wall_graph(wall: NDArray[np.bool_]) -> WallGraph:
     """Connect the centres of boundary wall cells.
 
     Edges join wall cells that touch by a side, unless both blocks of two by two cells beside the edge are full, and
-    by a corner where a block holds just these two. Short gaps between facing wall ends are bridged, and spurs of one
-    cell are cut off. Single cells become squares.
+    by a corner where a block holds just these two. Spurs of one cell are cut off. Single cells become squares.
 
     Parameters
     ----------
-    partial : PartialMap
-        The map, for its FREE and UNKNOWN cells.
     wall : (ny, nx) bool array
         Cleaned wall cells.
-    bridge_gap_m : float
-        Longest gap that is bridged [m].
 
     Returns
     -------

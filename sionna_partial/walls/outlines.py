@@ -65,9 +65,19 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     Outlines
         Segments meet only at shared vertices.
     """
-    partial, corner = _crop(partial)
+    state, corner = _crop(partial.state)
+    turned, turn = _canonical(state)
+    lines = [
+        turn.back(line) + corner
+        for line in _lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m)
+    ]
+    return assemble(lines, partial.resolution_m)
+
+
+def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> list[NDArray[np.float64]]:
+    """Polylines (n, 2) [cells] that meet only at equal vertices."""
     walls = wall_cells(partial, bridge_gap_m)
-    graph = wall_graph(partial, walls.cells, bridge_gap_m)
+    graph = wall_graph(walls.cells)
     chains = wall_chains(graph)
     places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
     fits = [_fit(places, shift, chain, tolerance_cells) for chain in chains]
@@ -75,18 +85,47 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     while True:
         lines, runs = _polylines(graph, places, chains, fits, plain)
         if not _keep_crossing(lines, runs, plain):
-            return assemble([line + corner for line in lines], partial.resolution_m)
+            return lines
 
 
-def _crop(partial: PartialMap) -> tuple[PartialMap, NDArray[np.float64]]:
-    """Cut a map to its walls and one cell around, and say where its lower-left corner was [cells]."""
-    wall = partial.state == CellState.WALL
+def _crop(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Cut cells to the walls and one cell around, and return where the lower-left corner was [cells]."""
+    wall = state == CellState.WALL
     bounds = [np.nonzero(wall.any(axis=axis))[0] if wall.any() else np.zeros(1, dtype=int) for axis in (0, 1)]
     (left, right), (bottom, top) = ((int(used[0]), int(used[-1])) for used in bounds)
-    part = partial.state[max(bottom - 1, 0) : top + 2, max(left - 1, 0) : right + 2]
-    missing = [[int(bottom == 0), int(top + 1 == wall.shape[0])], [int(left == 0), int(right + 1 == wall.shape[1])]]
-    state = np.pad(part, missing, constant_values=CellState.UNKNOWN)
-    return PartialMap(state, partial.resolution_m), np.array([left - 1.0, bottom - 1.0])
+    padded = np.pad(
+        state[bottom - 1 if bottom else 0 : top + 2, left - 1 if left else 0 : right + 2],
+        [[int(bottom == 0), int(top + 1 == wall.shape[0])], [int(left == 0), int(right + 1 == wall.shape[1])]],
+        constant_values=CellState.UNKNOWN,
+    )
+    return padded, np.array([left - 1.0, bottom - 1.0])
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Transposes a grid or not, then flips rows and columns or not."""
+
+    transpose: bool
+    flips: tuple[bool, bool]
+    shape: tuple[int, int]
+
+    def apply(self, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        turned = state.T if self.transpose else state
+        return np.ascontiguousarray(turned[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1])
+
+    def back(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 2) of the turned grid, in the original one."""
+        height, width = self.shape[::-1] if self.transpose else self.shape
+        flipped = np.where(self.flips[::-1], np.array([width, height]) - points, points)
+        return flipped[:, ::-1] if self.transpose else flipped
+
+
+def _canonical(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], _Turn]:
+    """Turn or mirror a grid to its one orientation of the smallest bytes: the outlines turn with the map."""
+    turns = [_Turn(t, (r, c), state.shape) for t in (False, True) for r in (False, True) for c in (False, True)]
+    turned = [turn.apply(state) for turn in turns]
+    best = min(range(8), key=lambda k: (turned[k].shape, turned[k].tobytes()))
+    return turned[best], turns[best]
 
 
 def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArray[np.float64]:
