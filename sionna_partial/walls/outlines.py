@@ -67,11 +67,8 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     """
     state, corner = _crop(partial.state)
     turned, turn = _canonical(state)
-    lines = [
-        turn.back(line) + corner
-        for line in _lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m)
-    ]
-    return assemble(lines, partial.resolution_m)
+    cells = assemble(_lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m), 1.0)
+    return Outlines((turn.back(cells.vertices_m) + corner) * partial.resolution_m, cells.segments)
 
 
 def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> list[NDArray[np.float64]]:
