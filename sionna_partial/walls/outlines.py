@@ -14,7 +14,7 @@ from sionna_partial.walls.graph import wall_graph
 from sionna_partial.walls.lines import fit_runs
 
 _REACH_CELLS = 1.0
-_OFFSET_CELLS = 0.6
+_OFFSET_CELLS = 1.0
 _MIN_SHIFT_CELLS = 0.25
 
 
