@@ -4,13 +4,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-RAGGED_FACTOR = 3.0
+RAGGED_FACTOR = 2.0
 """How much farther than the tolerance a line may be from ragged walls."""
 
 _CORNERS = 64
-_RESIDUAL_COST = 4.0
-_RAGGED_TURNS = 2
-_RAGGED_SPACING = 20.0
+_RESIDUAL_COST = 8.0
+_RAGGED_TURNS = 4
+_RAGGED_SPACING = 10.0
 _LEVEL_CELLS = 1.0
 
 _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
