@@ -24,6 +24,8 @@ PINHOLE_CELLS = 6
 
 _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
+_ROUGH = 0.05
+_DEEP = 0.3
 _BLOB_CELLS = 15
 _NEAR_CELLS = 7
 _CROSS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], dtype=np.uint8)
@@ -38,10 +40,13 @@ class CleanWalls:
     cells : (ny, nx) bool array
     peeled : (ny, nx) bool array
         Cells that face FREE ones and were taken off walls two cells thick: the outline lies between both layers.
+    noise : float
+        0 where walls are exact, to 1 where range noise thickened and roughened them.
     """
 
     cells: NDArray[np.bool_]
     peeled: NDArray[np.bool_]
+    noise: float
 
 
 def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
@@ -64,17 +69,33 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     """
     wall = _fill_pinholes(partial.state == CellState.WALL)
     free = ~_fill_pinholes((partial.state != CellState.FREE) | wall)
-    _close_unknown_gaps(wall, free, round(bridge_gap_m / partial.resolution_m + 1e-6))
+    longest = int(bridge_gap_m / partial.resolution_m + 1e-6)
+    _close_unknown_gaps(wall, free, longest)
+    noise = _level(wall, free)
+    _close_unknown_gaps(wall, free, longest)
+    for cells, is_free in ((wall, free), (wall.T, free.T)):
+        _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
+    thinned, peeled = _thin(_seen(wall, free), free)
+    return CleanWalls(thinned, peeled, noise)
+
+
+def _level(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> float:
+    """Level faces in place, and return the noise of `CleanWalls`.
+
+    Rays that end at a wall without noise mark one layer of cells with smooth faces; with noise they mark several, with
+    rough ones. Walls of plans are thick too, but smooth.
+    """
+    facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    faces, hidden = max(1, int(facing.sum())), int((wall & ~facing).sum())
+    was_free = free.copy()
     for _ in range(2):
         for wall_view, free_view in _orientations(wall, free):
             _shave_bumps(wall_view, free_view)
         for wall_view, free_view in _orientations(wall, free):
             _fill_notches(wall_view, free_view)
+    levelled = int((free != was_free).sum())
     _level_spikes(wall, free)
-    _close_unknown_gaps(wall, free, round(bridge_gap_m / partial.resolution_m + 1e-6))
-    for cells, is_free in ((wall, free), (wall.T, free.T)):
-        _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
-    return _thin(_seen(wall, free), free)
+    return min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
 
 
 def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longest: int) -> None:
@@ -177,7 +198,7 @@ def _close_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], resolution_m: 
             wall[row[k], end[k] : start[k + 1]] = True
 
 
-def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> CleanWalls:
+def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Thin walls of two cells to one, keeping the cells that face FREE ones where only one side does."""
     label, _ = ndimage.label(wall, structure=_SQUARE)
     small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
@@ -190,7 +211,7 @@ def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> CleanWalls:
         for (dy, dx), across in (((1, 0), height), ((-1, 0), height), ((0, 1), width), ((0, -1), width)):
             side = ~np.roll(thinned, (-dy, -dx), (0, 1))
             _peel(thinned, side & np.pad(removable & (across <= np.minimum(width, height)), 1))
-    return CleanWalls(thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing)
+    return thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing
 
 
 def _run_lengths(wall: NDArray[np.bool_]) -> NDArray[np.uint8]:

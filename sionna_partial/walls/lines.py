@@ -8,7 +8,7 @@ RAGGED_FACTOR = 2.0
 """How much farther than the tolerance a line may be from ragged walls."""
 
 _CORNERS = 64
-_RESIDUAL_COST = 8.0
+_RESIDUAL_COST = 4.0
 _RAGGED_TURNS = 4
 _RAGGED_SPACING = 10.0
 _LEVEL_CELLS = 1.0

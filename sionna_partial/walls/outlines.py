@@ -77,7 +77,7 @@ def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> 
     graph = wall_graph(walls.cells)
     chains = wall_chains(graph)
     places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
-    fits = [_fit(places, shift, chain, tolerance_cells) for chain in chains]
+    fits = [_fit(places, shift, chain, (1.0 + walls.noise) * tolerance_cells) for chain in chains]
     plain = [np.full(len(f.lines), graph.points[c.points[0], 0] % 2 == 0) for c, f in zip(chains, fits, strict=True)]
     while True:
         lines, runs = _polylines(graph, places, chains, fits, plain)
