@@ -70,12 +70,12 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     wall = _fill_pinholes(partial.state == CellState.WALL)
     free = ~_fill_pinholes((partial.state != CellState.FREE) | wall)
     longest = int(bridge_gap_m / partial.resolution_m + 1e-6)
-    _close_unknown_gaps(wall, free, longest)
+    filled = _close_unknown_gaps(wall, free, longest)
     noise = _level(wall, free)
-    _close_unknown_gaps(wall, free, longest)
+    filled |= _close_unknown_gaps(wall, free, longest)
     for cells, is_free in ((wall, free), (wall.T, free.T)):
         _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
-    thinned, peeled = _thin(_seen(wall, free), free)
+    thinned, peeled = _thin(_seen(wall, free) | (filled & wall), free)
     return CleanWalls(thinned, peeled, noise)
 
 
@@ -98,21 +98,38 @@ def _level(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> float:
     return min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
 
 
-def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longest: int) -> None:
-    """Fill, in place, gaps of UNKNOWN cells: short rows of them beside FREE cells that end at two pieces of wall."""
+def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+    """Fill, in place, gaps of UNKNOWN cells between two pieces of wall, and return the cells filled.
+
+    A gap is a row of UNKNOWN cells beside FREE ones, at most `longest`, that ends at two pieces. The shortest line
+    between these closes it, or, where rays passed that line, the row itself.
+    """
     gap = ndimage.binary_dilation(free) & ~free & ~wall
-    label, count = ndimage.label(gap, structure=_SQUARE)
-    extent = [0] + [max(s.stop - s.start for s in box) for box in ndimage.find_objects(label)]
-    touched, _ = ndimage.label(wall & ndimage.binary_dilation(gap, structure=_SQUARE), structure=_SQUARE)
-    padded = np.pad(touched, 1)
-    pairs = [
-        np.stack([label[gap], padded[1 + dy :, 1 + dx :][: gap.shape[0], : gap.shape[1]][gap]], axis=1)
-        for dy in (-1, 0, 1)
-        for dx in (-1, 0, 1)
-    ]
-    both = np.unique(np.concatenate(pairs), axis=0)
-    pieces = np.bincount(both[both[:, 1] > 0, 0], minlength=count + 1)
-    wall |= ((pieces >= 2) & (np.array(extent) <= longest))[label]
+    label, _ = ndimage.label(gap, structure=_SQUARE)
+    pieces, _ = ndimage.label(wall & ndimage.binary_dilation(gap, structure=_SQUARE), structure=_SQUARE)
+    filled = np.zeros_like(wall)
+    for index, box in enumerate(ndimage.find_objects(label), start=1):
+        if max(side.stop - side.start for side in box) <= longest:
+            around = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in box)
+            row = label[around] == index
+            ends = np.where(ndimage.binary_dilation(row, structure=_SQUARE), pieces[around], 0)
+            if len(np.unique(ends)) > 2:
+                line = _line_between(ends)
+                filled[around] |= row if (free[around] & line).any() else line
+    filled &= ~wall
+    wall |= filled
+    return filled
+
+
+def _line_between(ends: NDArray[np.integer]) -> NDArray[np.bool_]:
+    """Cells on the shortest line between two of the labels, the smallest and the largest."""
+    low, high = (np.argwhere(ends == value) for value in (ends[ends > 0].min(), ends.max()))
+    apart = np.abs(low[:, None] - high[None]).max(axis=2)
+    start, end = low[np.argmin(apart) // len(high)], high[np.argmin(apart) % len(high)]
+    row, column = np.rint(np.linspace(start, end, int(apart.min()) + 1)).astype(int).T
+    line = np.zeros(ends.shape, dtype=bool)
+    line[row, column] = True
+    return line
 
 
 def _seen(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> NDArray[np.bool_]:
