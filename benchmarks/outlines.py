@@ -123,7 +123,9 @@ def segments_per_m(maps: list[sp.PartialMap]) -> float:
 def print_leaks(homes: list[sp.PartialMap], floors: list[sp.PartialMap]) -> None:
     """Leaks and the opposite error."""
     lidar = sp.SensorSettings(**LIDAR)
-    print("| maps | steps | links | blocked by a seen wall | leaks | between seen cells | blocked on the partial map only |")
+    print(
+        "| maps | steps | links | blocked by a seen wall | leaks | between seen cells | blocked on the partial map only |"
+    )
     print("|---|---|---|---|---|---|---|")
     cases = (
         ("homes", homes, STEPS, None),

@@ -68,7 +68,25 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     state, corner = _crop(partial.state)
     turned, turn = _canonical(state)
     cells = assemble(_lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m), 1.0)
-    return Outlines((turn.back(cells.vertices_m) + corner) * partial.resolution_m, cells.segments)
+    vertices = turn.back(_extended(cells, turned)) + corner
+    return Outlines(vertices * partial.resolution_m, cells.segments)
+
+
+def _extended(outlines: Outlines, state: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Vertices [cells], with ends that UNKNOWN cells follow moved from the centre of the last cell to its border."""
+    vertices, segments = outlines.vertices_m.copy(), outlines.segments
+    ends, tails = segments.ravel(), segments[:, ::-1].ravel()
+    along = vertices[ends] - vertices[tails]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    column, row = np.clip(np.floor(vertices[ends] + along).astype(int), 0, np.array(state.shape)[::-1] - 1).T
+    is_open = (np.bincount(ends)[ends] == 1) & (state[row, column] == CellState.UNKNOWN)
+    tips = shapely.linestrings(np.stack([vertices[ends], vertices[ends] + 0.5 * along], axis=1)[is_open])
+    index = np.nonzero(is_open)[0]
+    tip, line = shapely.STRtree(np.append(shapely.linestrings(vertices[segments]), tips)).query(tips, "intersects")
+    own = (line == index[tip] // 2) | (line == len(segments) + tip)
+    index = np.delete(index, tip[~own])
+    vertices[ends[index]] += 0.5 * along[index]
+    return vertices
 
 
 def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> list[NDArray[np.float64]]:
