@@ -8,7 +8,7 @@ RAGGED_FACTOR = 2.0
 """How much farther than the tolerance a line may be from ragged walls."""
 
 _CORNERS = 64
-_RESIDUAL_COST = 4.0
+_RESIDUAL_COST = 3.0
 _RAGGED_TURNS = 4
 _RAGGED_SPACING = 10.0
 _LEVEL_CELLS = 1.0
@@ -87,7 +87,7 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
         _accumulate(sums, element)
         length = abs(points[k + 1, i] - points[start, i])
         if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
-            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums)
+            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums) / max(tolerance, 0.25) ** 2
             if total < cost[k + 1] - 1e-12:
                 cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
 
