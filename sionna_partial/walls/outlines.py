@@ -65,7 +65,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     Outlines
         Segments meet only at shared vertices.
     """
-    state, corner = _crop(partial.state)
+    state, corner = _crop(partial.state, 1 + int(bridge_gap_m / partial.resolution_m + 1e-6))
     turned, turn = _canonical(state)
     cells = assemble(_lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m), 1.0)
     vertices = turn.back(_extended(cells, turned)) + corner
@@ -103,17 +103,13 @@ def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> 
             return lines
 
 
-def _crop(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Cut cells to the walls and one cell around, and return where the lower-left corner was [cells]."""
-    wall = state == CellState.WALL
-    bounds = [np.nonzero(wall.any(axis=axis))[0] if wall.any() else np.zeros(1, dtype=int) for axis in (0, 1)]
-    (left, right), (bottom, top) = ((int(used[0]), int(used[-1])) for used in bounds)
-    padded = np.pad(
-        state[bottom - 1 if bottom else 0 : top + 2, left - 1 if left else 0 : right + 2],
-        [[int(bottom == 0), int(top + 1 == wall.shape[0])], [int(left == 0), int(right + 1 == wall.shape[1])]],
-        constant_values=CellState.UNKNOWN,
-    )
-    return padded, np.array([left - 1.0, bottom - 1.0])
+def _crop(state: NDArray[np.uint8], margin: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Cut cells to the walls and a margin around, and return where the lower-left corner was [cells]."""
+    row, column = (np.nonzero((state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
+    (bottom, top), (left, right) = ((used[0], used[-1]) if len(used) else (0, 0) for used in (row, column))
+    padded = np.pad(state, margin, constant_values=CellState.UNKNOWN)
+    part = padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1]
+    return part, np.array([left, bottom], dtype=float) - margin
 
 
 @dataclass(frozen=True)
