@@ -114,7 +114,7 @@ def explored(building: sp.PartialMap, **sensor: float) -> sp.PartialMap:
 
 
 def segments_per_m(maps: list[sp.PartialMap]) -> float:
-    """Number of segments by their length."""
+    """Divide the number of segments by their length."""
     outlines = [wall_outlines(each) for each in maps]
     lengths_m = [np.linalg.norm(np.diff(each.vertices_m[each.segments], axis=1), axis=2).sum() for each in outlines]
     return float(sum(len(each.segments) for each in outlines) / sum(lengths_m))
@@ -123,9 +123,7 @@ def segments_per_m(maps: list[sp.PartialMap]) -> float:
 def print_leaks(homes: list[sp.PartialMap], floors: list[sp.PartialMap]) -> None:
     """Leaks and the opposite error."""
     lidar = sp.SensorSettings(**LIDAR)
-    print(
-        "| maps | steps | links | blocked by a seen wall | leaks | between seen cells | blocked on the partial map only |"
-    )
+    print("| maps | steps | links | behind seen walls | leaks | between seen cells | blocked on the partial map only |")
     print("|---|---|---|---|---|---|---|")
     cases = (
         ("homes", homes, STEPS, None),

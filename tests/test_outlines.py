@@ -5,12 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.walls.outlines import Outlines, wall_outlines
@@ -471,6 +472,13 @@ def transformed_points(
     return np.where([columns < 0, rows < 0], [width, height] - turned, turned)
 
 
+SYMMETRIES = [
+    (transpose, rows, columns)
+    for transpose in (False, True)
+    for rows in (1, -1)
+    for columns in (1, -1)
+    if (transpose, rows, columns) != (False, 1, 1)
+]
 ORIENTATIONS = st.tuples(st.booleans(), st.sampled_from([1, -1]), st.sampled_from([1, -1]))
 
 
@@ -515,13 +523,26 @@ def test_outlines_turn_and_move_with_the_map(
     np.testing.assert_array_equal(there.segments, here.segments)
 
 
-SYMMETRIES = [
-    (transpose, rows, columns)
-    for transpose in (False, True)
-    for rows in (1, -1)
-    for columns in (1, -1)
-    if (transpose, rows, columns) != (False, 1, 1)
-]
+@settings(max_examples=4, deadline=None)
+@given(st.integers(0, 50), st.sampled_from(SYMMETRIES), st.sampled_from([0.0, 1e7]), st.booleans())
+def test_gains_turn_and_move_with_the_map(
+    seed: int, orientation: tuple[bool, int, int], origin: float, complete: bool
+) -> None:
+    """Links of a home, complete and explored, and of the home turned, mirrored and moved."""
+    home = sp.make_home(62_000 + seed)
+    partial = home if complete else sp.explore(home, (100,), seed)[0]
+    moved = sp.PartialMap(transformed(partial.state, *orientation), partial.resolution_m, (origin, -origin))
+    rng = np.random.default_rng(seed)
+    free = rng.permutation(np.argwhere(partial.state == CellState.FREE))[:150, ::-1] + rng.random((150, 2))
+    there = transformed_points(free, partial.shape, *orientation)
+    links = []
+    for each, points in ((partial, free), (moved, there)):
+        placed = np.column_stack([points * each.resolution_m + each.origin_m, np.full(150, 1.5)])
+        links.append(sp.trace_links(each, placed[0], placed[1:]))
+    here, turned = links
+    same = (np.abs(turned.gain_db - here.gain_db) <= 0.5) & (turned.link_state == here.link_state)
+    assert same.mean() >= 0.98
+    assert (turned.link_state == here.link_state).mean() >= 0.99
 
 
 @pytest.mark.parametrize("orientation", SYMMETRIES)

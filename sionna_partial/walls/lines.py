@@ -24,8 +24,8 @@ def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.
     (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
     lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
     more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
-    notches of one cell then need no runs of their own. The split minimises the number of runs plus eight times their
-    residual variances [cells^2]; a line is the least-squares one where that keeps the tolerance, and a ragged one is
+    notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
+    residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a ragged one is
     parallel to an axis where that moves its ends by half a cell at most.
 
     Parameters

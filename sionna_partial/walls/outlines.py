@@ -47,18 +47,21 @@ class _Fit:
 def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.5) -> Outlines:
     """Outline the walls of a map.
 
-    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Only WALL cells,
-    and the gaps of a cell or two between them, bear outlines.
+    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Of a wall that
+    was seen from one side, the face on that side is outlined. Only WALL cells, and short gaps between them, bear
+    outlines. An end that UNKNOWN cells follow reaches the border of the last cell. A map that is turned, mirrored,
+    padded with UNKNOWN cells or moved has the same outlines, transformed; only where a map equals its own mirror image
+    may they depend on the orientation.
 
     Parameters
     ----------
     partial : PartialMap
     tolerance_cells : float
         Largest distance of an outline from the lattice line through the cell centres [cells]. From 0.5 on, the
-        staircase of a tilted wall becomes one straight line. Twice as much is allowed where a wall is ragged, that is
-        where its face turns to and fro at least once in 10 cells.
+        staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
+        noise made thick and rough, and again twice as much where a face turns to and fro at least once in 10 cells.
     bridge_gap_m : float
-        Longest gap in a seen wall that is closed [m]; never more than two cells.
+        Longest gap of UNKNOWN cells in a seen wall that is closed [m].
 
     Returns
     -------
