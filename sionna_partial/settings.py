@@ -145,9 +145,9 @@ class SceneSettings:
     material : Material
         Material of walls, floor and ceiling, or of those parts of a mesh that name none.
     outline_tolerance_cells : float
-        Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps whose
-        walls range noise made thick and rough, and again twice as much where a face turns to and fro at least once in
-        10 cells.
+        Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps
+        whose walls range noise made thick and rough, and again twice as much where a face turns to and fro at least
+        once in 10 cells.
     bridge_gap_m : float
         Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
         closed, and 0.11 m.

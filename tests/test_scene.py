@@ -153,7 +153,7 @@ def test_meshes_stand_where_the_map_is(tmp_path: Path) -> None:
     partial = drawn(ROOM, origin_m=(-10.0, 20.0))
     folder = export_scene(partial, tmp_path / "scene")
     walls, floor, ceiling = (mesh(folder, name) for name in ("walls", "floor", "ceiling"))
-    np.testing.assert_allclose(walls.bounds, [[-9.25, 20.75, 0.0], [-4.5, 23.25, 3.0]])
+    np.testing.assert_allclose(walls.bounds, [[-9.25, 20.75, 0.0], [-4.75, 23.25, 3.0]])
     np.testing.assert_allclose(floor.bounds, [[-9.5, 20.5, 0.0], [-4.5, 23.5, 0.0]])
     np.testing.assert_allclose(ceiling.bounds, [[-9.5, 20.5, 3.0], [-4.5, 23.5, 3.0]])
     assert (floor.face_normals[:, 2] > 0.99).all()

@@ -25,8 +25,8 @@ def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.
     lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
     more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
     notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
-    residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a ragged one is
-    parallel to an axis where that moves its ends by half a cell at most.
+    residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a
+    ragged one is parallel to an axis where that moves its ends by half a cell at most.
 
     Parameters
     ----------
