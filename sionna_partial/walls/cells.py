@@ -26,9 +26,6 @@ _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
 _ROUGH = 0.05
 _DEEP = 0.3
-_BLOB_CELLS = 15
-_NEAR_CELLS = 7
-_CROSS = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], dtype=np.uint8)
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,6 @@ def _level(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> float:
         for wall_view, free_view in _orientations(wall, free):
             _fill_notches(wall_view, free_view)
     levelled = int((free != was_free).sum())
-    _level_spikes(wall, free)
     return min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
 
 
@@ -182,19 +178,6 @@ def _shave_bumps(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
             wall[i, a:b], free[i, a:b], wall[i - 1, a:b] = False, True, True
 
 
-def _level_spikes(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
-    """Fill, in place, cells that a thick wall has on three sides, and remove those that stick out of one."""
-    beside = ndimage.binary_dilation(_thick(wall))
-    for _ in range(2):
-        sides = ndimage.convolve(wall.astype(np.uint8), _CROSS, mode="constant")
-        wall |= beside & (sides >= 3)
-        padded = np.pad(wall, 1)
-        _peel(padded, np.pad(beside & wall & (sides <= 1), 1))
-        free |= wall & ~padded[1:-1, 1:-1] & ndimage.binary_dilation(free)
-        free &= ~padded[1:-1, 1:-1]
-        wall[:] = padded[1:-1, 1:-1]
-
-
 def _close_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], resolution_m: float, bridge_gap_m: float) -> None:
     """Close, in place, short horizontal gaps between walls that are longer than they are thick."""
     row, start, end = row_runs(wall)
@@ -219,7 +202,7 @@ def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple[NDArray[np.
     """Thin walls of two cells to one, keeping the cells that face FREE ones where only one side does."""
     label, _ = ndimage.label(wall, structure=_SQUARE)
     small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
-    kept = _thick(wall) | np.array(small, dtype=bool)[label]
+    kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
     facing = ndimage.binary_dilation(free, structure=_SQUARE)
     kept |= ~ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
     width, height = _run_lengths(wall), _run_lengths(wall.T).T
@@ -237,28 +220,6 @@ def _run_lengths(wall: NDArray[np.bool_]) -> NDArray[np.uint8]:
     length = np.zeros(wall.shape, dtype=np.uint8)
     length[wall] = np.repeat(np.minimum(end - start, 255), end - start)
     return length
-
-
-def _thick(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Cells of walls of three cells or more, also where a tilted one holds no square of three by three."""
-    squares = _consistent(wall, ndimage.binary_opening(wall, structure=_SQUARE))
-    crosses = ndimage.binary_opening(wall, structure=ndimage.generate_binary_structure(2, 1))
-    label, count = ndimage.label(crosses, structure=_SQUARE)
-    solid = np.zeros(count + 1, dtype=bool)
-    solid[label[squares]] = True
-    solid[0] = False
-    return squares | solid[label]
-
-
-def _consistent(wall: NDArray[np.bool_], squares: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Add short thin parts of walls that are mostly thick, and leave out short thick parts of thin walls."""
-    closed = ndimage.minimum_filter(ndimage.maximum_filter(squares, _NEAR_CELLS), _NEAR_CELLS) & wall
-    label, count = ndimage.label(closed, structure=_SQUARE)
-    size, thick = (np.bincount(mask, minlength=count + 1) for mask in (label.ravel(), label[squares]))
-    wall_label, _ = ndimage.label(wall, structure=_SQUARE)
-    wall_size = np.zeros(count + 1, dtype=np.int64)
-    wall_size[label[closed]] = np.bincount(wall_label.ravel())[wall_label[closed]]
-    return closed & ((2 * thick > size) & ((thick > _BLOB_CELLS) | (2 * thick > wall_size)))[label]
 
 
 def _peel(wall: NDArray[np.bool_], candidates: NDArray[np.bool_]) -> None:
