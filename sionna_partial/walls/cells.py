@@ -11,7 +11,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 
 MAX_GAP_CELLS = 2
-"""Longest gap in a wall that is closed [cells]."""
+"""Longest gap of FREE cells in a wall that is closed, and longest bump or notch that is levelled [cells]."""
 
 MAX_FREE_GAP_M = 0.11
 """Longest gap of FREE cells that is closed [m]: nobody passes there; log-odds mapping erases single wall cells."""
@@ -25,7 +25,10 @@ PINHOLE_CELLS = 6
 _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
 _ROUGH = 0.05
+"""Levelled cells per cell of a face on maps of full noise. Plans and exact explorations have less or are not deep."""
+
 _DEEP = 0.3
+"""Wall cells behind faces per cell of a face on maps of full noise: measured on simulated lidars, 0.5 to 2.5."""
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,8 @@ def wall_graph(wall: NDArray[np.bool_]) -> WallGraph:
     -------
     WallGraph
     """
-    posts = _lone_cells(wall)
-    graph = _cut_spurs(_index(_lattice_edges(wall), posts))
-    ends = graph.points[graph.edges]
-    return _index(np.concatenate([ends, _squares(posts)]), np.zeros((0, 2), dtype=np.int64))
+    graph = _cut_spurs(_index(_lattice_edges(wall)))
+    return _index(np.concatenate([graph.points[graph.edges], _squares(_lone_cells(wall))]))
 
 
 def lattice_graph(wall: NDArray[np.bool_]) -> WallGraph:
@@ -43,8 +41,7 @@ def lattice_graph(wall: NDArray[np.bool_]) -> WallGraph:
     -------
     WallGraph
     """
-    ends = np.concatenate([_lattice_edges(wall), _squares(_lone_cells(wall))])
-    return _index(ends, np.zeros((0, 2), dtype=np.int64))
+    return _index(np.concatenate([_lattice_edges(wall), _squares(_lone_cells(wall))]))
 
 
 def _lattice_edges(wall: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -77,15 +74,10 @@ def _squares(centres: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([corners, np.roll(corners, -1, axis=1)], 2).reshape(-1, 2, 2)
 
 
-def _key(points: NDArray[np.int64]) -> NDArray[np.int64]:
-    return points[..., 1] * _KEY + points[..., 0]
-
-
-def _index(ends: NDArray[np.int64], more: NDArray[np.int64]) -> WallGraph:
-    """Graph of edges given by their ends (E, 2, 2), and of points without edges."""
-    key = _key(np.concatenate([ends.reshape(-1, 2), more]))
-    unique, inverse = np.unique(key, return_inverse=True)
-    edges = np.sort(inverse[: 2 * len(ends)].reshape(-1, 2), axis=1)
+def _index(ends: NDArray[np.int64]) -> WallGraph:
+    """Graph of edges given by their ends (E, 2, 2)."""
+    unique, inverse = np.unique(ends[..., 1].ravel() * _KEY + ends[..., 0].ravel(), return_inverse=True)
+    edges = np.sort(inverse.reshape(-1, 2), axis=1)
     edges = np.unique(edges, axis=0) if len(edges) else edges
     return WallGraph(np.stack([unique % _KEY, unique // _KEY], 1), edges.astype(np.int64))
 
@@ -98,4 +90,4 @@ def _cut_spurs(graph: WallGraph) -> WallGraph:
     junction = np.where(ends[:, 0] > ends[:, 1], graph.edges[:, 0], graph.edges[:, 1])
     spurs = np.bincount(junction[spur], minlength=len(degree))
     spur &= spurs[junction] < degree[junction]
-    return _index(graph.points[graph.edges[~spur]], graph.points[degree == 0])
+    return _index(graph.points[graph.edges[~spur]])
