@@ -161,10 +161,12 @@ class SceneSettings:
     material : Material
         Material of walls, floor and ceiling, or of those parts of a mesh that name none.
     outline_tolerance_cells : float
-        Largest distance of a simplified wall outline from the lattice outline [cells]; twice as much along ragged
-        walls, whose face turns to and fro at least once in 10 cells.
+        Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps
+        whose walls range noise made thick and rough, and again twice as much where a face turns to and fro at least
+        once in 10 cells.
     bridge_gap_m : float
-        Longest gap that is closed in a seen wall [m]; at most two cells are bridged, whatever this allows.
+        Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
+        closed, and 0.11 m.
     floor_extent : {"observed", "map", "none"}
         What floor and ceiling span: the observed area (nothing comes from unknown cells), the whole map, or nothing.
     ceiling : bool
@@ -181,7 +183,7 @@ class SceneSettings:
 
     material: Material = field(default_factory=Material)
     outline_tolerance_cells: float = 0.5
-    bridge_gap_m: float = 0.2
+    bridge_gap_m: float = 0.5
     floor_extent: Literal["observed", "map", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"

@@ -24,7 +24,7 @@ MODULES = (
     *("maps.mesh_cut", "maps.mesh", "maps.partial_map", "maps.map_turn", "maps.ros_map"),
     *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.furniture", "maps.homes"),
     *("maps.camera", "maps.robot", "maps.explore"),
-    *("walls.lines", "walls.cells", "walls.chains", "walls.bridges", "walls.graph", "walls.outlines", "walls.lattice"),
+    *("walls.lines", "walls.cells", "walls.chains", "walls.graph", "walls.outlines", "walls.lattice"),
     *(
         "tracing.plan",
         "tracing.scene_xml",
