@@ -20,19 +20,21 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 MODULES = (
-    *("constants", "errors", "resources", "settings", "files", "planar", "llvm", "llvm_probe"),
+    *("constants", "errors", "resources", "settings", "files", "planar", "cores", "llvm", "llvm_probe"),
     *("maps.mesh_cut", "maps.mesh", "maps.partial_map", "maps.map_turn", "maps.ros_map"),
-    *("maps.mesh_files", "maps.mesh_scene", "maps.mesh_map", "maps.map_files", "maps.furniture", "maps.homes"),
+    *(
+        "maps.mesh_files",
+        "maps.mesh_scene",
+        "maps.mesh_map",
+        "maps.map_files",
+        "maps.furniture",
+        "maps.buildings",
+        "maps.homes",
+    ),
     *("maps.camera", "maps.robot", "maps.explore"),
     *("walls.lines", "walls.cells", "walls.chains", "walls.graph", "walls.outlines", "walls.lattice"),
-    *(
-        "tracing.plan",
-        "tracing.scene_xml",
-        "tracing.scene",
-        "tracing.beams",
-        "tracing.candidates",
-        "tracing.diffraction",
-    ),
+    *("tracing.plan", "tracing.scene_xml", "tracing.scene", "tracing.slab", "tracing.bounds"),
+    *("tracing.beams", "tracing.candidates", "tracing.diffraction"),
     *("tracing.rays", "tracing.mesh_planes", "tracing.ray_chains", "tracing.mesh_candidates"),
     *("tracing.paths", "tracing.sionna_rt", "tracing.contract", "tracing.stock", "tracing.chain", "tracing.solver"),
     *("tracing.generator", "tracing.probe", "tracing.trace", "tracing.fixed_paths", "tracing.gradients"),
@@ -50,7 +52,6 @@ MODULES = (
     *(
         "inverse.checkpoint",
         "inverse.measurements",
-        "inverse.slab",
         "inverse.gain_errors",
         "inverse.material_paths",
         "inverse.material_fit",

@@ -1,5 +1,6 @@
 """The trace against closed forms and against stock Sionna RT."""
 
+import dataclasses
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
+from sionna_partial.learning.features import link_features
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.scene import export_scene
@@ -474,3 +476,42 @@ class TestTraceEach:
     def test_receiver_in_a_wall(self) -> None:
         with pytest.raises(PositionError, match="is inside a wall"):
             trace_each(_room(), [(1.0, 1.0, 1.5)], [[(0.05, 0.05, 1.5)]])
+
+
+class TestPathsOnDisk:
+    def test_they_are_those_in_memory(self, tmp_path: Path) -> None:
+        tx, rx = [(1.05, 2.95, 1.5), (4.05, 1.95, 1.5)], _grid(_room(), 0.5)
+        here, stored = trace_links(_room(), tx, rx), trace_links(_room(), tx, rx, folder=tmp_path / "paths")
+        assert isinstance(stored.vertices_m, np.memmap)
+        for field in dataclasses.fields(TracedLinks):
+            if not field.name.endswith("settings"):
+                np.testing.assert_array_equal(getattr(stored, field.name), getattr(here, field.name))
+        phi = link_features(_room(), stored)
+        np.testing.assert_array_equal(phi.gain_db, here.gain_db.ravel())
+
+    def test_a_link_without_paths_leaves_empty_files(self, tmp_path: Path) -> None:
+        stored = trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)), folder=tmp_path)
+        assert stored.vertices_m.shape == (0, 6, 3)
+
+    def test_nothing_half_written_stays(self, tmp_path: Path) -> None:
+        def stop(share: float, message: str) -> None:
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], folder=tmp_path / "paths", progress=stop)
+        assert not list(tmp_path.iterdir())
+
+
+class TestMemory:
+    def test_paths_that_do_not_fit_are_refused_before_they_are_traced(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level("INFO", "sionna_partial")
+        rx = _grid(_room(), 0.04)
+        assert len(rx) > 10_000
+        with pytest.raises(MemoryLimitError, match=r"memory_gb = 0.01 is too little for about .* give a folder"):
+            trace_links(_room(), (1.05, 2.95, 1.5), rx, settings=SPECULAR, memory_gb=0.01)
+        (message,) = [message for message in caplog.messages if "paths" in message]
+        estimate = int(message.split()[1])
+        links = trace_links(_room(), (1.05, 2.95, 1.5), rx, settings=SPECULAR)
+        assert len(links.a) == pytest.approx(estimate, rel=0.2)

@@ -216,15 +216,17 @@ def _verified(
 ) -> Iterator[Found]:
     """Verify candidates, many blocks of one kind at once."""
     waiting: list[Candidates] = []
-    for candidates, share, message in itertools.chain(blocks, [(None, 1.0, "verifying paths")]):
+    doing = ""
+    for candidates, share, message in itertools.chain(blocks, [(None, 1.0, "")]):
         full = sum(len(each.rx) for each in waiting) >= CANDIDATES_AT_ONCE
         if waiting and (candidates is None or full or not candidates.is_like(waiting[0])):
             together = Candidates.concatenate(waiting)
             paths, rows = solver.verify(together, tx_m, rx_m)
-            yield together.rows(rows), paths, share, message
+            yield together.rows(rows), paths, share, doing
             waiting = []
         if candidates is not None and len(candidates.rx):
             waiting.append(candidates)
+            doing = message
 
 
 def _nothing(
