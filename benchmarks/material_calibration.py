@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.inverse.slab import reflection_loss_db
+from sionna_partial.tracing.slab import reflection_loss_db
 from sionna_partial.tracing.trace import trace_each
 
 HIDDEN = {

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from sionna_partial.inverse.slab import reflection_loss_db
 
 import sionna_partial as sp
-from sionna_partial.inverse.slab import reflection_loss_db
 from sionna_partial.resources import scenes_folder
 
 HIDDEN = sp.Material(relative_permittivity=5.24, conductivity_s_m=0.626, thickness_m=0.03)

@@ -14,6 +14,9 @@ GAIN_FLOOR_DB = -150.0
 DEFAULT_HEIGHT_M = 1.5
 """Height of transmitters and receivers where none is given [m] (the paper's reference trace)."""
 
+MEMORY_GB = 2.0
+"""Memory that a job may take where no other limit is given [GB]."""
+
 DEFAULT_WALL_HEIGHT_M = 3.0
 """Height to which plans are extruded where none is given [m]."""
 

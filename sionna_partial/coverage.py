@@ -15,14 +15,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.learning.features import LinkFeatures, link_features
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
+from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
+from sionna_partial.files import temporary_folder
+from sionna_partial.learning.features import LinkFeatures, features_of_paths
 from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
-from sionna_partial.tracing.trace import SHORTEST_M, Progress, checked_settings, nearest_m, trace_links
+from sionna_partial.tracing.trace import SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
@@ -43,6 +44,13 @@ _WHOSE = {
     "indoor": "given that the receiver is indoors",
     "anywhere": "of a receiver that may be outside, in outage",
 }
+
+_LIBRARIES_GB, _CELL_BYTES, _RECEIVER_BYTES, _WORK_BYTES = 1.0, 40, 400, 120_000
+"""Memory of the process with all libraries [GB], of each cell of the map, of each receiver, and of each of those that
+are predicted together [bytes]; `benchmarks/scale.py` measures it."""
+
+_FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
+"""Number of receivers that are predicted together."""
 
 _log = logging.getLogger(__name__)
 
@@ -105,6 +113,7 @@ def predict_map(
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
     receivers: str = RECEIVERS[0],
+    memory_gb: float = MEMORY_GB,
     progress: Progress | None = None,
 ) -> xr.Dataset:
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
@@ -137,8 +146,10 @@ def predict_map(
     trace_settings : TraceSettings, optional
     receivers : {"indoor", "anywhere"}
         Probabilities and gains given that a receiver is indoors, or of one that may be outside, in outage.
+    memory_gb : float
+        How much memory the process may take [GB]. Receivers are traced and predicted in blocks that fit.
     progress : callable, optional
-        Called as ``progress(share_done, message)``.
+        Called as ``progress(fraction_done, message)``.
 
     Returns
     -------
@@ -149,6 +160,8 @@ def predict_map(
     ------
     MapError
         If the map cannot be read.
+    MemoryLimitError
+        If the job cannot be done within `memory_gb`; nothing was begun.
     PositionError
         For a transmitter where none can stand, or if no receiver can stand anywhere.
     SettingsError
@@ -163,29 +176,32 @@ def predict_map(
     trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
     scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
     trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
+    require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     tx_m = _transmitter(partial, tx)
     grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
     complete = partial.is_complete
     chosen = None if complete and predictor is None else _predictor(predictor)
     model = None if complete else chosen
-    report = progress or (lambda share, message: None)
-    links = trace_links(
-        partial,
-        tx_m,
-        grid.rx_m,
-        settings=trace_settings,
-        scene_settings=scene_settings,
-        progress=lambda share, message: report(0.8 * share, message),
-    )
     if model is not None:
-        _warn_of_other_traces(model, links.settings)
-    report(0.8, "measuring unobserved distances")
-    phi = link_features(partial, links)
-    report(0.9, f"predicting {len(grid.rx_m)} links")
-    variables = _variables(grid, phi, model, anywhere=receivers == "anywhere")
+        _warn_of_other_traces(model, trace_settings)
+    at_once = _receivers_at_once(partial, grid, memory_gb)
+    report = progress or (lambda share, message: None)
+    report(0.0, "building the scene")
+    columns: list[dict[str, NDArray[Any]]] = []
+    with temporary_folder() as work:
+        tracer = Tracer(partial, work, trace_settings, scene_settings)
+        for start in range(0, len(grid.rx_m), at_once):
+
+            def within(share: float, message: str, start: int = start) -> None:
+                report(min(0.99, (start + share * at_once) / len(grid.rx_m)), message)
+
+            rx_m = grid.rx_m[start : start + at_once]
+            phi = features_of_paths(partial, tx_m, rx_m, tracer.paths(tx_m, rx_m, within))
+            columns.append(_columns(partial, phi, model, anywhere=receivers == "anywhere"))
+    variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
-        **_provenance(partial, model, scene_settings, links.settings),
+        **_provenance(partial, model, scene_settings, trace_settings),
         "transmitter_m": tx_m,
         "rx_height_m": float(rx_height_m),
         "spacing_m": float(spacing_m),
@@ -294,25 +310,46 @@ def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float6
     return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
 
 
-def _variables(
-    receivers: _Receivers, phi: LinkFeatures, model: Predictor | None, *, anywhere: bool
+def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: float) -> int:
+    """Return how many receivers are predicted together, or raise a MemoryLimitError if the limit is too low."""
+    count = len(receivers.rx_m)
+    kept_gb = _LIBRARIES_GB + (_CELL_BYTES * partial.state.size + _RECEIVER_BYTES * receivers.valid.size) / 1e9
+    needed_gb = kept_gb + _WORK_BYTES * min(count, _FEWEST_RECEIVERS) / 1e9
+    if needed_gb > memory_gb:
+        raise MemoryLimitError(
+            f"memory_gb = {memory_gb:g} is too little: {count:,} receivers on a map of {partial.state.size:,} cells "
+            f"take about {needed_gb:.2g} GB. Give more memory_gb, a larger spacing_m, or a part of the map."
+        )
+    most = (memory_gb - kept_gb) / _WORK_BYTES * 1e9
+    return int(min(max(most, _FEWEST_RECEIVERS), _MOST_RECEIVERS))
+
+
+def _columns(
+    partial: PartialMap, phi: LinkFeatures, model: Predictor | None, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Predict, and lay all results out on the grid."""
+    """Predict links: values (N,) of each variable that depends on them."""
     prediction = LinkPrediction.of_trace(phi) if model is None else model.predict(phi)
-    free = receivers.cell_state[receivers.valid] == CellState.FREE
+    assert phi.context is not None
+    free = partial.state_at(phi.context.rx_m) == CellState.FREE
     p_indoor = np.where(free, 1.0, 0.0 if model is None else model.predict_indoor(phi))
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
-    values = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)}
-    values |= {
+    columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
         "p_indoor": p_indoor,
         "partial_gain_db": phi.gain_db,
         "unobserved_distance_m": phi.unobserved_distance_m,
         "distance_m": phi.distance_m,
     }
-    states = {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
-    layers = {name: _spread(value, receivers.valid, np.float32(np.nan)) for name, value in values.items()}
-    layers |= {name: _spread(value, receivers.valid, np.uint8(NO_RECEIVER)) for name, value in states.items()}
+    columns = {name: values.astype(np.float32) for name, values in columns.items()}
+    return columns | {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
+
+
+def _variables(receivers: _Receivers, columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Lay all results out on the grid."""
+    fill = {name: np.uint8(NO_RECEIVER) for name in ("link_state", "partial_link_state")}
+    layers = {
+        name: _spread(values, receivers.valid, fill.get(name, np.float32(np.nan))) for name, values in columns.items()
+    }
     return layers | {
         "observed": receivers.cell_state != CellState.UNKNOWN,
         "valid": receivers.valid,

@@ -20,6 +20,10 @@ class SettingsError(SionnaPartialError, ValueError):
     """A setting outside its allowed range."""
 
 
+class MemoryLimitError(SionnaPartialError, MemoryError):
+    """A job that cannot be done within its limit of memory; it was not begun."""
+
+
 class SceneError(SionnaPartialError, ValueError):
     """A scene folder that is missing, damaged or unsafe to load."""
 

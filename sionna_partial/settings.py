@@ -1,9 +1,12 @@
 """One frozen dataclass of settings for each stage, checked when it is built."""
 
+import itertools
 import math
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Literal, TypeVar, get_args
+
+import numpy as np
 
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
@@ -41,6 +44,11 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 FREQUENCIES_HZ = (1e6, 1e12)
 """Lowest and highest carrier frequency [Hz]."""
 
+HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
+"""Kinds of procedural homes; the last three are large."""
+
+HOME_KINDS = get_args(HomeKind)
+
 NetworkKind = Literal["paper", "paths", "map"]
 """What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
 
@@ -72,6 +80,14 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
     """Raise a SettingsError unless `value` is a whole number in [low, high]."""
     inside = isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
+
+
+def are_stages(value: object) -> bool:
+    """Whether `value` has increasing whole numbers (of steps), or increasing fractions in [0, 1), one at least."""
+    stages = list(value) if np.iterable(value) else []
+    numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
+    rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
+    return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))
 
 
 def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:
@@ -145,10 +161,12 @@ class SceneSettings:
     material : Material
         Material of walls, floor and ceiling, or of those parts of a mesh that name none.
     outline_tolerance_cells : float
-        Largest distance of a simplified wall outline from the lattice outline [cells]; twice as much along ragged
-        walls, whose face turns to and fro at least once in 10 cells.
+        Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps
+        whose walls range noise made thick and rough, and again twice as much where a face turns to and fro at least
+        once in 10 cells.
     bridge_gap_m : float
-        Longest gap that is closed in a seen wall [m]; at most two cells are bridged, whatever this allows.
+        Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
+        closed, and 0.11 m.
     floor_extent : {"observed", "map", "none"}
         What floor and ceiling span: the observed area (nothing comes from unknown cells), the whole map, or nothing.
     ceiling : bool
@@ -165,7 +183,7 @@ class SceneSettings:
 
     material: Material = field(default_factory=Material)
     outline_tolerance_cells: float = 0.5
-    bridge_gap_m: float = 0.2
+    bridge_gap_m: float = 0.5
     floor_extent: Literal["observed", "map", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
@@ -199,6 +217,9 @@ class TraceSettings:
         Largest number of walls of a floor plan that mirror a path before its diffraction, and after it: 0, 1 or 2.
     open_ends : bool
         Whether a wall of a floor plan diffracts also where it ends because observation did.
+    power_tolerance_db : float
+        By how much the power of a link's indirect paths may be changed by leaving out weak paths of a floor plan [dB],
+        0 to 1; 0 keeps every path. Bounds of the power of all candidates, before any is verified, guarantee it.
     refraction, diffuse_reflection : bool
         Further interactions. With either of them, every path is found by shooting rays (Sionna RT's own candidate
         generator), which is slower than exact beams.
@@ -218,6 +239,7 @@ class TraceSettings:
     diffraction: bool | None = None
     diffraction_walls: int = 2
     open_ends: bool = False
+    power_tolerance_db: float = 0.1
     refraction: bool = False
     diffuse_reflection: bool = False
     samples_per_tx: int = 1_000_000
@@ -232,6 +254,7 @@ class TraceSettings:
             ("seed", 0, 2**31 - 1),
         ):
             require_whole(name, getattr(self, name), low, high)
+        require_number("power_tolerance_db", self.power_tolerance_db, 0.0, 1.0)
         for name in ("diffraction", "open_ends", "refraction", "diffuse_reflection"):
             value = getattr(self, name)
             unset = name == "diffraction" and value is None
@@ -283,6 +306,23 @@ class SensorSettings:
         return self.range_noise_m == self.drift_m_per_m == self.missed_wall_share == 0.0
 
 
+SHORT_LINK_M = 25.0
+"""Length that a short link has at most, on the floor plan [m]."""
+
+MIXED_SENSORS = {
+    "range_m": (3.0, 30.0),
+    "field_of_view_deg": (60.0, 120.0),
+    "range_noise_m": (0.0, 0.05),
+    "drift_m_per_m": (0.0, 0.02),
+    "missed_wall_share": (0.0, 0.1),
+}
+"""Ranges of the sensors of a data set with `sensor="mixed"`.
+
+The range is drawn uniformly on a logarithmic scale, the field of view of cameras uniformly, and errors more often small
+than large (the square of a uniform number).
+"""
+
+
 @dataclass(frozen=True)
 class DatasetSettings:
     """Which links of a home a data set has.
@@ -295,16 +335,21 @@ class DatasetSettings:
         are there at each stage.
     transmitters_per_home : int
         Number of transmitters, drawn from the free cells of the complete home; each has receivers of its own.
-    stages : tuple of int
-        Steps that the robot has explored, increasing.
+    stages : tuple of int, or of float
+        Steps that the robot has explored, increasing; or, all in [0, 1), fractions of the home's free area that it has
+        observed, which mean the same in buildings of all sizes.
     seed : int
         Seed of the places and of the robot, together with the home's name.
     tx_height_m, rx_height_m : float
         Heights of transmitters and receivers above the map's z = 0 [m].
     margin_m : float
         How far the map area reaches beyond the known cells of the complete home [m]. Maps are cut and extended to it.
-    sensor : SensorSettings
-        What the exploring robot sees, and its errors.
+    sensor : SensorSettings or "mixed"
+        What the exploring robot sees, and its errors; "mixed" draws it for each home from `MIXED_SENSORS`, by `seed`
+        and the home's name: one home in three has a camera of 60 to 120 degrees, the others a lidar that turns.
+    short_link_fraction : float
+        Fraction of the receivers of each transmitter that are drawn within `SHORT_LINK_M` of it [1]. In large
+        buildings most links between places that are drawn uniformly are long, and in outage.
     scene : SceneSettings
         How maps become scenes.
     trace : TraceSettings
@@ -318,12 +363,13 @@ class DatasetSettings:
 
     links_per_home: int = 400
     transmitters_per_home: int = 4
-    stages: tuple[int, ...] = (0, 50, 100, 150, 200)
+    stages: tuple[int, ...] | tuple[float, ...] = (0, 50, 100, 150, 200)
     seed: int = 0
     tx_height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
     margin_m: float = 3.0
-    sensor: SensorSettings = field(default_factory=SensorSettings)
+    sensor: SensorSettings | Literal["mixed"] = field(default_factory=SensorSettings)
+    short_link_fraction: float = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
 
@@ -337,13 +383,15 @@ class DatasetSettings:
         enough = self.links_per_home >= self.transmitters_per_home
         remedy = f"give at least {self.transmitters_per_home}, one for each of the transmitters_per_home."
         require(enough, "links_per_home", self.links_per_home, remedy)
-        remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200)."
-        whole = isinstance(self.stages, tuple) and len(self.stages) > 0 and all(map(is_whole, self.stages))
-        require(whole and list(self.stages) == sorted(set(self.stages)), "stages", self.stages, remedy)
+        remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
+        require(isinstance(self.stages, tuple) and are_stages(self.stages), "stages", self.stages, remedy)
         for name in ("tx_height_m", "rx_height_m"):
             require_number(name, getattr(self, name), 0.0, 1000.0, open_low=True)
         require_number("margin_m", self.margin_m, 0.0, 1000.0)
-        require(isinstance(self.sensor, SensorSettings), "sensor", self.sensor, "give SensorSettings(...).")
+        mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
+        remedy = "give SensorSettings(...), or 'mixed'."
+        require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
+        require_number("short_link_fraction", self.short_link_fraction, 0.0, 1.0)
         require(isinstance(self.scene, SceneSettings), "scene", self.scene, "give SceneSettings(...).")
         require(isinstance(self.trace, TraceSettings), "trace", self.trace, "give TraceSettings(...).")
         self.scene.material.require_frequency(self.trace.frequency_hz)

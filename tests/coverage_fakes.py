@@ -1,21 +1,22 @@
 """A tracer and a predictor that answer at once, for tests of what is made of their answers."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
-from sionna_partial.learning.features import LinkFeatures
+from sionna_partial.learning.features import LinkFeatures, unobserved_distance_m
+from sionna_partial.learning.link_context import ContextSums
 from sionna_partial.learning.predictor import LinkPrediction
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import PredictorSettings, SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import TracedLinks
+from sionna_partial.tracing.paths import SolvedPaths
 
 PICTURE = """
 ????????????
@@ -52,38 +53,35 @@ def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float
     return PartialMap(np.flipud(np.array(rows, dtype=np.uint8)), resolution_m, origin_m)
 
 
-def fake_trace(
-    scene: PartialMap,
-    tx: ArrayLike,
-    rx: NDArray[np.float64],
-    *,
-    settings: TraceSettings,
-    scene_settings: SceneSettings,
-    progress: Callable[[float, str], None],
-) -> TracedLinks:
+class FakeTracer:
+    """Finds no paths, and says so."""
+
+    def __init__(
+        self, partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings
+    ) -> None:
+        pass
+
+    def paths(
+        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Callable[[float, str], None]
+    ) -> Iterator[SolvedPaths]:
+        report(0.5, "tracing")
+        return iter(())
+
+
+def fake_features(
+    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], blocks: Iterable[SolvedPaths]
+) -> LinkFeatures:
     """Trace without walls: LOS up to 2 m, NLOS up to 4 m, then outage; Friis' gain, less 20 dB for NLOS."""
-    progress(0.5, "tracing")
-    tx_m = scene.require_positions("tx", tx)
-    rx_m = scene.require_positions("rx", rx)
+    assert not list(blocks)
     distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
     state = np.select([distance_m < 2.0, distance_m < 4.0], [LinkState.LOS, LinkState.NLOS], LinkState.OUTAGE)
     gain_db = -61.4 - 20.0 * np.log10(distance_m) - np.choose(state, [150.0, 0.0, 20.0])
-    no_paths = np.zeros(0)
-    return TracedLinks(
-        tx=tx_m,
-        rx=rx_m,
-        link_state=state.astype(np.uint8),
-        gain_db=np.maximum(gain_db, -150.0),
-        path_tx=no_paths.astype(np.int32),
-        path_rx=no_paths.astype(np.int32),
-        a=no_paths.astype(np.complex128),
-        delay_s=no_paths,
-        departure_rad=np.zeros((0, 2)),
-        arrival_rad=np.zeros((0, 2)),
-        interactions=np.zeros((0, settings.max_depth), dtype=np.uint8),
-        vertices_m=np.zeros((0, settings.max_depth, 3)),
-        settings=settings if settings.diffraction is False else replace(settings, diffraction=True),
-        scene_settings=scene_settings,
+    return LinkFeatures(
+        state.astype(np.uint8),
+        unobserved_distance_m(partial, tx_m, rx_m),
+        distance_m,
+        np.maximum(gain_db, -150.0),
+        ContextSums(partial, tx_m[None], rx_m).context(),
     )
 
 
@@ -119,7 +117,8 @@ class FakePredictor:
 
 def use_fakes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let predict_map use the fakes."""
-    monkeypatch.setattr(coverage_module, "trace_links", fake_trace)
+    monkeypatch.setattr(coverage_module, "Tracer", FakeTracer)
+    monkeypatch.setattr(coverage_module, "features_of_paths", fake_features)
     monkeypatch.setattr(coverage_module, "Predictor", FakePredictor)
 
 

@@ -51,7 +51,7 @@ def install() -> None:
     home_links.home_links = fake_links  # type: ignore[assignment]
 
 
-def make_home(seed: int) -> SimpleNamespace:
+def make_home(seed: int, kind: str | None = None) -> SimpleNamespace:
     """Do what the seed stands for; the process number goes into a file beside `sitecustomize`."""
     notes = Path(sys.modules["sitecustomize"].__file__ or "").parent
     (notes / f"process-{os.getpid()}").touch()
@@ -79,7 +79,7 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
     state = rng.integers(0, 3, count).astype(np.uint8)
     return LinkTable(
         home=np.full(count, name),
-        stage=np.repeat(settings.stages, 2 * settings.links_per_home).astype(np.int64),
+        stage=np.repeat(settings.stages, 2 * settings.links_per_home).astype(np.float64),
         phi=LinkFeatures(
             state[::-1].copy(), distance_m / 2, distance_m, rng.uniform(GAIN_FLOOR_DB, -40.0, count), context
         ),

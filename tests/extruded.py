@@ -9,7 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
+from sionna_partial.tracing.beams import trace_beams
+from sionna_partial.tracing.bounds import Strengths, strengths_of
+from sionna_partial.tracing.candidates import Candidates, Room, Wedges, specular_candidates
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, DiffractionCandidates
 from sionna_partial.tracing.scene import SceneGeometry
+
+Blocks = list[tuple[Candidates, float]]
 
 CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
 
@@ -173,3 +179,37 @@ def climbs_m(
             legs = [abs(low_m - first), *[height_m] * (count - 1), abs(high_m - last)]
             climbs.append((sum(legs), np.cumsum(legs)[:-1] / sum(legs)))
     return climbs
+
+
+def everything(receivers: int) -> Strengths:
+    """Ask for all candidates of so many receivers, in drywall at 28 GHz."""
+    material = Material()
+    constants = np.array([material.relative_permittivity, material.conductivity_s_m, material.thickness_m])
+    return strengths_of(constants, 28e9, receivers)
+
+
+def specular_blocks(
+    geometry: SceneGeometry,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    max_depth: int,
+    pairs_per_block: int = 200_000,
+) -> Blocks:
+    """List all specular candidates, and the fraction of the work done with each block."""
+    beams = trace_beams(geometry.plan, tx_m[:2], rx_m[:, :2], max_depth)
+    room, strengths = Room.of(geometry, tx_m, rx_m), everything(len(rx_m))
+    best = np.zeros(len(beams.pair_rx), np.uint8)
+    return list(specular_candidates(beams, geometry, room, max_depth, strengths, best, pairs_per_block=pairs_per_block))
+
+
+def diffracted_blocks(
+    geometry: SceneGeometry,
+    wedges: Wedges,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    max_depth: int,
+    walls_a_side: int = MAX_REFLECTIONS,
+) -> Blocks:
+    """List all candidates with a diffraction, and the fraction of the work done with each block."""
+    candidates = DiffractionCandidates(geometry, wedges, Room.of(geometry, tx_m, rx_m), max_depth, walls_a_side)
+    return list(candidates.blocks(everything(len(rx_m))))

@@ -16,10 +16,10 @@ import sionna_partial as sp
 from sionna_partial.errors import MeasurementError, OutputError, PositionError, SettingsError
 from sionna_partial.inverse import calibration, material_search
 from sionna_partial.inverse.measured_building import custom_material
-from sionna_partial.inverse.slab import reflection_loss_db
 from sionna_partial.maps.mesh import merged_mesh
 from sionna_partial.maps.mesh_map import MeshReading, mesh_map
 from sionna_partial.tracing.scene_xml import itu_constants
+from sionna_partial.tracing.slab import reflection_loss_db
 
 SETTINGS = sp.TraceSettings(max_depth=2)
 THIN_M = 0.01

@@ -5,11 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from extruded import ROOM, extrude, specular_lengths_m
+from extruded import ROOM, extrude, specular_blocks, specular_lengths_m
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import BEND, CEILING, EDGE, FLOOR, Candidates, faces_of, specular_candidates
+from sionna_partial.tracing.candidates import BEND, CEILING, EDGE, FLOOR, Candidates, faces_of
 from sionna_partial.tracing.scene import SHAPES, SceneGeometry, write_scene
 
 TX = np.array([1.1, 0.7, 1.2])
@@ -24,8 +23,7 @@ PARTS = {
 def _candidates(
     geometry: SceneGeometry, tx: NDArray[np.float64] = TX, rx: NDArray[np.float64] = RX, max_depth: int = 3
 ) -> Candidates:
-    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], max_depth)
-    candidates, share = next(specular_candidates(beams, geometry, tx, rx, max_depth))
+    ((candidates, share),) = specular_blocks(geometry, tx, rx, max_depth)
     assert share == 1.0
     return candidates
 
@@ -109,8 +107,7 @@ class TestSpecularCandidates:
     def test_blocks_together_hold_what_one_block_holds(self) -> None:
         geometry = PARTS["floor and ceiling"]
         whole = _candidates(geometry)
-        beams = trace_beams(geometry.plan, TX[:2], RX[:, :2], 3)
-        parts, shares = zip(*specular_candidates(beams, geometry, TX, RX, 3, pairs_per_block=3), strict=True)
+        parts, shares = zip(*specular_blocks(geometry, TX, RX, 3, pairs_per_block=3), strict=True)
         assert len(parts) > 3
         assert list(shares) == sorted(shares)
         assert shares[-1] == 1.0

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, fake_trace, map_of, small_coverage, use_fakes
+from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, small_coverage, use_fakes
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -35,7 +35,7 @@ def no_work(monkeypatch):
     def heavy(*args, **kwargs):
         pytest.fail("heavy work started before the input was checked")
 
-    for name in ("trace_links", "link_features"):
+    for name in ("Tracer", "features_of_paths"):
         monkeypatch.setattr(coverage_module, name, heavy)
     monkeypatch.setattr(coverage_module.Predictor, "load", heavy)
 
@@ -422,15 +422,3 @@ def test_what_is_no_coverage_map_is_named(coverage, spoil, message):
     require_coverage(coverage)
     with pytest.raises(SettingsError, match=message):
         require_coverage(spoil(coverage))
-
-
-def test_the_fake_tracer_checks_positions_like_the_real_one():
-    with pytest.raises(PositionError):
-        fake_trace(
-            map_of(PICTURE),
-            (50.0, 0.0, 1.5),
-            np.zeros((0, 3)),
-            settings=TraceSettings(),
-            scene_settings=SceneSettings(),
-            progress=print,
-        )

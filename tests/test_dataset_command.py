@@ -78,6 +78,14 @@ class TestDataset:
         assert passed.scene.material == Material(itu="concrete")
         assert options == {"scheduler": "tcp://host:8786", "workers": 3, "home_time_limit_s": 60.0}
 
+    def test_kinds_in_turn_fractions_and_mixed_sensors(self, calls: list[Any]) -> None:
+        options = ("--kind", "floor", "--kind", "hall", "--mixed-sensors", "--short-links", 0.5)
+        result = run("dataset", "out", "--homes", 3, "--first-seed", 7, "--stage", 0.25, "--stage", 0, *options)
+        assert result.exit_code == 0
+        _, homes, passed, _ = calls[0]
+        assert homes == [(7, "floor"), (8, "hall"), (9, "floor")]
+        assert (passed.stages, passed.sensor, passed.short_link_fraction) == ((0, 0.25), "mixed", 0.5)
+
     def test_maps_alone_and_failed_homes(self, calls: list[Any]) -> None:
         result = run("dataset", "out", "--map", "one.yaml", "--map", "two")
         assert calls[0][1] == [Path("one.yaml"), Path("two")]

@@ -4,11 +4,11 @@ import itertools
 
 import numpy as np
 import pytest
-from extruded import ROOM, SPLINTERS, chains_between, extrude
+from extruded import ROOM, SPLINTERS, chains_between, diffracted_blocks, extrude
 from numpy.typing import NDArray
 
 from sionna_partial.tracing.candidates import EDGE, Candidates
-from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, diffraction_candidates, find_wedges
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, find_wedges
 from sionna_partial.tracing.scene import SceneGeometry
 
 TX = np.array([1.07, 1.93, 1.2])
@@ -23,11 +23,9 @@ def _join(
     max_depth: int = 3,
     walls_a_side: int = MAX_REFLECTIONS,
 ) -> Candidates:
-    """Candidates of all blocks, of which there are several."""
+    """Candidates of all blocks."""
     wedges = find_wedges(geometry, open_ends=False)
-    blocks = diffraction_candidates(
-        geometry, wedges, tx, rx, max_depth, walls_a_side=walls_a_side, candidates_per_block=50
-    )
+    blocks = diffracted_blocks(geometry, wedges, tx, rx, max_depth, walls_a_side)
     parts = [part for part, _ in blocks]
     names = ("rx", "face", "vertices_m", "wedge")
     return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), wedges)
@@ -187,7 +185,7 @@ class TestDiffractionCandidates:
     @pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 6])
     def test_depth_limits_the_reflections(self, max_depth: int) -> None:
         geometry, rx = extrude(ROOM), np.array([[4.5, 0.7, 2.1]])
-        found = list(diffraction_candidates(geometry, find_wedges(geometry, open_ends=False), TX, rx, max_depth))
+        found = diffracted_blocks(geometry, find_wedges(geometry, open_ends=False), TX, rx, max_depth)
         depth = max((int((block.face != -1).sum(axis=1).max()) for block, _ in found), default=0)
         assert depth == min(max_depth, MAX_REFLECTIONS + 1)
 
@@ -236,7 +234,7 @@ class TestDiffractionCandidates:
         }
         for (a, tx), (b, rx) in itertools.permutations(places.items(), 2):
             wedges = find_wedges(geometry, open_ends=False)
-            blocks = list(diffraction_candidates(geometry, wedges, tx, rx[None], 1))
+            blocks = diffracted_blocks(geometry, wedges, tx, rx[None], 1)
             at = [(block.vertices_m[:, 0, :2] == 0.0).all(axis=1).sum() for block, _ in blocks]
             assert sum(at) == (a >= 100 and b >= 100), (a, b)
 
@@ -245,7 +243,7 @@ class TestDiffractionCandidates:
         rx = np.array([[5.0, 2.0, 1.0]])
         for open_ends in (False, True):
             wedges = find_wedges(geometry, open_ends=open_ends)
-            (block, share), *rest = diffraction_candidates(geometry, wedges, TX, rx, 1)
+            (block, share), *rest = diffracted_blocks(geometry, wedges, TX, rx, 1)
             assert share == 1.0
             assert not rest
             assert sorted(block.vertices_m[:, 0, 1]) == ([1.0, 3.0] if open_ends else [3.0])
@@ -255,13 +253,11 @@ class TestDiffractionCandidates:
         wedges = find_wedges(geometry, open_ends=True)
         assert len(wedges.edge_m) == 4
         inside = TX[None] + [2.0, 0.5, 0.1]
-        assert not list(diffraction_candidates(geometry, wedges, TX, inside, 3))
+        assert not diffracted_blocks(geometry, wedges, TX, inside, 3)
         empty = extrude(np.zeros((0, 2, 2)))
-        assert not list(diffraction_candidates(empty, find_wedges(empty, open_ends=True), TX, inside, 3))
+        assert not diffracted_blocks(empty, find_wedges(empty, open_ends=True), TX, inside, 3)
 
     def test_without_receivers_there_are_no_candidates(self) -> None:
         geometry = extrude(ROOM)
         wedges = find_wedges(geometry, open_ends=False)
-        assert not [
-            block for block, _ in diffraction_candidates(geometry, wedges, TX, np.zeros((0, 3)), 3) if len(block.rx)
-        ]
+        assert not [block for block, _ in diffracted_blocks(geometry, wedges, TX, np.zeros((0, 3)), 3) if len(block.rx)]

@@ -206,6 +206,38 @@ def test_observed_fractions_on_real_homes():
     assert np.mean(seen, axis=0) == pytest.approx([0.30, 0.45, 0.55, 0.62], abs=0.05)
 
 
+class TestFractions:
+    """Stages by the observed fraction of the free area."""
+
+    def test_each_is_reached_and_not_long_before(self, home):
+        exploration = explore_trajectory(home, (0, 0.25, 0.5, 0.75), 3)
+        assert exploration.steps[0] == 0
+        for fraction, step, observed in zip(
+            (0.25, 0.5, 0.75), exploration.steps[1:], exploration.observed_fractions[1:], strict=True
+        ):
+            assert observed >= fraction
+            assert explore(home, (step - 1,), 3)[0].observed_fraction < fraction
+        assert exploration.maps == explore(home, exploration.steps, 3)
+
+    def test_what_cannot_be_seen_is_given_up(self):
+        exploration = explore_trajectory(plan(CLOSET), (0.1, 0.99), 0)
+        assert exploration.observed_fractions[1] < 0.99
+        assert len(exploration.poses) == exploration.steps[1] + 1 < 2000
+
+    def test_large_buildings_and_errors(self):
+        building = make_home(7, "hall")
+        sensor = SensorSettings(0.03, 0.002, 0.05, 360.0, 15.0)
+        exploration = explore_trajectory(building, (0.25, 0.5, 0.75), 1, sensor=sensor)
+        assert (exploration.observed_fractions >= (0.25, 0.5, 0.75)).all()
+
+    @pytest.mark.parametrize("fractions", [(0.5, 0.25), (0.5, 1.0), (-0.1, 0.5), (0.5, 1), (0.5, math.nan)])
+    def test_fractions_must_increase_below_1(self, fractions):
+        with pytest.raises(
+            SettingsError, match=r"steps = .* is not allowed: .* fractions of the free area in \[0, 1\)"
+        ):
+            explore(plan(CLOSET), fractions)
+
+
 class TestTrajectory:
     def test_it_is_the_way_that_explore_takes(self, home, exploration):
         assert exploration.maps == explore(home, (0, 30, 60), 3)

@@ -19,7 +19,7 @@ from sionna_partial.tracing import fixed_paths
 from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS, FixedPaths, PathParameters, PathScene
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
-SETTINGS = sp.TraceSettings(max_depth=1)
+SETTINGS = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1)
 FIELD = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.1)
 FLOOR = sp.SceneSettings(floor_extent="map", ceiling=False)
 NOTHING = sp.SceneSettings(floor_extent="none")
@@ -349,7 +349,7 @@ class TestNothingIsLeftBehind:
             "import sionna_partial as sp\n"
             "from sionna_partial.tracing.fixed_paths import PathScene\n"
             "from sionna_partial.tracing.probe import RX_M, TX_M, small_room\n"
-            "scene = PathScene(small_room(), settings=sp.TraceSettings(max_depth=1))\n"
+            "scene = PathScene(small_room(), settings=sp.TraceSettings(power_tolerance_db=0.0, max_depth=1))\n"
             "paths = scene.paths(TX_M, RX_M)\n"
             "slopes = paths.slopes(paths.base)\n"
             "passes = paths._passes(paths.base, ('tx_m',))\n"
@@ -402,7 +402,7 @@ class TestNothingThere:
         shares = [share for share, _ in calls]
         assert shares == sorted(shares)
         assert shares[-1] == pytest.approx(1.0)
-        assert {message for _, message in calls} == {"verifying reflections", "verifying diffractions"}
+        assert {message for _, message in calls} == {"listing paths", "verifying reflections", "verifying diffractions"}
 
 
 class TestErrors:
@@ -413,7 +413,7 @@ class TestErrors:
 
     def test_diffraction_on_a_mesh(self) -> None:
         with pytest.raises(SettingsError, match="diffraction = True is not allowed: paths that are found by shooting"):
-            PathScene(mesh_room(), settings=sp.TraceSettings(diffraction=True))
+            PathScene(mesh_room(), settings=sp.TraceSettings(power_tolerance_db=0.0, diffraction=True))
 
     def test_diffraction_left_open_is_off_on_a_mesh_only(self, mesh_paths: FixedPaths, paths: FixedPaths) -> None:
         assert mesh_paths._scene.settings.diffraction is False

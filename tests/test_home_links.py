@@ -13,11 +13,11 @@ from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.learning.features import link_features
 from sionna_partial.maps.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import DatasetSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
 from sionna_partial.tracing.trace import trace_links
 from sionna_partial.training import home_links as module
-from sionna_partial.training.home_links import NEAREST_M, home_links, map_area
-from sionna_partial.training.link_table import LinkTable
+from sionna_partial.training.home_links import NEAREST_M, home_links, home_sensor, map_area
+from sionna_partial.training.link_table import LinkTable, stage_name
 
 SETTINGS = DatasetSettings(
     links_per_home=31, transmitters_per_home=3, stages=(0, 3, 40), trace=TraceSettings(max_depth=2)
@@ -81,6 +81,26 @@ class TestPlaces:
         table = home_links(PartialMap(state, 0.1), "closet", settings)
         assert table.phi.distance_m.min() >= NEAREST_M
         assert table.phi.distance_m.min() < NEAREST_M + 0.02
+
+    def test_short_links(self) -> None:
+        state = np.full((22, 1002), CellState.WALL, dtype=np.uint8)
+        state[1:-1, 1:-1] = CellState.FREE
+        settings = DatasetSettings(60, 2, (0,), short_link_fraction=0.5, trace=TraceSettings(max_depth=0))
+        near_m = SHORT_LINK_M + 0.2
+        table = home_links(PartialMap(state, 0.1), "corridor", settings)
+        _, transmitter = np.unique(table.context.tx_m[:, 0], return_inverse=True)
+        for number in range(2):
+            for anywhere in (False, True):
+                distance_m = table.phi.distance_m[(transmitter == number) & (table.anywhere == anywhere)]
+                assert len(distance_m) == 30
+                assert 15 <= (distance_m <= near_m).sum() < 30
+
+    def test_stages_by_observed_fraction(self, home: PartialMap) -> None:
+        table = home_links(home, "two rooms", replace(SETTINGS, stages=(0, 0.3, 0.6)))
+        assert np.unique(table.stage).tolist() == [0.0, 0.3, 0.6]
+        for stage in (0.3, 0.6):
+            assert (table.observed_fraction[table.stage == stage] >= stage).all()
+        assert [stage_name(stage) for stage in (0.0, 0.3, 50.0)] == ["0 steps", "30 % observed", "50 steps"]
 
     def test_too_small(self) -> None:
         state = np.full((3, 3), CellState.WALL, dtype=np.uint8)
@@ -185,6 +205,20 @@ class TestSeeds:
                 assert (partial.state_at(places_m) != CellState.WALL).all()
         walls = np.logical_or.reduce([each.state == CellState.WALL for each in wrong.context.maps])
         assert (walls & (area.state == CellState.FREE)).any()
+
+    def test_mixed_sensors_are_drawn_by_name_and_seed(self) -> None:
+        settings = replace(SETTINGS, sensor="mixed")
+        drawn = [home_sensor(f"home {number}", settings) for number in range(60)]
+        assert drawn == [home_sensor(f"home {number}", settings) for number in range(60)]
+        assert drawn[0] != home_sensor("home 0", replace(settings, seed=1))
+        around = np.mean([sensor.field_of_view_deg == 360.0 for sensor in drawn])
+        assert 0.5 < around < 0.85
+        for name, (low, high) in MIXED_SENSORS.items():
+            values = [getattr(sensor, name) for sensor in drawn]
+            within = [low <= value <= high or value == 360.0 for value in values]
+            assert all(within), name
+            assert np.ptp(values) > 0.5 * (high - low), name
+        assert home_sensor("home 0", SETTINGS) == SETTINGS.sensor
 
     def test_size_of_the_grid_is_of_no_account(self, table: LinkTable) -> None:
         moved = two_rooms((200, 300), (120, 44))

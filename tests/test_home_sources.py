@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sionna_partial.errors import MapError
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.training.home_sources import HomeSource, home_sources
@@ -25,6 +25,20 @@ def test_seeds() -> None:
     assert home_sources(range(3, 5)) == [HomeSource("make_home(3)", 3), HomeSource("make_home(4)", 4)]
     assert home_sources([3])[0].record == {"name": "make_home(3)", "seed": 3}
     assert home_sources([3])[0].load() == make_home(3)
+
+
+def test_seeds_of_a_kind() -> None:
+    (hall,) = home_sources([(3, "hall")])
+    assert hall == HomeSource("make_home(3, hall)", 3, "hall")
+    assert hall.record == {"name": "make_home(3, hall)", "seed": 3, "kind": "hall"}
+    assert hall.load() == make_home(3, "hall")
+    assert home_sources([(3, None)]) == home_sources([3])
+
+
+@pytest.mark.parametrize(("home", "name"), [((-1, "hall"), "seed = -1"), ((3, "castle"), "kind = 'castle'")])
+def test_pairs_are_checked(home: tuple[int, str], name: str) -> None:
+    with pytest.raises(SettingsError, match=f"{name} is not allowed"):
+        home_sources([home])  # type: ignore[list-item]
 
 
 def test_folder_of_maps(maps: Path) -> None:

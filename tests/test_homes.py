@@ -12,8 +12,9 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps import homes
+from sionna_partial.maps.buildings import LARGEST_M
 from sionna_partial.maps.explore import explore
-from sionna_partial.maps.homes import DOOR_M, STYLES, make_home
+from sionna_partial.maps.homes import DOOR_M, LARGE_RESOLUTION_M, STYLES, make_home
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 
@@ -183,6 +184,51 @@ def test_some_homes_are_turned_and_some_are_not():
     runs_m = [longest_run_along_x(apartment(seed).state == CellState.FREE) * 0.05 for seed in range(20)]
     assert sum(run_m > 3 for run_m in runs_m) >= 2
     assert sum(run_m < 1.5 for run_m in runs_m) >= 6
+
+
+LARGE = ("floor", "hall", "warehouse")
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_large_kinds_are_as_large_as_buildings_and_no_larger(kind):
+    sizes_m = []
+    for seed in range(8):
+        free = np.argwhere(make_home(seed, kind).state == CellState.FREE) * LARGE_RESOLUTION_M
+        hull = shapely.MultiPoint(free[::7]).minimum_rotated_rectangle.exterior
+        sides = np.linalg.norm(np.diff(hull.coords, axis=0), axis=1)
+        sizes_m.append((sides.min(), sides.max()))
+    widths_m, lengths_m = np.array(sizes_m).T
+    assert lengths_m.max() > 60
+    assert (lengths_m < LARGEST_M[0] + 2).all()
+    assert (widths_m < LARGEST_M[1] + 2).all()
+
+
+@pytest.mark.parametrize("kind", LARGE)
+def test_large_kinds_depend_on_the_seed_alone(kind):
+    assert make_home(5, kind) == make_home(5, kind)
+    assert make_home(5, kind) != make_home(6, kind)
+    assert make_home(5, kind, resolution_m=0.2).resolution_m == 0.2
+
+
+def test_floors_have_corridors_and_rooms_and_halls_have_few():
+    """A body wider than any door finds many rooms on a floor; a hall is one, or a few."""
+    rooms = {}
+    for kind in LARGE:
+        counts = []
+        for seed in range(6):
+            home = make_home(seed, kind)
+            clearance_m = ndimage.distance_transform_edt(home.state == CellState.FREE) * home.resolution_m
+            labels, _ = ndimage.label(clearance_m > DOOR_M[1] / 2 + home.resolution_m)
+            counts.append((np.bincount(labels.ravel())[1:] * home.resolution_m**2 > 1.0).sum())
+        rooms[kind] = np.median(counts)
+    assert rooms["floor"] > 15
+    assert rooms["floor"] > 3 * max(rooms["hall"], rooms["warehouse"])
+
+
+def test_warehouses_have_aisles_between_shelves():
+    """Shelves and legs are islands in the free area."""
+    islands = [ndimage.label(make_home(seed, "warehouse").state != CellState.FREE)[1] - 1 for seed in range(6)]
+    assert np.median(islands) > 10
 
 
 def test_resolution_keeps_the_plan():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.link_context import REACHES_M, LinkContext, link_context
+from sionna_partial.learning.link_context import REACHES_M, ContextSums, LinkContext
 from sionna_partial.learning.unobserved import unobserved_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -59,6 +59,13 @@ def traced(tx, rx, *paths):
         settings=TraceSettings(),
         scene_settings=SceneSettings(),
     )
+
+
+def link_context(partial, links):
+    """Return the context of all links."""
+    sums = ContextSums(partial, links.tx.reshape(-1, 3), links.rx)
+    sums.add(links)
+    return sums.context()
 
 
 def of_paths(*paths, partial=HALF, rx=FAR):

@@ -39,7 +39,7 @@ class TestSummary:
             assert len(rows) - 2 == len({row.answer for row in measured})
             for row in measured:
                 (cells,) = (cells for cells in rows if cells[0] == row.answer)
-                cell = cells[rows[0].index(f"{row.stage} steps")]
+                cell = cells[rows[0].index(f"{row.stage:g} steps")]
                 assert cell.split() == [f"{row.metrics.accuracy:.3f}", f"{row.metrics.rmse_db:.2f}", "dB"]
 
     def test_what_is_shown_is_defined_and_notes_are_not_lost(self, evaluation):
@@ -59,14 +59,14 @@ class TestSummary:
 class TestMarkdown:
     def test_figures_stand_where_they_belong(self, evaluation):
         rows = tables(markdown(evaluation))["Test homes, receivers indoors"]
-        (row,) = (cells for cells in rows if cells[:2] == ["100", "predictor"])
+        (row,) = (cells for cells in rows if cells[:2] == ["100 steps", "predictor"])
         (found,) = evaluation.select(homes="test", stage=100, answer="predictor", ends_seen="all")
         assert rows[0][2:5] == ["links", "accuracy", "RMSE [dB]"]
         assert row[2:5] == ["600", f"{found.metrics.accuracy:.3f}", f"{found.metrics.rmse_db:.2f}"]
 
     def test_what_has_no_finite_value_is_a_dash(self, evaluation):
         rows = tables(markdown(evaluation))["Test homes, receivers indoors"]
-        (row,) = (cells for cells in rows if cells[:2] == ["0", "partial trace"])
+        (row,) = (cells for cells in rows if cells[:2] == ["0 steps", "partial trace"])
         assert row[6:8] == ["-", "-"]
         assert row[9] == "-"
         assert "| nan" not in markdown(evaluation)

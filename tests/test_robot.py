@@ -14,16 +14,16 @@ def hall(size: int = 80) -> np.ndarray:
 
 class TestRouter:
     def test_costs_are_lengths_in_the_open(self):
-        router = _Router(np.ones((5, 9)), (2, 1))
-        assert router.costs[2, 7] == pytest.approx(6.0)
-        assert router.costs[4, 3] == pytest.approx(2 * np.sqrt(2))
-        assert router.path_to((2, 7)).tolist() == [[2, column] for column in range(1, 8)]
+        router = _Router(np.ones((5, 9)), (10, 20), (12, 21))
+        assert router.cost_to((12, 27)) == pytest.approx(6.0)
+        assert router.cost_to((14, 23)) == pytest.approx(2 * np.sqrt(2))
+        assert router.path_to((12, 27)).tolist() == [[12, column] for column in range(21, 28)]
 
     def test_no_way_between_cells_that_meet_at_a_corner(self):
         cost = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
-        assert np.isinf(_Router(cost, (0, 0)).costs[1, 2])
+        assert np.isinf(_Router(cost, (0, 0), (0, 0)).cost_to((1, 2)))
         cost[0, 2] = 1.0
-        assert _Router(cost, (0, 0)).costs[1, 2] == pytest.approx(1 + np.sqrt(2))
+        assert _Router(cost, (0, 0), (0, 0)).cost_to((1, 2)) == pytest.approx(1 + np.sqrt(2))
 
 
 class TestMoves:

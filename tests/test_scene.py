@@ -93,13 +93,13 @@ def test_without_a_ceiling_there_is_no_such_shape(tmp_path: Path) -> None:
     ("text", "ends"),
     [
         # A wall between two rooms that stops at a door: jambs are ends of the wall.
-        ("........ ###..### ........", {(2.5, 1.5): False, (5.5, 1.5): False, (0.5, 1.5): True, (7.5, 1.5): True}),
+        ("........ ###..### ........", {(2.5, 1.5): False, (5.5, 1.5): False, (0.0, 1.5): True, (8.0, 1.5): True}),
         # The same wall, seen in part: what lies beyond its end may be more of it.
-        ("........ ###????? ........", {(2.5, 1.5): True, (0.5, 1.5): True}),
-        ("..?..... ###..... ..?.....", {(2.5, 1.5): False, (0.5, 1.5): True}),
+        ("........ ###????? ........", {(3.0, 1.5): True, (0.0, 1.5): True}),
+        ("..?..... ###..... ..?.....", {(2.5, 1.5): False, (0.0, 1.5): True}),
         # Upright.
-        (".#. .#. .#. ... ...", {(1.5, 2.5): False, (1.5, 4.5): True}),
-        (".#. .#. .#. .?. ...", {(1.5, 2.5): True, (1.5, 4.5): True}),
+        (".#. .#. .#. ... ...", {(1.5, 2.5): False, (1.5, 5.0): True}),
+        (".#. .#. .#. .?. ...", {(1.5, 2.0): True, (1.5, 5.0): True}),
         # Where two walls meet there is no end.
         ("..... .###. .#... .#... .....", {(1.5, 3.5): False, (3.5, 3.5): False, (1.5, 1.5): False}),
     ],

@@ -232,7 +232,7 @@ class TestDatasetSettings:
             ("tx_height_m", 0.0, "give a number in (0, 1000]."),
             ("rx_height_m", math.nan, "give a number in (0, 1000]."),
             ("margin_m", -0.1, "give a number in [0, 1000]."),
-            ("sensor", TraceSettings(), "give SensorSettings(...)."),
+            ("sensor", TraceSettings(), "give SensorSettings(...), or 'mixed'."),
             ("scene", None, "give SceneSettings(...)."),
             ("trace", SceneSettings(), "give TraceSettings(...)."),
         ],

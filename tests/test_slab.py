@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sionna_partial.errors import SettingsError
-from sionna_partial.inverse.slab import VACUUM_F_M, reflection_loss_db
 from sionna_partial.tracing.sionna_rt import load_sionna
+from sionna_partial.tracing.slab import VACUUM_F_M, reflection_loss_db
 
 FREQUENCY_HZ = 28e9
 ANGLES_DEG = np.array([0.0, 20.0, 45.0, 70.0, 85.0])

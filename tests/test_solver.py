@@ -5,14 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from extruded import ROOM, extrude
+from extruded import ROOM, diffracted_blocks, extrude, specular_blocks
 from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import Candidates, specular_candidates
-from sionna_partial.tracing.diffraction import diffraction_candidates, find_wedges
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.diffraction import find_wedges
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.scene import SHAPES, SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing.solver import SceneSolver, _to_device
@@ -27,12 +26,11 @@ def _solver(geometry: SceneGeometry, folder: Path) -> SceneSolver:
 
 
 def _specular(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
-    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], depth)
-    return next(specular_candidates(beams, geometry, tx, rx, depth))[0]
+    return specular_blocks(geometry, tx, rx, depth)[0][0]
 
 
 def _diffracted(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
-    return next(diffraction_candidates(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth))[0]
+    return diffracted_blocks(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth)[0][0]
 
 
 def _rows(candidates: Candidates, rows: NDArray[np.intp]) -> Candidates:
@@ -59,7 +57,7 @@ class TestVerify:
         order = np.random.default_rng(0).permutation(len(candidates.rx))
         shuffled = _rows(candidates, order)
         counts = [
-            np.bincount(solver.verify(each, tx, rx).path_rx, minlength=len(rx)) for each in (candidates, shuffled)
+            np.bincount(solver.verify(each, tx, rx)[0].path_rx, minlength=len(rx)) for each in (candidates, shuffled)
         ]
         np.testing.assert_array_equal(*counts)
 
@@ -70,7 +68,7 @@ class TestVerify:
         for number, walls in enumerate((ROOM, ROOM[::-1], ROOM[[2, 5, 0, 4, 1, 3]][:, ::-1])):
             geometry, folder = extrude(walls), tmp_path / str(number)
             folder.mkdir()
-            answers.append(_sorted(_solver(geometry, folder).verify(make(geometry, TX, RX, 2), TX, RX)))
+            answers.append(_sorted(_solver(geometry, folder).verify(make(geometry, TX, RX, 2), TX, RX)[0]))
         assert len(answers[0][0]) > 20
         for delay_s, gain in answers[1:]:
             np.testing.assert_allclose(delay_s, answers[0][0], rtol=1e-6)
@@ -83,7 +81,7 @@ class TestVerify:
         geometry = extrude(walls, floor_m=floor_m, ceiling="ceiling" not in missing)
         rx = np.array([[4.9, 3.1, 1.7]])
         candidates = _specular(geometry, TX, rx, 1)
-        paths = _solver(geometry, tmp_path).verify(candidates, TX, rx)
+        paths = _solver(geometry, tmp_path).verify(candidates, TX, rx)[0]
         expected = 1 + 4 * ("walls" not in missing) + ("floor" not in missing) + (not missing or missing == ("walls",))
         assert len(paths.a) == len(candidates.rx) == expected
 
@@ -91,12 +89,12 @@ class TestVerify:
         geometry = extrude(ROOM)
         rx = np.array([[5.0, 0.4, 1.5], [2.0, 2.0, 1.5]])
         through = Candidates(np.array([0, 1], np.int32), np.full((2, 1), -1, np.int32), np.zeros((2, 1, 3)))
-        assert _solver(geometry, tmp_path).verify(through, TX, rx).path_rx.tolist() == [1]
+        assert _solver(geometry, tmp_path).verify(through, TX, rx)[0].path_rx.tolist() == [1]
 
     def test_no_candidates_give_no_paths(self, tmp_path: Path) -> None:
         geometry = extrude(ROOM)
         none = _rows(_specular(geometry, TX, RX, 2), np.zeros(0, np.intp))
-        paths = _solver(geometry, tmp_path).verify(none, TX, RX)
+        paths = _solver(geometry, tmp_path).verify(none, TX, RX)[0]
         assert paths.a.shape == paths.path_rx.shape == (0,)
         assert paths.vertices_m.shape == (0, 2, 3)
 
@@ -127,12 +125,12 @@ class TestAlignment:
         import drjit as dr  # after LLVM
 
         candidates = make(geometry, TX, RX, 2)
-        solver.verify(candidates, TX, RX)
+        solver.verify(candidates, TX, RX)[0]
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             for skip in range(1, 8):
                 fewer = _rows(_elsewhere(candidates, skip), np.arange(skip, len(candidates.rx)))
-                solver.verify(fewer, TX + 0.01 * skip, RX)
+                solver.verify(fewer, TX + 0.01 * skip, RX)[0]
             kernels = dr.kernel_history([dr.KernelType.JIT])
         assert len(kernels) >= 7
         assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []

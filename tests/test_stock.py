@@ -4,14 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from extruded import specular_blocks
 from numpy.typing import NDArray
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import specular_candidates
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.scene import SHAPES, build_scene, write_scene
 from sionna_partial.tracing.sionna_rt import load_sionna
@@ -77,9 +76,8 @@ class TestStockPaths:
     def test_finds_the_paths_of_exact_beams(self, room_xml: Path) -> None:
         settings = TraceSettings(max_depth=2, samples_per_tx=100_000)
         geometry, solver = build_scene(_room()), SceneSolver(room_xml, SHAPES, settings)
-        beams = trace_beams(geometry.plan, TX[:2], RX[:, :2], settings.max_depth)
-        blocks = specular_candidates(beams, geometry, TX, RX, settings.max_depth)
-        exact = join_paths([solver.verify(block, TX, RX) for block, _ in blocks], settings.max_depth)
+        blocks = specular_blocks(geometry, TX, RX, settings.max_depth)
+        exact = join_paths([solver.verify(block, TX, RX)[0] for block, _ in blocks], settings.max_depth)
         shot = _solve(room_xml, settings, TX, RX)
         assert len(exact.a) > 30
         np.testing.assert_array_equal(shot.path_rx, exact.path_rx)

@@ -1,5 +1,6 @@
 """The trace against closed forms and against stock Sionna RT."""
 
+import dataclasses
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
+from sionna_partial.learning.features import link_features
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.scene import export_scene
@@ -19,7 +21,7 @@ from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 NO_FLOOR = SceneSettings(floor_extent="none")
-SPECULAR = TraceSettings(diffraction=False)
+SPECULAR = TraceSettings(power_tolerance_db=0.0, diffraction=False)
 
 
 def _map(shape: tuple[int, int], resolution_m: float = 0.1) -> NDArray[np.uint8]:
@@ -100,7 +102,11 @@ def test_floor_and_ceiling_reflect_with_the_parallel_coefficient() -> None:
     tx, rx = np.array([2.0, 2.0, 1.5]), np.array([[5.0, 2.0, 1.5]])
     settings = SceneSettings(material=material)
     links = trace_links(
-        PartialMap(_map((60, 100)), 0.1), tx, rx, settings=TraceSettings(max_depth=1), scene_settings=settings
+        PartialMap(_map((60, 100)), 0.1),
+        tx,
+        rx,
+        settings=TraceSettings(power_tolerance_db=0.0, max_depth=1),
+        scene_settings=settings,
     )
     length = np.hypot(3.0, 3.0)
     cos_incidence = 3.0 / length
@@ -160,7 +166,10 @@ def test_no_receivers_give_no_links() -> None:
 
 def test_line_of_sight_alone_at_depth_zero() -> None:
     links = trace_links(
-        _room(), (1.0, 1.0, 1.5), [[2.0, 3.0, 1.5], [5.0, 0.6, 1.5]], settings=TraceSettings(max_depth=0)
+        _room(),
+        (1.0, 1.0, 1.5),
+        [[2.0, 3.0, 1.5], [5.0, 0.6, 1.5]],
+        settings=TraceSettings(power_tolerance_db=0.0, max_depth=0),
     )
     assert links.link_state.tolist() == [LinkState.LOS, LinkState.OUTAGE]
     assert links.path_rx.tolist() == [0]
@@ -257,7 +266,12 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
     tx, rx = (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]]
     trace_links(_room(), tx, rx)
     assert not caplog.messages
-    trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=1, refraction=True, samples_per_tx=1000))
+    trace_links(
+        _room(),
+        tx,
+        rx,
+        settings=TraceSettings(power_tolerance_db=0.0, max_depth=1, refraction=True, samples_per_tx=1000),
+    )
     assert caplog.messages == [
         "refraction: Sionna RT shoots 1000 rays for one receiver after the other, and finds most paths, not all"
     ]
@@ -265,8 +279,10 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_refraction_passes_walls() -> None:
     tx, rx = (1.03, 0.52, 1.5), [[5.02, 0.53, 1.5]]
-    without = trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=1, diffraction=False))
-    shot = TraceSettings(max_depth=1, diffraction=False, refraction=True, samples_per_tx=20_000)
+    without = trace_links(
+        _room(), tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=1, diffraction=False)
+    )
+    shot = TraceSettings(power_tolerance_db=0.0, max_depth=1, diffraction=False, refraction=True, samples_per_tx=20_000)
     through = trace_links(_room(), tx, rx, settings=shot)
     assert without.link_state.tolist() == [LinkState.OUTAGE]
     assert through.link_state.tolist() == [LinkState.NLOS]
@@ -275,7 +291,7 @@ def test_refraction_passes_walls() -> None:
 
 def test_diffraction_bends_around_the_door() -> None:
     tx, rx = (1.03, 0.52, 1.5), [[4.02, 0.93, 1.5]]
-    links = trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=1))
+    links = trace_links(_room(), tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=1))
     assert 8 in links.interactions
     corner = links.vertices_m[(links.interactions == 8).any(axis=1), 0, :2]
     assert np.abs(corner - [3.05, 1.45]).max(axis=1).min() < 0.1
@@ -283,9 +299,12 @@ def test_diffraction_bends_around_the_door() -> None:
 
 def test_shot_and_exact_paths_agree_where_both_apply() -> None:
     tx, rx = (1.03, 2.93, 1.5), [[5.02, 2.03, 1.5], [2.2, 1.1, 1.2]]
-    exact = trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=2, diffraction=False))
+    exact = trace_links(_room(), tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=2, diffraction=False))
     shot = trace_links(
-        _room(), tx, rx, settings=TraceSettings(max_depth=2, diffuse_reflection=True, samples_per_tx=20_000)
+        _room(),
+        tx,
+        rx,
+        settings=TraceSettings(power_tolerance_db=0.0, max_depth=2, diffuse_reflection=True, samples_per_tx=20_000),
     )
     specular = ((shot.interactions == 0) | (shot.interactions == 1)).all(axis=1)
     np.testing.assert_allclose(np.sort(shot.delay_s[specular]), np.sort(exact.delay_s), rtol=1e-5)
@@ -343,7 +362,7 @@ def test_material_of_the_map_comes_before_that_of_the_settings() -> None:
 
 
 def test_links_shorter_than_friis_allows_are_refused() -> None:
-    settings = TraceSettings(frequency_hz=10e6)
+    settings = TraceSettings(power_tolerance_db=0.0, frequency_hz=10e6)
     with pytest.raises(PositionError, match=r"is 1.* m from the transmitter.*: leave out receivers nearer than 2.39 m"):
         trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], settings=settings)
 
@@ -373,7 +392,7 @@ def test_the_field_behind_an_open_wall_end_follows_the_fresnel_integral() -> Non
     partial, edge_x = _screen()
     tx = np.array([edge_x, 0.55, 1.5])
     rx = np.column_stack([edge_x + np.linspace(-0.15, 0.15, 16), np.full(16, 7.05), np.full(16, 1.5)])
-    settings = TraceSettings(max_depth=1)
+    settings = TraceSettings(power_tolerance_db=0.0, max_depth=1)
     total = _field(trace_links(partial, tx, rx, settings=settings, scene_settings=NO_FLOOR), len(rx))
     direct = WAVELENGTH_M / (4 * np.pi * np.linalg.norm(rx - tx, axis=1))
     before, after = 4.05 - tx[1], 7.05 - 4.05
@@ -387,7 +406,7 @@ def test_the_field_behind_an_open_wall_end_follows_the_fresnel_integral() -> Non
 def test_diffracted_paths_are_reciprocal_and_need_no_rays() -> None:
     """The paths are; Sionna RT's coefficients of a dielectric wedge are not, as they depend on the lit face."""
     a, b = np.array([0.75, 0.83, 1.2]), np.array([5.21, 0.61, 2.1])
-    settings = TraceSettings(max_depth=3, diffraction=True, samples_per_tx=1)
+    settings = TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction=True, samples_per_tx=1)
     there, back = (trace_links(_room(), p, q[None], settings=settings) for p, q in ((a, b), (b, a)))
     diffracted = (there.interactions == 8).any(axis=1)
     assert diffracted.sum() == (back.interactions == 8).any(axis=1).sum() > 10
@@ -398,7 +417,7 @@ def test_diffracted_paths_are_reciprocal_and_need_no_rays() -> None:
 
 @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
 def test_diffraction_is_independent_of_the_other_receivers(partial: PartialMap) -> None:
-    settings = TraceSettings(open_ends=True)
+    settings = TraceSettings(power_tolerance_db=0.0, open_ends=True)
     tx, rx = (1.05, 2.95, 1.5), _grid(partial, 0.3)
     together, again = (trace_links(partial, tx, rx, settings=settings) for _ in range(2))
     for name in ("a", "delay_s", "interactions", "vertices_m", "gain_db"):
@@ -411,7 +430,7 @@ def test_diffraction_is_independent_of_the_other_receivers(partial: PartialMap) 
 @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
 def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
     tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::47] + np.array([0.021, 0.013, 0.3])
-    links = trace_links(partial, tx, rx, settings=TraceSettings(max_depth=3, open_ends=True))
+    links = trace_links(partial, tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=3, open_ends=True))
     scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
     paths = load_sionna().PathSolver(deterministic=True)(
         scene, max_depth=3, refraction=False, diffraction=True, edge_diffraction=True, samples_per_src=100_000
@@ -457,3 +476,42 @@ class TestTraceEach:
     def test_receiver_in_a_wall(self) -> None:
         with pytest.raises(PositionError, match="is inside a wall"):
             trace_each(_room(), [(1.0, 1.0, 1.5)], [[(0.05, 0.05, 1.5)]])
+
+
+class TestPathsOnDisk:
+    def test_they_are_those_in_memory(self, tmp_path: Path) -> None:
+        tx, rx = [(1.05, 2.95, 1.5), (4.05, 1.95, 1.5)], _grid(_room(), 0.5)
+        here, stored = trace_links(_room(), tx, rx), trace_links(_room(), tx, rx, folder=tmp_path / "paths")
+        assert isinstance(stored.vertices_m, np.memmap)
+        for field in dataclasses.fields(TracedLinks):
+            if not field.name.endswith("settings"):
+                np.testing.assert_array_equal(getattr(stored, field.name), getattr(here, field.name))
+        phi = link_features(_room(), stored)
+        np.testing.assert_array_equal(phi.gain_db, here.gain_db.ravel())
+
+    def test_a_link_without_paths_leaves_empty_files(self, tmp_path: Path) -> None:
+        stored = trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)), folder=tmp_path)
+        assert stored.vertices_m.shape == (0, 6, 3)
+
+    def test_nothing_half_written_stays(self, tmp_path: Path) -> None:
+        def stop(share: float, message: str) -> None:
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], folder=tmp_path / "paths", progress=stop)
+        assert not list(tmp_path.iterdir())
+
+
+class TestMemory:
+    def test_paths_that_do_not_fit_are_refused_before_they_are_traced(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level("INFO", "sionna_partial")
+        rx = _grid(_room(), 0.04)
+        assert len(rx) > 10_000
+        with pytest.raises(MemoryLimitError, match=r"memory_gb = 0.01 is too little for about .* give a folder"):
+            trace_links(_room(), (1.05, 2.95, 1.5), rx, settings=SPECULAR, memory_gb=0.01)
+        (message,) = [message for message in caplog.messages if "paths" in message]
+        estimate = int(message.split()[1])
+        links = trace_links(_room(), (1.05, 2.95, 1.5), rx, settings=SPECULAR)
+        assert len(links.a) == pytest.approx(estimate, rel=0.2)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from extruded import ROOM, SPLINTERS, drawn, extrude, specular_lengths_m
+from extruded import ROOM, SPLINTERS, drawn, extrude, specular_blocks, specular_lengths_m
 from numpy.typing import NDArray
 from test_trace import _grid, _half_seen_room, _room
 
@@ -13,8 +13,6 @@ from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import specular_candidates
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.scene import SHAPES, SceneGeometry, write_scene
 from sionna_partial.tracing.solver import SceneSolver
@@ -47,10 +45,11 @@ LATTICE = np.array([[x, y, 1.2] for x in (0.5, 1.0, 2.0, 4.0, 5.0, 5.5) for y in
 
 
 def _trace(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], folder: Path) -> SolvedPaths:
-    solver = SceneSolver(write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, TraceSettings())
-    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], 2)
-    blocks = specular_candidates(beams, geometry, tx, rx, 2)
-    return join_paths([solver.verify(block, tx, rx) for block, _ in blocks], 2)
+    solver = SceneSolver(
+        write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, TraceSettings(power_tolerance_db=0.0)
+    )
+    blocks = specular_blocks(geometry, tx, rx, 2)
+    return join_paths([solver.verify(block, tx, rx)[0] for block, _ in blocks], 2)
 
 
 def _matched(lengths: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
@@ -88,7 +87,12 @@ class TestJunctions:
 
     @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
     def test_no_path_bends_where_three_walls_meet(self, partial: PartialMap) -> None:
-        links = trace_links(partial, (1.05, 2.95, 1.5), _grid(partial, 0.5), settings=TraceSettings(open_ends=True))
+        links = trace_links(
+            partial,
+            (1.05, 2.95, 1.5),
+            _grid(partial, 0.5),
+            settings=TraceSettings(power_tolerance_db=0.0, open_ends=True),
+        )
         edges = np.unique(links.vertices_m[links.interactions == 8][:, :2].round(2), axis=0)
         jambs = [[3.05, 1.45], [3.05, 2.55]]
         assert {tuple(edge) for edge in jambs} <= {tuple(edge) for edge in edges.tolist()}
@@ -102,7 +106,9 @@ class TestOpenEnds:
         tx, rx = (1.5, 0.5, 1.5), [[0.5, 4.5, 1.5]]
         scene = SceneSettings(floor_extent="none")
         quiet, asked = (
-            trace_links(partial, tx, rx, settings=TraceSettings(open_ends=each), scene_settings=scene)
+            trace_links(
+                partial, tx, rx, settings=TraceSettings(power_tolerance_db=0.0, open_ends=each), scene_settings=scene
+            )
             for each in (False, True)
         )
         assert quiet.link_state.tolist() == [LinkState.OUTAGE]
@@ -119,7 +125,7 @@ class TestDiffractionSetting:
     def test_plans_diffract_unless_told_otherwise(self) -> None:
         tx, rx = (1.03, 0.52, 1.5), [[4.02, 0.93, 1.5]]
         default, on, off = (
-            trace_links(_room(), tx, rx, settings=TraceSettings(max_depth=2, diffraction=each))
+            trace_links(_room(), tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=2, diffraction=each))
             for each in (None, True, False)
         )
         assert default.a.tobytes() == on.a.tobytes()
@@ -133,7 +139,7 @@ class TestCeiling:
     @pytest.mark.parametrize("diffraction", [False, True])
     def test_without_it_the_paths_that_do_not_touch_it_remain(self, diffraction: bool) -> None:
         tx, rx = (1.05, 2.95, 1.5), _grid(_room(), 1.0)
-        settings = TraceSettings(max_depth=3, diffraction=diffraction)
+        settings = TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction=diffraction)
         under, open_air = (
             trace_links(_room(), tx, rx, settings=settings, scene_settings=SceneSettings(ceiling=each))
             for each in (True, False)
@@ -209,7 +215,9 @@ def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:
         "............. .###########. .#....#....#. .#....#....#. .#.........#. .###########. .............", 0.5
     )
     tx, rx = np.array([1.3, 1.7, 1.2]), np.array([[4.4, 2.2, 1.5], [3.9, 1.4, 1.9]])
-    shallow, deep = (trace_links(walls, tx, rx, settings=TraceSettings(max_depth=depth)) for depth in (2, 3))
+    shallow, deep = (
+        trace_links(walls, tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=depth)) for depth in (2, 3)
+    )
     bent = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
     assert len(bent) > 3
     for path in bent:

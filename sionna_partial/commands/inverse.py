@@ -7,6 +7,7 @@ import typer
 
 from sionna_partial.commands.shell import (
     CheckpointOption,
+    DiffractionOption,
     FrequencyOption,
     HeightBandOption,
     MapArgument,
@@ -15,6 +16,7 @@ from sionna_partial.commands.shell import (
     PredictorOption,
     StrictOption,
     UpOption,
+    WallHeightOption,
     parse_material,
     print_files,
     show_progress,
@@ -45,22 +47,24 @@ def calibrate(
     material: MaterialOption = "",
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     max_depth: MaxDepthOption = 6,
+    diffraction: DiffractionOption = True,
     checkpoint: CheckpointOption = None,
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
+    wall_height: WallHeightOption = None,
 ) -> None:
     """Find the material of a building from measured path gains.
 
     The folder --out gets the map with the calibrated material (predict takes it), the numbers as JSON, and a picture.
     """
     scene_settings = SceneSettings(material=parse_material(material))
-    settings = TraceSettings(frequency_hz=frequency, max_depth=max_depth)
+    settings = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
     from sionna_partial.inverse.measurements import measurements_of
     from sionna_partial.maps.map_files import load_map, save_map
 
     measured = measurements_of(measurements)
-    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    partial = load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with show_progress() as report:
         report(0.0, "loading Sionna RT")
@@ -100,21 +104,23 @@ def place(
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     max_depth: MaxDepthOption = 6,
+    diffraction: DiffractionOption = True,
     predictor: PredictorOption = "",
     checkpoint: CheckpointOption = None,
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
+    wall_height: WallHeightOption = None,
 ) -> None:
     """Find a good place for a transmitter on a partial map.
 
     The folder --out gets the place and the way to it as JSON, and a picture.
     """
     scene_settings = SceneSettings(material=parse_material(material))
-    trace_settings = TraceSettings(frequency_hz=frequency, max_depth=max_depth)
+    trace_settings = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
     from sionna_partial.maps.map_files import load_map
 
-    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    partial = load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with show_progress() as report:
         report(0.0, "loading the predictor")

@@ -1,8 +1,9 @@
 """Subcommands of learning: dataset, train, evaluate."""
 
+import itertools
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 
@@ -22,7 +23,10 @@ from sionna_partial.commands.shell import (
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.files import require_writable
 from sionna_partial.settings import (
+    HOME_KINDS,
+    SHORT_LINK_M,
     DatasetSettings,
+    HomeKind,
     NetworkKind,
     PredictorSettings,
     SceneSettings,
@@ -53,6 +57,10 @@ def dataset(
         int | None, typer.Option(min=0, help=f"Homes to make. Default: {DEFAULT_HOMES}, or 0 with --map.")
     ] = None,
     first_seed: Annotated[int, typer.Option(min=0, help="Seed of the first of them.")] = FIRST_SEED,
+    kinds: Annotated[
+        list[str] | None,
+        typer.Option("--kind", help=f"Kinds to make in turn: {', '.join(HOME_KINDS)}. Default: drawn.", metavar="KIND"),
+    ] = None,
     maps: Annotated[
         list[Path] | None,
         typer.Option("--map", help="Complete map, or a folder of maps; may be repeated.", show_default=False),
@@ -60,16 +68,23 @@ def dataset(
     links: Annotated[
         int, typer.Option(help="Links of a home with receivers indoors; as many more have them anywhere.")
     ] = DatasetSettings.links_per_home,
+    short_links: Annotated[
+        float, typer.Option(help=f"Fraction of the links that are drawn shorter than {SHORT_LINK_M:g} m [1].")
+    ] = DatasetSettings.short_link_fraction,
     transmitters: Annotated[int, typer.Option(help="Transmitters of a home.")] = DatasetSettings.transmitters_per_home,
-    stages: Annotated[list[int], typer.Option("--stage", help="Steps, such as --stage 0 --stage 50.")] = list(  # noqa: B006
-        DatasetSettings.stages
-    ),
+    stages: Annotated[
+        list[float],
+        typer.Option("--stage", help="Steps, such as --stage 0 --stage 50, or fractions observed, such as 0 and 0.25."),
+    ] = list(DatasetSettings.stages),  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of places and robots.")] = DatasetSettings.seed,
     field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
     range_m: RangeOption = SensorSettings.range_m,
     range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
     drift: DriftOption = SensorSettings.drift_m_per_m,
     missed_walls: MissedWallsOption = SensorSettings.missed_wall_share,
+    mixed_sensors: Annotated[
+        bool, typer.Option("--mixed-sensors", help="Draw a sensor for each home, in place of the five options above.")
+    ] = False,
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     workers: Annotated[
@@ -87,22 +102,26 @@ def dataset(
 
     OUT gets the links of each home. Stop it at any time, and give the same command, or one with more homes, again.
     """
+    sensor = SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
     settings = DatasetSettings(
         links_per_home=links,
         transmitters_per_home=transmitters,
-        stages=tuple(sorted(set(stages))),
+        stages=tuple(int(each) if each.is_integer() else each for each in sorted({*map(float, stages)})),
         seed=seed,
-        sensor=SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m),
+        sensor="mixed" if mixed_sensors else sensor,
+        short_link_fraction=short_links,
         scene=SceneSettings(material=parse_material(material)),
         trace=TraceSettings(frequency_hz=frequency),
     )
     count = homes if homes is not None else 0 if maps else DEFAULT_HOMES
+    seeds = range(first_seed, first_seed + count)
+    in_turn = itertools.cycle(cast("list[HomeKind]", kinds or []))
     with show_rate("homes") as report:
         from sionna_partial.training.dataset import build_dataset
 
         result = build_dataset(
             out,
-            [*range(first_seed, first_seed + count), *(maps or [])],
+            [*(zip(seeds, in_turn, strict=False) if kinds else seeds), *(maps or [])],
             settings,
             scheduler=scheduler,
             workers=workers,

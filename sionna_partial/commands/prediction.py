@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from sionna_partial.commands.shell import (
+    DiffractionOption,
     DriftOption,
     FieldOfViewOption,
     FrequencyOption,
@@ -13,18 +14,20 @@ from sionna_partial.commands.shell import (
     MapArgument,
     MaterialOption,
     MaxDepthOption,
+    MemoryOption,
     MissedWallsOption,
     PredictorOption,
     RangeNoiseOption,
     RangeOption,
     StrictOption,
     UpOption,
+    WallHeightOption,
     parse_material,
     parse_position,
     print_files,
     show_progress,
 )
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
 from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
 
@@ -46,6 +49,7 @@ def predict(
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     max_depth: MaxDepthOption = 6,
+    diffraction: DiffractionOption = True,
     predictor: PredictorOption = "",
     receivers: Annotated[
         str, typer.Option(metavar="indoor|anywhere", help="Given that receivers are indoors, or outside in outage.")
@@ -53,16 +57,18 @@ def predict(
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
+    wall_height: WallHeightOption = None,
+    memory: MemoryOption = MEMORY_GB,
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
     position = parse_position(tx)
     suffixes = [_parse_format(name) for name in formats]
     scene_settings = SceneSettings(material=parse_material(material))
-    trace_settings = TraceSettings(frequency_hz=frequency, max_depth=max_depth)
+    trace_settings = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
     from sionna_partial.maps.map_files import load_map
 
-    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    partial = load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with show_progress() as report:
         report(0.0, "loading the predictor")
@@ -78,6 +84,7 @@ def predict(
             scene_settings=scene_settings,
             trace_settings=trace_settings,
             receivers=receivers,
+            memory_gb=memory,
             progress=lambda share, message: report(0.9 * share, message),
         )
         names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
@@ -96,6 +103,7 @@ def export_scene(
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
+    wall_height: WallHeightOption = None,
 ) -> None:
     """Write a map as a scene folder that stock Sionna RT loads."""
     settings = SceneSettings(material=parse_material(material))
@@ -103,7 +111,7 @@ def export_scene(
     from sionna_partial.maps.map_files import load_map
     from sionna_partial.tracing.scene import export_scene as write_scene
 
-    partial = load_map(map_path, strict=strict, height_band_m=height_band, up=up)
+    partial = load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     scene = write_scene(partial, out, settings, frequency_hz=frequency)
     print_files([scene])
 

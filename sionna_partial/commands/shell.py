@@ -38,6 +38,13 @@ DriftOption = Annotated[float, typer.Option(help="Growth of its error of positio
 MissedWallsOption = Annotated[float, typer.Option(help="Share of walls that it misses, as glass [1].")]
 FrequencyOption = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
 MaxDepthOption = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
+DiffractionOption = Annotated[
+    bool, typer.Option("--diffraction/--no-diffraction", help="Whether paths bend around vertical edges of walls.")
+]
+WallHeightOption = Annotated[
+    float | None, typer.Option(help="Height of walls and ceiling [m]. Default: the map's.", show_default=False)
+]
+MemoryOption = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
 PredictorOption = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
 CheckpointOption = Annotated[
     Path | None, typer.Option(metavar="JSON", help="Keeps what has been found: a stopped run goes on from there.")
@@ -108,16 +115,19 @@ def _is_number(text: str) -> bool:
 
 @contextmanager
 def show_progress() -> Iterator[Callable[[float, str], None]]:
-    """Show progress on stderr: a bar on a terminal, a line a minute elsewhere."""
+    """Show progress and the time left on stderr: a bar on a terminal, a line a minute elsewhere."""
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 
-    done = (BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn())
+    done = (BarColumn(), TextColumn("{task.percentage:3.0f} %"), TimeElapsedColumn(), TextColumn("{task.fields[rest]}"))
+    started = monotonic()
     with _bar_or_lines(TextColumn("{task.description}"), *done) as (bar, say):
-        task = bar.add_task("starting", total=1.0)
+        task = bar.add_task("starting", total=1.0, rest="")
 
         def report(share: float, message: str) -> None:
-            bar.update(task, completed=share, description=message)
-            say(f"{share:.0%} {message}")
+            elapsed_s = monotonic() - started
+            rest = time_left(elapsed_s * (1.0 / share - 1.0)) if share > 0.0 and elapsed_s > 2.0 else ""
+            bar.update(task, completed=share, description=message, rest=rest)
+            say(f"{share:.0%} {message} {rest}".rstrip())
 
         try:
             yield report
@@ -186,9 +196,13 @@ def rate_and_rest(done: int, rest: int, elapsed_s: float) -> str:
     """Return how many a minute were done, and how long the rest takes at that rate; "" where nothing was done."""
     if not done or elapsed_s <= 0.0:
         return ""
-    rest_s = round(rest * elapsed_s / done)
-    hours, minutes, seconds = rest_s // 3600, rest_s // 60 % 60, rest_s % 60
-    return f"({60.0 * done / elapsed_s:.3g}/min, {hours}:{minutes:02}:{seconds:02} left)"
+    return f"({60.0 * done / elapsed_s:.3g}/min, {time_left(rest * elapsed_s / done)})"
+
+
+def time_left(rest_s: float) -> str:
+    """Return a time [s] as hours, minutes and seconds that are left."""
+    seconds = round(rest_s)
+    return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02} left"
 
 
 def print_files(files: Sequence[Path]) -> None:

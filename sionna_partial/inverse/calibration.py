@@ -32,10 +32,10 @@ from sionna_partial.inverse.measured_building import (
     usable_links,
 )
 from sionna_partial.inverse.measurements import Measurements, measurements_of
-from sionna_partial.inverse.slab import Polarisation, reflection_loss_db
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings, require
+from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 from sionna_partial.tracing.trace import Progress, checked_settings
 
 DETERMINED = 0.35

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.inverse.gain_errors import GainErrors, fit_errors
 from sionna_partial.inverse.material_paths import MaterialPaths, link_gains_db
-from sionna_partial.inverse.slab import reflection_loss_db
+from sionna_partial.tracing.slab import reflection_loss_db
 
 PRIOR_SUSCEPTIBILITY, SUSCEPTIBILITY_SPREAD = 2.5, 0.9
 """Median of the relative permittivity less 1 before anything is measured, and standard deviation of its logarithm: 95 %

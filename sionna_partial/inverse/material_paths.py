@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.files import temporary_folder
-from sionna_partial.inverse.slab import VACUUM_F_M
 from sionna_partial.learning.link_context import path_unobserved_m
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.fixed_paths import PATHS_PER_BLOCK, PathScene
 from sionna_partial.tracing.generator import write_scene_of
+from sionna_partial.tracing.slab import VACUUM_F_M
 from sionna_partial.tracing.solver import SceneSolver, Variables, VerifiedPaths, forward_passes
 from sionna_partial.tracing.trace import Progress
 

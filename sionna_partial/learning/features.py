@@ -1,6 +1,6 @@
 """What the predictor sees of a link: TracedLinks + PartialMap -> LinkFeatures."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -8,10 +8,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PositionError, PredictorError
-from sionna_partial.learning.link_context import LinkContext, link_context
+from sionna_partial.learning.link_context import ContextSums, LinkContext
 from sionna_partial.learning.unobserved import unobserved_lengths_m
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.tracing.trace import TracedLinks
+from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.trace import TracedLinks, link_summary
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,13 +141,39 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     """
     require_map("partial", partial)
     transmitters = links.tx.reshape(-1, 3)
+    sums = ContextSums(partial, transmitters, links.rx)
+    sums.add(links)
     return LinkFeatures(
         link_state=links.link_state.ravel(),
         unobserved_distance_m=np.concatenate([unobserved_distance_m(partial, tx, links.rx) for tx in transmitters]),
         distance_m=_distance_m(transmitters[:, None], links.rx).ravel(),
         gain_db=links.gain_db.ravel(),
-        context=link_context(partial, links),
+        context=sums.context(),
     )
+
+
+def features_of_paths(
+    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], blocks: Iterable[SolvedPaths]
+) -> LinkFeatures:
+    """Extract the features of N links while their paths are traced, without keeping any path.
+
+    Parameters
+    ----------
+    partial : PartialMap
+        The map on which the links are traced.
+    tx_m, rx_m : (3,) and (N, 3) float64 arrays
+        Transmitter and receivers [m].
+    blocks : iterable of SolvedPaths
+        All paths between them, from `Tracer.paths`.
+    """
+    power, is_direct, sums = np.zeros(len(rx_m)), np.zeros(len(rx_m), bool), ContextSums(partial, tx_m[None], rx_m)
+    for paths in blocks:
+        np.add.at(power, paths.path_rx, np.abs(paths.a) ** 2)
+        is_direct[paths.path_rx[paths.is_direct]] = True
+        sums.add(paths)
+    link_state, gain_db = link_summary(power, is_direct)
+    unobserved_m = unobserved_distance_m(partial, tx_m, rx_m)
+    return LinkFeatures(link_state, unobserved_m, _distance_m(tx_m, rx_m), gain_db, sums.context())
 
 
 def unobserved_distance_m(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> NDArray[np.float64]:

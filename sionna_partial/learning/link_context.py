@@ -12,10 +12,14 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.learning.unobserved import unobserved_lengths_m, walled_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import TracedLinks, path_gain_db
 
 REACHES_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """How far paths are taken to get through unobserved space [m]: a path that crosses u of it counts exp(-u / reach)."""
+
+_PATHS_AT_ONCE = 100_000
+"""Number of paths that are measured together, which bounds the memory."""
 
 SEEN_M = 1e-3
 """Unobserved length below which a path is wholly in observed space [m]."""
@@ -126,41 +130,57 @@ class LinkContext:
 _COLUMNS = ("map_index", "tx_m", "rx_m", "indirect_gain_db", "strongest_unobserved_m")
 
 
-def link_context(partial: PartialMap, links: TracedLinks) -> LinkContext:
-    """Measure what the paths of traced links cross.
+class ContextSums:
+    """What the paths of links cross, summed up while they are traced.
 
     Parameters
     ----------
     partial : PartialMap
-        The map on which the links were traced.
-    links : TracedLinks
-        From one or T transmitters to N receivers.
-
-    Returns
-    -------
-    LinkContext
-        Of N or T N links, transmitter by transmitter.
+        The map on which the links are traced.
+    tx_m, rx_m : (T, 3) and (N, 3) float64 arrays
+        Transmitters and receivers [m].
     """
-    transmitters, receivers = links.tx.reshape(-1, 3), len(links.rx)
-    tx_m = np.repeat(transmitters, receivers, axis=0)
-    rx_m = np.tile(links.rx, (len(transmitters), 1))
-    indirect = np.any(links.interactions > 0, axis=1)
-    link = (links.path_tx.astype(np.int64) * receivers + links.path_rx)[indirect]
-    power = np.abs(links.a[indirect]) ** 2
-    unobserved_m = path_unobserved_m(
-        partial,
-        links.tx.reshape(-1, 3)[links.path_tx[indirect]],
-        links.interactions[indirect],
-        links.vertices_m[indirect],
-        links.rx[links.path_rx[indirect]],
-    )
-    gains_db = np.stack(
-        [_gain_db(link, power * kept_shares(unobserved_m, reach), len(tx_m)) for reach in REACHES_M], axis=1
-    )
-    strongest_m = np.linalg.norm(rx_m - tx_m, axis=1)
-    weakest_first = np.argsort(power, kind="stable")
-    strongest_m[link[weakest_first]] = unobserved_m[weakest_first]
-    return LinkContext((partial,), np.zeros(len(tx_m), dtype=np.int64), tx_m, rx_m, gains_db, strongest_m)
+
+    def __init__(self, partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
+        self._partial, self._tx_m, self._rx_m = partial, tx_m, rx_m
+        count = len(tx_m) * len(rx_m)
+        self._power, self._strongest = np.zeros((len(REACHES_M), count)), np.zeros(count)
+        self._strongest_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
+
+    def add(self, paths: TracedLinks | SolvedPaths) -> None:
+        """Add paths, in world coordinates."""
+        for start in range(0, len(paths.a), _PATHS_AT_ONCE):
+            block = slice(start, start + _PATHS_AT_ONCE)
+            indirect = start + np.flatnonzero(np.any(paths.interactions[block] > 0, axis=1))
+            tx, rx = paths.path_tx[indirect], paths.path_rx[indirect]
+            self._add(
+                tx.astype(np.int64) * len(self._rx_m) + rx,
+                np.abs(paths.a[indirect]) ** 2,
+                path_unobserved_m(
+                    self._partial,
+                    self._tx_m[tx],
+                    paths.interactions[indirect],
+                    paths.vertices_m[indirect],
+                    self._rx_m[rx],
+                ),
+            )
+
+    def _add(self, link: NDArray[np.int64], power: NDArray[np.float64], unobserved_m: NDArray[np.float64]) -> None:
+        for total, reach in zip(self._power, REACHES_M, strict=True):
+            np.add.at(total, link, power * kept_shares(unobserved_m, reach))
+        order = np.argsort(power, kind="stable")
+        strongest = np.full(len(self._strongest), -1)
+        strongest[link[order]] = order
+        links = np.flatnonzero(strongest >= 0)
+        links = links[power[strongest[links]] >= self._strongest[links]]
+        self._strongest[links], self._strongest_m[links] = power[strongest[links]], unobserved_m[strongest[links]]
+
+    def context(self) -> LinkContext:
+        """Return the context of all T N links, transmitter by transmitter."""
+        tx_m = np.repeat(self._tx_m, len(self._rx_m), axis=0)
+        rx_m = np.tile(self._rx_m, (len(self._tx_m), 1))
+        gains_db = np.stack([path_gain_db(total) for total in self._power], axis=1)
+        return LinkContext((self._partial,), np.zeros(len(tx_m), np.int64), tx_m, rx_m, gains_db, self._strongest_m)
 
 
 def path_unobserved_m(
@@ -202,7 +222,3 @@ def path_unobserved_m(
 def kept_shares(unobserved_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
     """Return the share (P,) of the power of paths that gets through the unobserved space that they cross [m]."""
     return np.exp(-unobserved_m / reach_m) if reach_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
-
-
-def _gain_db(link: NDArray[np.int64], power: NDArray[np.float64], links: int) -> NDArray[np.float64]:
-    return path_gain_db(np.bincount(link, weights=power, minlength=links).astype(np.float64))

@@ -1,6 +1,7 @@
 """The robot's camera: readings of the walls, their errors, and the map that they add up to."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -73,14 +74,22 @@ class Camera:
         """
         angles = _ray_angles(heading_deg, self._view_deg, self._reach)
         noise = self._noise * self._rng.standard_normal(len(angles))
-        view = np.full_like(self._truth, _UNKNOWN)
-        _cast_rays(self._truth, self._missed, view, (x, y), shift, angles, noise, self._reach)
-        view[under[:, 0], under[:, 1]] = _FREE
-        self._log_odds[under[:, 0], under[:, 1]] = LOG_ODDS_LIMITS[0]
+        middle = np.array([y + shift[1], x + shift[0]])
+        reach = max(self._reach, float(np.abs(under - middle).max(initial=0.0)))
+        corner = np.clip(middle - reach - 1, 0, self.seen.shape).astype(np.intp)
+        end = np.clip(middle + reach + 2, 0, self.seen.shape).astype(np.intp)
+        part = slice(corner[0], end[0]), slice(corner[1], end[1])
+        log_odds, seen = self._log_odds[part], self.seen[part]
+        view = np.full_like(seen, _UNKNOWN)
+        rays = _Rays((x, y), shift, angles, noise, self._reach)
+        _cast_rays(self._truth, self._missed, view, (int(corner[0]), int(corner[1])), rays)
+        rows, columns = (under - corner).T
+        view[rows, columns] = _FREE
+        log_odds[rows, columns] = LOG_ODDS_LIMITS[0]
         known = view != _UNKNOWN
         change = np.where(view[known] == _WALL, HIT_LOG_ODDS, MISS_LOG_ODDS)
-        self._log_odds[known] = np.clip(self._log_odds[known] + change, *LOG_ODDS_LIMITS)
-        self.seen[known] = np.where(self._log_odds[known] > 0, _WALL, _FREE)
+        log_odds[known] = np.clip(log_odds[known] + change, *LOG_ODDS_LIMITS)
+        seen[known] = np.where(log_odds[known] > 0, _WALL, _FREE)
 
 
 def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
@@ -122,40 +131,46 @@ def _missed_walls(
     return squares[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
 
 
+class _Rays(NamedTuple):
+    """Rays of one look: angles [radian]; start, how far from there the robot believes to be, errors, range [cells]."""
+
+    place: tuple[float, float]
+    shift: tuple[float, float]
+    angles: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    reach: float
+
+
 @njit(cache=True)
 def _cast_rays(
     truth: NDArray[np.uint8],
     missed: NDArray[np.bool_],
     view: NDArray[np.uint8],
-    place: tuple[float, float],
-    shift: tuple[float, float],
-    angles: NDArray[np.float64],
-    noise: NDArray[np.float64],
-    reach: float,
+    corner: tuple[int, int],
+    rays: _Rays,
 ) -> None:
     """Write what one picture reports into `view`: free up to the reading, a wall there.
 
-    Where several rays disagree about a cell, a wall counts (as in OctoMap).
+    The first cell of `view` is row and column `corner` of the home. Where several rays disagree about a cell, a wall
+    counts (as in OctoMap).
     """
-    cells, entry = np.empty((_ray_cells(reach), 2), np.int64), np.empty(_ray_cells(reach) + 1)
+    (x, y), shift, angles, noise, reach = rays
     for ray in range(len(angles)):
-        _walk(place[0], place[1], angles[ray], cells, entry)
-        echo, reading = _read(truth, missed, cells, entry, reach)
+        echo, reading = _read(truth, missed, x, y, angles[ray], reach)
         reading += noise[ray]
-        if shift[0] != 0.0 or shift[1] != 0.0:  # else it is the same walk
-            _walk(place[0] + shift[0], place[1] + shift[1], angles[ray], cells, entry)
-        for k in range(len(cells)):
-            row, column = cells[k]
-            if not (0 <= row < view.shape[0] and 0 <= column < view.shape[1]):
-                break
-            if echo != _FAR and entry[k + 1] > reading:
+        walk = _start(x + shift[0], y + shift[1], angles[ray])
+        row, column = walk.row - corner[0], walk.column - corner[1]
+        while 0 <= row < view.shape[0] and 0 <= column < view.shape[1]:
+            if echo != _FAR and walk.leaves > reading:
                 if echo == _WALL_ECHO:
                     view[row, column] = _WALL
                 break
-            if entry[k] > reach:
+            if walk.enters > reach:
                 break
             if view[row, column] == _UNKNOWN:
                 view[row, column] = _FREE
+            walk = _next(walk)
+            row, column = walk.row - corner[0], walk.column - corner[1]
 
 
 @njit(cache=True)
@@ -163,57 +178,65 @@ def _ranges(
     truth: NDArray[np.uint8], x: float, y: float, angles: NDArray[np.float64], reach: float
 ) -> NDArray[np.float64]:
     """Return how far each ray gets [cells]."""
-    cells, entry = np.empty((_ray_cells(reach), 2), np.int64), np.empty(_ray_cells(reach) + 1)
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
-        _walk(x, y, angles[ray], cells, entry)
-        ranges[ray] = _read(truth, missed, cells, entry, reach)[1]
+        ranges[ray] = _read(truth, missed, x, y, angles[ray], reach)[1]
     return ranges
 
 
 @njit(cache=True)
-def _ray_cells(reach: float) -> int:
-    """Bound how many cells a ray of some length can meet."""
-    return int(2 * reach) + 4
-
-
-@njit(cache=True)
 def _read(
-    truth: NDArray[np.uint8],
-    missed: NDArray[np.bool_],
-    cells: NDArray[np.int64],
-    entry: NDArray[np.float64],
-    reach: float,
+    truth: NDArray[np.uint8], missed: NDArray[np.bool_], x: float, y: float, angle: float, reach: float
 ) -> tuple[int, float]:
     """Return what ends a ray, and a distance within that cell: a wall that is noticed, one that is not, or nothing."""
-    for k in range(len(cells)):
-        row, column = cells[k]
-        if entry[k] > reach:
-            break
-        if truth[row, column] != _FREE:
-            noticed = truth[row, column] == _WALL and not missed[row, column]
-            return (_WALL_ECHO if noticed else _NO_ECHO), (entry[k] + entry[k + 1]) / 2
+    walk = _start(x, y, angle)
+    while walk.enters <= reach:
+        if truth[walk.row, walk.column] != _FREE:
+            noticed = truth[walk.row, walk.column] == _WALL and not missed[walk.row, walk.column]
+            return (_WALL_ECHO if noticed else _NO_ECHO), (walk.enters + walk.leaves) / 2
+        walk = _next(walk)
     return _FAR, reach
 
 
-@njit(cache=True)
-def _walk(x: float, y: float, angle: float, cells: NDArray[np.int64], entry: NDArray[np.float64]) -> None:
-    """List the cells along a ray, from edge to edge, and where it enters each [cells]; the last entry is an exit.
+class _Walk(NamedTuple):
+    """A ray in one of the cells along it, and where it enters and leaves the cell [cells].
 
     A ray through a corner takes one of the two cells beside it, so that it never slips between two walls. Each cell
     keeps a piece of the ray to itself, a billionth of a cell at least, so that a distance names one cell.
     """
+
+    row: int
+    column: int
+    enters: float
+    leaves: float
+    step_x: int
+    step_y: int
+    pace_x: float
+    pace_y: float
+    next_x: float
+    next_y: float
+
+
+@njit(cache=True)
+def _start(x: float, y: float, angle: float) -> _Walk:
+    """Return a ray in the cell where it starts."""
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
     step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
     pace_x, pace_y = 1.0 / max(abs(along_x), 1e-12), 1.0 / max(abs(along_y), 1e-12)
     next_x = pace_x * (column + 1 - x if along_x > 0 else x - column)
     next_y = pace_y * (row + 1 - y if along_y > 0 else y - row)
-    entry[0] = 0.0
-    for k in range(len(cells)):
-        cells[k, 0], cells[k, 1] = row, column
-        entry[k + 1] = max(min(next_x, next_y), entry[k] + 1e-9)
-        if next_x < next_y:
-            column, next_x = column + step_x, next_x + pace_x
-        else:
-            row, next_y = row + step_y, next_y + pace_y
+    leaves = max(min(next_x, next_y), 1e-9)
+    return _Walk(row, column, 0.0, leaves, step_x, step_y, pace_x, pace_y, next_x, next_y)
+
+
+@njit(cache=True)
+def _next(walk: _Walk) -> _Walk:
+    """Return the ray in the next cell."""
+    row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
+    if next_x < next_y:
+        column, next_x = column + walk.step_x, next_x + walk.pace_x
+    else:
+        row, next_y = row + walk.step_y, next_y + walk.pace_y
+    leaves = max(min(next_x, next_y), walk.leaves + 1e-9)
+    return _Walk(row, column, walk.leaves, leaves, walk.step_x, walk.step_y, walk.pace_x, walk.pace_y, next_x, next_y)

@@ -12,7 +12,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh_map import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.robot import Robot
-from sionna_partial.settings import SensorSettings, is_whole, require, settings_or_default
+from sionna_partial.settings import SensorSettings, are_stages, is_whole, require, settings_or_default
 
 MAX_STEPS = 100_000
 """Largest number of actions: many times what a large building takes."""
@@ -20,6 +20,13 @@ MAX_STEPS = 100_000
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
 _MARGIN_M = 2.0
 _REPORT_STEPS = 10
+
+VAIN_STEPS = 1000
+"""Number of actions without progress after which a robot gives up to observe a fraction of the free area: errors of its
+map may close its way."""
+
+PROGRESS = 0.005
+"""Fraction of the free area that counts as progress."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +40,7 @@ class Exploration:
     sensor : SensorSettings
         What it was seen with.
     steps : (M,) tuple of int
-        Numbers of actions [1], increasing.
+        Numbers of actions [1], increasing; where fractions were asked for, those after which each was observed.
     states : (M, ny, nx) uint8 array of CellState
         The robot's map after so many steps, on the grid of `home`.
     poses : (N, 3) array
@@ -88,7 +95,7 @@ class Exploration:
 
 def explore(
     home: PartialMap,
-    steps: Sequence[int] = (50, 100, 150, 200),
+    steps: Sequence[float] = (50, 100, 150, 200),
     seed: int = 0,
     *,
     sensor: SensorSettings | None = None,
@@ -104,9 +111,10 @@ def explore(
     ----------
     home : PartialMap
         What is there to be seen. Its unknown cells stop the robot and its view, and stay unknown.
-    steps : sequence of int
+    steps : sequence of int or float
         Numbers of actions [1], increasing, at most `MAX_STEPS`, after which the map is returned. After 0 nothing has
-        been seen.
+        been seen. Or fractions of the free area in [0, 1), increasing: each map is the first that has so much of it,
+        or what the robot knows when it has nothing left to see, or after `VAIN_STEPS` actions without progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
@@ -124,15 +132,15 @@ def explore(
     MapError
         If the home has no free cell, or is no PartialMap.
     SettingsError
-        If `steps` are not increasing whole numbers of 0 to `MAX_STEPS`, or `seed` is not a whole number of 0 or more,
-        or `sensor` is of another kind.
+        If `steps` are neither increasing whole numbers of 0 to `MAX_STEPS` nor increasing fractions in [0, 1), or
+        `seed` is not a whole number of 0 or more, or `sensor` is of another kind.
     """
     return explore_trajectory(home, steps, seed, sensor=sensor).maps
 
 
 def explore_trajectory(
     home: PartialMap,
-    steps: Sequence[int] = (50, 100, 150, 200),
+    steps: Sequence[float] = (50, 100, 150, 200),
     seed: int = 0,
     *,
     sensor: SensorSettings | None = None,
@@ -156,7 +164,7 @@ def explore_trajectory(
     MapError, SettingsError
         As `explore` does.
     """
-    counts = _checked_steps(steps)
+    stages = _checked_stages(steps)
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
     sensor = settings_or_default("sensor", sensor, SensorSettings)
     require_map("home", home)
@@ -168,21 +176,57 @@ def explore_trajectory(
     (row0, column0), (row1, column1) = free.min(axis=0) - around, free.max(axis=0) + around + 1
     robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor)
     corner_m = np.array(home.origin_m) + (np.array([column0, row0]) - around) * home.resolution_m
+    clock = _Clock(stages, len(free))
     states: list[NDArray[np.uint8]] = []
     poses = [_poses(robot, corner_m, home.resolution_m)]
-    for done in range(counts[-1] + 1):
-        if done:
-            robot.act()
-            poses.append(_poses(robot, corner_m, home.resolution_m))
-        if done == counts[len(states)]:
+    while True:
+        for _ in range(clock.due(len(poses) - 1, robot)):
             seen = np.full_like(padded, _UNKNOWN)
-            if done:
+            if len(poses) > 1:
                 seen[row0:row1, column0:column1] = robot.seen
             states.append(seen[around:-around, around:-around])
-        if progress and (done % _REPORT_STEPS == 0 or done == counts[-1]):
-            progress(done / max(1, counts[-1]), f"exploring: step {done}")
+        if progress and ((len(poses) - 1) % _REPORT_STEPS == 0 or not clock.waits):
+            progress(clock.share(len(poses) - 1), f"exploring: step {len(poses) - 1}")
+        if not clock.waits:
+            break
+        robot.act()
+        poses.append(_poses(robot, corner_m, home.resolution_m))
     was, believed = np.array(poses).transpose(1, 0, 2)
-    return Exploration(home, sensor, tuple(counts), np.array(states), was, believed)
+    return Exploration(home, sensor, tuple(clock.steps), np.array(states), was, believed)
+
+
+class _Clock:
+    """Finds when the map of a robot is wanted: after so many steps, or when it has seen such fractions of a home."""
+
+    def __init__(self, stages: list[int] | list[float], free_cells: int) -> None:
+        self._stages, self._free_cells = stages, free_cells
+        self._by_fraction = not all(map(is_whole, stages))
+        self._progress = 0, 0.0
+        self.steps: list[int] = []
+
+    @property
+    def waits(self) -> bool:
+        """Whether there are maps still to come."""
+        return len(self.steps) < len(self._stages)
+
+    def due(self, step: int, robot: Robot) -> int:
+        """Note and count the stages that are reached after a step."""
+        before = len(self.steps)
+        done, gives_up = float(step), False
+        if self._by_fraction:
+            done = int((robot.seen == _FREE).sum()) / self._free_cells if step else 0.0
+            if done > self._progress[1] + PROGRESS:
+                self._progress = step, done
+            gives_up = robot.is_finished or step >= self._progress[0] + VAIN_STEPS
+        while self.waits and (gives_up or self._stages[len(self.steps)] <= done):
+            self.steps.append(step)
+        return len(self.steps) - before
+
+    def share(self, step: int) -> float:
+        """Share of the stages that are done, or of the steps."""
+        if self._by_fraction:
+            return len(self.steps) / len(self._stages)
+        return step / max(1, self._stages[-1])
 
 
 def _poses(robot: Robot, corner_m: NDArray[np.float64], resolution_m: float) -> list[tuple[float, float, float]]:
@@ -191,9 +235,11 @@ def _poses(robot: Robot, corner_m: NDArray[np.float64], resolution_m: float) -> 
     return [(float(x), float(y), robot.heading_deg) for x, y in places]
 
 
-def _checked_steps(steps: Sequence[int]) -> list[int]:
-    counts = list(steps) if np.iterable(steps) else []
-    rising = len(counts) > 0 and all(map(is_whole, counts)) and bool(np.all(np.diff(counts) > 0))
-    remedy = f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200)."
-    require(rising and counts[-1] <= MAX_STEPS, "steps", steps, remedy)
-    return [int(count) for count in counts]
+def _checked_stages(steps: Sequence[float]) -> list[int] | list[float]:
+    """Numbers of steps, or fractions; a SettingsError for anything else."""
+    remedy = (
+        f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200), or increasing fractions "
+        "of the free area in [0, 1), such as (0.25, 0.5, 0.75)."
+    )
+    require(are_stages(steps) and steps[-1] <= MAX_STEPS, "steps", steps, remedy)
+    return [int(each) for each in steps] if all(map(is_whole, steps)) else [float(each) for each in steps]

@@ -7,9 +7,8 @@ they do on the maps that robots and scanners make. `docs/homes.md` compares the 
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import shapely
@@ -23,11 +22,18 @@ from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
 from sionna_partial.constants import CellState
+from sionna_partial.maps.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
 from sionna_partial.maps.furniture import GRID_M, NEAR_M, furnish, parts_of, union_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import is_whole, require, require_number
+from sionna_partial.settings import HOME_KINDS, HomeKind, is_whole, require, require_number
 
-HomeKind = Literal["apartment", "house", "office"]
+RESOLUTION_M = 0.05
+"""Edge of a cell of the other kinds where none is given [m]."""
+
+LARGE_RESOLUTION_M = 0.1
+"""Edge of a cell of the large kinds (floor, hall, warehouse) where none is given [m].
+
+That of the real floors in `docs/homes.md`; a building of 100 x 60 m has four times as many cells of 0.05 m."""
 
 WALK_M = 0.5
 """Width that walls and furniture leave to walk through [m]."""
@@ -79,6 +85,7 @@ class _Style:
     clutter: float = 1.0
     swelling: float = 0.0
     raggedness: float = 0.0
+    layout: LayoutMaker | None = None
 
     @property
     def walk(self) -> float:
@@ -90,12 +97,21 @@ STYLES: dict[str, _Style] = {
     "apartment": _Style(0.5, (30, 150), (7, 20), 0.35, 0.5, (0.9, 1.4), 0.4, 0.15, 0.1),
     "house": _Style(0.35, (40, 230), (9, 26), 0.35, 0.5, (1.0, 1.6), 0.4, 0.25, 0.15),
     "office": _Style(0.15, (90, 600), (10, 40), 0.1, 0.95, (1.4, 2.4), 0.2, 0.15, 0.5, 0.1, clutter=0.5),
+    "floor": _Style(
+        0.0, (600, 6000), (30, 100), 0.0, 1.0, (1.6, 4.5), 0.1, 0.05, 0.0, 0.1, clutter=0.03, layout=floor_layout
+    ),
+    "hall": _Style(
+        0.0, (200, 6000), (12, 40), 0.0, 0.0, (1.6, 4.5), 0.2, 0.3, 0.0, 0.1, clutter=0.02, layout=hall_layout
+    ),
+    "warehouse": _Style(
+        0.0, (300, 6000), (12, 40), 0.0, 0.0, (1.6, 4.5), 0.2, 0.3, 0.0, 0.1, clutter=0.01, layout=warehouse_layout
+    ),
 }
-"""The kinds of homes that can be made; areas are those of the outline."""
+"""The kinds of homes that can be made; areas are those of the outline. `share` is how often kind=None draws one."""
 
 
 def make_home(
-    seed: int, kind: HomeKind | None = None, *, resolution_m: float = 0.05, locked_rooms: bool = True
+    seed: int, kind: HomeKind | None = None, *, resolution_m: float | None = None, locked_rooms: bool = True
 ) -> PartialMap:
     """Make a complete floor plan.
 
@@ -103,10 +119,11 @@ def make_home(
     ----------
     seed : int
         Seed, at least 0. Equal seeds give equal homes.
-    kind : {"apartment", "house", "office"} or None
-        Kind of home; None draws one.
-    resolution_m : float
-        Edge of a cell [m], 0.01 to 0.2.
+    kind : {"apartment", "house", "office", "floor", "hall", "warehouse"} or None
+        Kind of home; None draws an apartment, a house or a small office. The last three are large, up to 100 x 60 m:
+        an office floor with corridors, a production hall with machines, a warehouse with shelves.
+    resolution_m : float or None
+        Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
     locked_rooms : bool
         Whether the home may have free rooms that are out of reach; the rest of it does not depend on it.
 
@@ -123,10 +140,12 @@ def make_home(
         For a seed, kind or resolution that is not allowed.
     """
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
-    require(kind is None or kind in STYLES, "kind", kind, f"choose one of {get_args(HomeKind)} or None.")
-    require_number("resolution_m", resolution_m, 0.01, 0.2)
+    require(kind is None or kind in STYLES, "kind", kind, f"choose one of {HOME_KINDS} or None.")
+    if resolution_m is not None:
+        require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)
     style = STYLES[kind or str(rng.choice(list(STYLES), p=[each.share for each in STYLES.values()]))]
+    resolution_m = resolution_m or (LARGE_RESOLUTION_M if style.layout else RESOLUTION_M)
     plan = _draw(rng, style, locked_rooms=locked_rooms)
     while plan is None:
         plan = _draw(rng, style, locked_rooms=locked_rooms)
@@ -156,16 +175,19 @@ _SHAPES = ("free", "shut", "lines")
 def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
     """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
-    outline = _outline(rng, _log_uniform(rng, style.area))
-    rooms = [core for piece in _rooms(rng, outline, style) for core in _cores(piece)]
+    pieces, fixtures = _layout(rng, style)
+    rooms = [core for piece in pieces for core in _cores(piece)]
     rooms, openings, locked = _connected(rng, rooms, style)
     leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < LEAF_SHARE]
     gaps = union_of([opening.buffer(0.05, cap_style="flat") for opening in openings])
     lines = union_of([room.boundary for room in rooms]).difference(gaps, grid_size=GRID_M)
     walls = lines.buffer(style.wall / 2, cap_style="flat", join_style="mitre")
     lines, walls = union_of([lines, *leaves]), union_of([walls, *shapely.buffer(leaves, NEAR_M)])
+    doorsteps = union_of([opening.buffer(2 * style.walk, cap_style="flat") for opening in openings])
+    fixtures = parts_of(union_of(fixtures).difference(doorsteps, grid_size=GRID_M))
     fill = {"walk_m": style.walk, "clutter": style.clutter, "pillars": style.pillars}
-    things = [thing for room in rooms for thing in furnish(rng, room, walls, openings, **fill)]
+    taken = union_of([walls, *fixtures])
+    things = [thing for room in rooms for thing in furnish(rng, room, taken, openings, **fill)] + fixtures
     gaps = union_of([opening.buffer(style.wall, cap_style="flat") for opening in openings])
     free = union_of([*rooms, gaps]).difference(union_of([walls, *things]), grid_size=GRID_M)
     free = free.buffer(-_SLIVER_M, join_style="mitre").buffer(_SLIVER_M, join_style="mitre")
@@ -176,6 +198,15 @@ def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Pla
     waves = rng.normal(size=(_WAVES, 3))
     shut = _shut(locked if locked_rooms and rng.spawn(1)[0].random() < SHUT_SHARE else [], free, style.wall)
     return _Plan(free, shut, lines, style.swelling, style.raggedness, waves)
+
+
+def _layout(rng: np.random.Generator, style: _Style) -> tuple[Iterable[Polygon], list[Polygon]]:
+    """Rooms of a home before they are checked, and what stands fixed in them."""
+    area_m2 = _log_uniform(rng, style.area)
+    if style.layout is not None:
+        layout = style.layout(rng, area_m2, _log_uniform(rng, style.room_area))
+        return layout.rooms, layout.fixtures
+    return _rooms(rng, _outline(rng, area_m2), style), []
 
 
 def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.GeometryCollection:

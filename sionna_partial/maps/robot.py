@@ -30,8 +30,11 @@ ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
 ROAMED_SHARE = 0.95
 """Share of the free area that the robot must be able to cover to get around."""
 
-GOAL_STEPS = 25
-"""Number of actions after which a goal is chosen anew (Active Neural SLAM, Section 4)."""
+GOAL_RANGES = 2.0
+"""Ranges of the sensor that the robot may go before it chooses its goal anew [1].
+
+25 actions with the camera of Active Neural SLAM (Section 4), which sees 3.2 m; more where one look shows more.
+"""
 
 GOAL_SHARPNESS = 3.0
 """Power of a frontier's promise in its odds to become the goal [1].
@@ -86,10 +89,11 @@ class Robot:
         self._cell_m = resolution_m
         self._radius, self._roomy = _fitting_radius(truth == _FREE, resolution_m)
         self._footprint = _disc(self._radius)
+        self._goal_steps = max(1, int(GOAL_RANGES * sensor.range_m / FORWARD_M))
         self._given_up = np.zeros(truth.shape, dtype=bool)
         self._bumps = np.zeros(truth.shape, dtype=bool)
         self._goal: _Goal | None = None
-        self._finished = False
+        self.is_finished = False
         row, column = self._rng.choice(np.argwhere(self._roomy))
         self.place = column + 0.5, row + 0.5
         self.heading_deg = float(self._rng.integers(360 // TURN_DEG) * TURN_DEG)
@@ -111,13 +115,13 @@ class Robot:
 
     def act(self) -> None:
         """Do one action towards a frontier, and look; do nothing once no frontier can be reached."""
-        if self._finished:
+        if self.is_finished:
             return
         goal = self._goal
-        if goal is None or goal.steps >= GOAL_STEPS or self._is_done(goal.cell):
+        if goal is None or goal.steps >= self._goal_steps or self._is_done(goal.cell):
             goal = self._goal = self._choose_goal()
         if goal is None:
-            self._finished = True
+            self.is_finished = True
             return
         goal.steps += 1
         row, column = self._waypoint(goal)
@@ -144,22 +148,34 @@ class Robot:
         bearing = math.degrees(math.atan2(cell[0] + 0.5 - y, cell[1] + 0.5 - x))
         return (bearing - self.heading_deg + 180.0) % 360.0 - 180.0
 
-    def _frontier(self) -> NDArray[np.bool_]:
-        """Free cells that touch an unseen one, where the robot has not given up."""
-        beside = ndimage.binary_dilation(self.seen == _UNKNOWN)
-        return beside & (self.seen == _FREE) & ~self._given_up
+    def _frontier(self, part: tuple[slice, slice]) -> NDArray[np.bool_]:
+        """Free cells of a part of the map that touch an unseen one, where the robot has not given up."""
+        seen = self.seen[part]
+        beside = ndimage.binary_dilation(seen == _UNKNOWN)
+        return beside & (seen == _FREE) & ~self._given_up[part]
+
+    def _known_part(self) -> tuple[slice, slice]:
+        """Part of the map that has the robot and all known cells, and one more on each side."""
+        known = self.seen != _UNKNOWN
+        known[self._cell()] = True
+        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
+        return _part((rows[0] - 1, columns[0] - 1), (rows[-1] + 2, columns[-1] + 2))
 
     def _choose_goal(self) -> _Goal | None:
         """Draw a frontier, the likelier the more it promises for few steps; None if none can be reached."""
-        labels, count = ndimage.label(self._frontier(), structure=_EIGHT)
+        part = self._known_part()
+        corner = part[0].start, part[1].start
+        labels, count = ndimage.label(self._frontier(part), structure=_EIGHT)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-        router = _Router(self._travel_cost(), self._cell())
+        router = _Router(self._travel_cost(part), corner, self._cell())
         middles, promises = [], []
-        for label in np.nonzero(sizes >= _SMALLEST_FRONTIER_CELLS)[0] + 1:
-            cells = np.argwhere(labels == label)
+        for label, place in enumerate(ndimage.find_objects(labels), start=1):
+            if sizes[label - 1] < _SMALLEST_FRONTIER_CELLS:
+                continue
+            cells = np.argwhere(labels[place] == label) + np.add(corner, [side.start for side in place])
             row, column = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
             middles.append((int(row), int(column)))
-            steps = self._steps_to(middles[-1], router.costs[row, column])
+            steps = self._steps_to(middles[-1], router.cost_to(middles[-1]))
             promises.append(math.sqrt(sizes[label - 1]) / (steps + _DECISION_STEPS))
         if not any(promises):
             return None
@@ -171,19 +187,22 @@ class Robot:
         return math.hypot(cell[0] + 0.5 - y, cell[1] + 0.5 - x)
 
     def _is_done(self, cell: tuple[int, int]) -> bool:
-        return self._distance_to(cell) * self._cell_m < _ARRIVAL_M and not self._frontier()[cell]
+        around = _part((cell[0] - 1, cell[1] - 1), (cell[0] + 2, cell[1] + 2))
+        middle = min(cell[0], 1), min(cell[1], 1)
+        return self._distance_to(cell) * self._cell_m < _ARRIVAL_M and not self._frontier(around)[middle]
 
     def _steps_to(self, cell: tuple[int, int], cost: float) -> float:
         """Count the actions to a cell: the way, and the turn towards it."""
         return float(cost * self._cell_m / FORWARD_M + abs(self._turn_to(cell)) / TURN_DEG)
 
-    def _travel_cost(self) -> NDArray[np.float64]:
+    def _travel_cost(self, part: tuple[slice, slice]) -> NDArray[np.float64]:
         """Cost per cell of the way: 1 in the open, more beside walls, 0 (no way) where not seen free."""
-        distance = ndimage.distance_transform_edt(self.seen != _WALL) - 0.5
+        seen = self.seen[part]
+        distance = ndimage.distance_transform_edt(seen != _WALL) - 0.5
         nearness = np.clip(1.0 - distance * self._cell_m / _COMFORT_M, 0.0, 1.0)
         cost = 1.0 + _COMFORT_COST * nearness
-        cost[(distance < self._radius) | self._bumps] = _TIGHT_COST
-        cost[self.seen != _FREE] = 0.0
+        cost[(distance < self._radius) | self._bumps[part]] = _TIGHT_COST
+        cost[seen != _FREE] = 0.0
         return cost
 
     def _waypoint(self, goal: _Goal) -> NDArray[np.intp]:
@@ -217,15 +236,33 @@ class Robot:
 
     def _bump(self, goal: _Goal) -> None:
         """Avoid what stopped the robot; give up what is too near to be approached further."""
-        rows, columns = np.indices(self.seen.shape)
         reach = _BUMP_M / self._cell_m
         angle, (x, y) = math.radians(self.heading_deg), self.believed_place
         x, y = x + math.cos(angle) * reach / 2, y + math.sin(angle) * reach / 2
-        self._bumps |= np.hypot(rows + 0.5 - y, columns + 0.5 - x) < reach / 2
-        row, column = goal.cell
+        rows, columns = self._cells_around(y, x, reach)
+        self._bumps[rows, columns] |= np.hypot(rows + 0.5 - y, columns + 0.5 - x) < reach / 2
         if self._distance_to(goal.cell) < 2 * reach:
-            self._given_up |= np.hypot(rows - row, columns - column) <= reach
+            self._give_up(goal)
         self._goal = None
+
+    def _give_up(self, goal: _Goal) -> None:
+        """Take no frontier at a goal any more."""
+        (row, column), reach = goal.cell, _BUMP_M / self._cell_m
+        rows, columns = self._cells_around(row, column, reach)
+        self._given_up[rows, columns] |= np.hypot(rows - row, columns - column) <= reach
+
+    def _cells_around(self, row: float, column: float, reach: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
+        spans = zip((row, column), self.seen.shape, strict=True)
+        rows, columns = (
+            np.arange(max(0, int(at - reach)), max(0, min(size, int(at + reach) + 2))) for at, size in spans
+        )
+        return rows[:, None], columns[None]
+
+
+def _part(low: tuple[int, int], high: tuple[int, int]) -> tuple[slice, slice]:
+    """Part of a map from one row and column up to, and without, others; it ends where the map does."""
+    return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
 def _disc(radius: float) -> NDArray[np.intp]:
@@ -240,9 +277,18 @@ class _Router:
     """Shortest ways from one cell to all others, in eight directions, where a cell costs more than 0 to cross.
 
     None leads between two cells that meet at a corner and cannot be crossed.
+
+    Parameters
+    ----------
+    cost : (ny, nx) array
+        Cost of the cells of a part of a map.
+    corner : (int, int)
+        Row and column on the map of the part's first cell; `start` and all that is returned are cells of the map.
+    start : (int, int)
     """
 
-    def __init__(self, cost: NDArray[np.float64], start: tuple[int, int]) -> None:
+    def __init__(self, cost: NDArray[np.float64], corner: tuple[int, int], start: tuple[int, int]) -> None:
+        self._corner = np.array(corner)
         self._cells = np.argwhere(cost > 0)
         self._index = np.full(cost.shape, -1)
         self._index[tuple(self._cells.T)] = np.arange(len(self._cells))
@@ -257,16 +303,25 @@ class _Router:
             weights.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
         size = len(self._cells)
         graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(size, size)).tocsr()
-        cheapest, self._before = dijkstra(graph, directed=False, indices=self._index[start], return_predecessors=True)
-        self.costs = np.full(cost.shape, np.inf)
-        self.costs[tuple(self._cells.T)] = cheapest
+        cheapest, self._before = dijkstra(
+            graph, directed=False, indices=self._index[self._of_part(start)], return_predecessors=True
+        )
+        self._costs = np.full(cost.shape, np.inf)
+        self._costs[tuple(self._cells.T)] = cheapest
+
+    def cost_to(self, cell: tuple[int, int]) -> float:
+        """Cost of the way from the start to `cell`; infinite if there is none."""
+        return float(self._costs[self._of_part(cell)])
 
     def path_to(self, cell: tuple[int, int]) -> NDArray[np.intp]:
         """Cells (n, 2) from the start to `cell`."""
-        way = [self._index[cell]]
+        way = [self._index[self._of_part(cell)]]
         while self._before[way[-1]] >= 0:
             way.append(self._before[way[-1]])
-        return self._cells[way[::-1]]
+        return self._cells[way[::-1]] + self._corner
+
+    def _of_part(self, cell: tuple[int, int]) -> tuple[int, int]:
+        return int(cell[0] - self._corner[0]), int(cell[1] - self._corner[1])
 
 
 def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float, NDArray[np.bool_]]:

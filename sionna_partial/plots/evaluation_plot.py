@@ -49,7 +49,7 @@ def plot_stages(evaluation: Evaluation) -> Figure:
     axes = figure.subplots(1, len(_PANELS))
     for axis, (name, label) in zip(axes, _PANELS.items(), strict=True):
         _draw(axis, rows, name)
-        axis.set(xlabel="exploration steps", title=label)
+        axis.set(xlabel="steps, or observed fraction", title=label)
         axis.set_ylim(0.0, 1.0 if name == "accuracy" else None)
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return figure

@@ -8,9 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sionna_partial.inverse.calibration import MaterialCalibration
-from sionna_partial.inverse.slab import reflection_loss_db
 from sionna_partial.plots.figures import BLUE, RED
 from sionna_partial.settings import Material
+from sionna_partial.tracing.slab import reflection_loss_db
 
 ANGLES_DEG = np.linspace(0.0, 85.0, 171)
 """Angles of incidence at which reflections are drawn [degrees]."""

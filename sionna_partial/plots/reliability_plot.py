@@ -8,13 +8,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sionna_partial.settings import require
+from sionna_partial.training.link_table import stage_name
 from sionna_partial.training.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration
 
 _COLOUR = "#004488"
 _IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
 
 
-def plot_reliability(stages: Mapping[int, Calibration]) -> Figure:
+def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
     """Draw reliability diagrams of the link state (above) and histograms of the gain's transform (below).
 
     In a reliability diagram, discs on the dashed line are right as often as they say; the larger a disc, the more
@@ -23,8 +24,8 @@ def plot_reliability(stages: Mapping[int, Calibration]) -> Figure:
 
     Parameters
     ----------
-    stages : mapping of int to Calibration
-        By exploration steps.
+    stages : mapping of float to Calibration
+        By stage of exploration.
 
     Returns
     -------
@@ -39,10 +40,10 @@ def plot_reliability(stages: Mapping[int, Calibration]) -> Figure:
     require(len(stages) > 0, "stages", dict(stages), "give at least one calibration.")
     figure = Figure(figsize=(max(2.6 * len(stages), 5.2), 5.4), dpi=150, layout="constrained")
     axes = figure.subplots(2, len(stages), squeeze=False, sharey="row")
-    for column, (steps, calibration) in enumerate(stages.items()):
+    for column, (stage, calibration) in enumerate(stages.items()):
         _draw_reliability(axes[0, column], calibration)
         _draw_transform(axes[1, column], calibration)
-        axes[0, column].set_title(f"{steps} steps, error {calibration.state.error:.3f}")
+        axes[0, column].set_title(f"{stage_name(stage)}, error {calibration.state.error:.3f}")
     axes[0, 0].set_ylabel("share that is right")
     axes[1, 0].set_ylabel("density")
     figure.suptitle("Calibration of the link state (above) and of the path gain (below)")

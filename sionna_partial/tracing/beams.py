@@ -11,7 +11,7 @@ wall is the upper envelope of straight segments in (t, 1 / r).
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -24,6 +24,9 @@ TOLERANCE_M = 1e-4
 """Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that
 checks the candidates computes in single precision."""
 
+_STRIP_CELLS = 6.0
+"""Depth of the strips in which a narrow beam is searched for walls [cells of the index]."""
+
 _FAR_M = 1e6
 """Length at which beams that hit nothing are cut off [m]. It is fixed, so that no receiver depends on the others."""
 
@@ -31,8 +34,7 @@ _ROOT_ANGLE_RAD = 0.1234567
 """Direction of the first root beam [rad]: no wall of a lattice map is parallel to it."""
 
 
-@dataclass(frozen=True)
-class Beams:
+class Beams(NamedTuple):
     """All (chain of walls, receiver) pairs that a specular path can join.
 
     Nodes form trees: a node is one beam, its chain the walls from the root down to it. Nodes 4 k to 4 k + 3 are the
@@ -75,15 +77,7 @@ def trace_beams_in(
     plan: Plan, receivers: PointBins, sources_m: NDArray[np.float64], max_depth: NDArray[np.int64]
 ) -> Beams:
     """Do the work of `trace_beams` for several sources (E, 2) [m], each with its own largest depth (E,)."""
-    beam, node, pair = _trace_beams(
-        plan.pieces_m,
-        plan.line,
-        _root_beams(sources_m),
-        max_depth,
-        receivers.points_m,
-        receivers.start,
-        receivers.grid,
-    )
+    beam, node, pair = _trace_beams(plan, _root_beams(sources_m), max_depth, receivers)
     parent, piece, depth = node[:, :3].T.copy()
     pair_node, pair_rx = pair.T.copy()
     chain = _chain_ids(parent, np.append(plan.line, -1)[piece], depth)
@@ -113,29 +107,52 @@ def _root_beams(sources: NDArray[np.float64]) -> NDArray[np.float64]:
     return (np.tile(sources, 3)[:, None] + np.array(window)).reshape(-1, 6)
 
 
-@njit(cache=True)
-def _trace_beams(walls, line, beam, left, points, bins, grid):  # type: ignore[no-untyped-def]
+class _Room(NamedTuple):
+    """Arrays that one beam after the other is worked out in; `visit` ends with the number of the present beam."""
+
+    found: NDArray[np.float64]
+    wall: NDArray[np.int32]
+    order: NDArray[np.int32]
+    active: NDArray[np.int32]
+    edge: NDArray[np.float64]
+    piece: NDArray[np.float64]
+    piece_wall: NDArray[np.int32]
+    visit: NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
     """Breadth-first beam trees and the points inside each beam (see `trace_beams`).
 
     Returns the beams (M, 6), their (parent, segment, depth, depth left) and the pairs (node, point).
     """
-    count = len(beam)
+    walls, count = plan.pieces_m, len(beam)
     node = np.empty((count, 4), np.int32)
     for root in range(count):
         node[root, 0], node[root, 1], node[root, 2], node[root, 3] = -1, -1, 0, left[root // 4]
     pair = np.empty((4096, 2), np.int32)
-    piece = np.empty((2 * len(walls) + 3, 4))
-    piece_wall = np.empty(2 * len(walls) + 3, np.int32)
+    size = len(walls)
+    room = _Room(
+        np.empty((size, 4)),
+        np.empty(size, np.int32),
+        np.empty(size, np.int32),
+        np.empty(size, np.int32),
+        np.empty(2 * size + 2),
+        np.empty((2 * size + 3, 4)),
+        np.empty(2 * size + 3, np.int32),
+        np.zeros(size + 1, np.int64),
+    )
     k = pairs = np.int64(0)  # numba would compile a function that is called with the literal 0 twice
     while k < count:
         own = node[k, 1]
-        for i in range(_visible_pieces(walls, line, beam[k], own, piece, piece_wall)):
-            pair, pairs = _add_points(beam[k], own >= 0, piece[i], points, bins, grid, k, pair, pairs)
-            if piece_wall[i] < 0 or node[k, 3] == 0:
+        for i in range(_visible_pieces(plan, beam[k], own, room)):
+            pair, pairs = _add_points(beam[k], own >= 0, room.piece[i], receivers, k, pair, pairs)
+            wall = room.piece_wall[i]
+            if wall < 0 or node[k, 3] == 0:
                 continue
             beam, node = grow(beam, count + 1), grow(node, count + 1)
-            if _reflect(beam[k], piece[i], walls[piece_wall[i]], beam[count]):
-                node[count, 0], node[count, 1] = k, piece_wall[i]
+            if _reflect(beam[k], room.piece[i], walls[wall], beam[count]):
+                node[count, 0], node[count, 1] = k, wall
                 node[count, 2], node[count, 3] = node[k, 2] + 1, node[k, 3] - 1
                 count += 1
         k += 1
@@ -176,65 +193,167 @@ def _clip(beam, wall, reflected):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _visible_pieces(walls, line, beam, own, piece, piece_wall):  # type: ignore[no-untyped-def]
-    """Split a beam by the nearest wall: pieces (t0, w0, t1, w1), w = 0 where nothing is hit, and their walls."""
-    found = np.empty((len(walls), 4))
-    index = np.empty(len(walls), np.int32)
-    edge = np.empty(2 * len(walls) + 2)
+def _visible_pieces(plan, beam, own, room):  # type: ignore[no-untyped-def]
+    """Split a beam by the nearest wall: pieces (t0, w0, t1, w1), w = 0 where nothing is hit, and their walls.
+
+    They are written to `room`; returns their number.
+    """
+    count = _walls_in(plan, beam, own, room)
+    line, found, index, edge = plan.line, room.found, room.wall, room.edge
     edge[0], edge[1] = 0.0, 1.0
-    count = 0
-    for i in range(len(walls)):
-        if own >= 0 and line[i] == line[own]:
-            continue
-        t0, w0, t1, w1 = _clip(beam, walls[i], own >= 0)
-        if t1 - t0 > 1e-12:
-            found[count, 0], found[count, 1], found[count, 2], found[count, 3] = t0, w0, t1, w1
-            index[count] = i
-            edge[2 * count + 2], edge[2 * count + 3] = min(max(t0, 0.0), 1.0), min(max(t1, 0.0), 1.0)
-            count += 1
+    for i in range(count):
+        edge[2 * i + 2], edge[2 * i + 3] = min(max(found[i, 0], 0.0), 1.0), min(max(found[i, 2], 0.0), 1.0)
     _sort(edge, 2 * count + 2)
-    pieces = 0
+    pieces = begun = active = 0
     for i in range(2 * count + 1):
         t0, t1 = edge[i], edge[i + 1]
         if t1 - t0 < 1e-12:
             continue
-        best, w0, w1 = _nearest(found[:count], t0, t1)
+        middle = 0.5 * (t0 + t1)
+        while begun < count and found[room.order[begun], 0] <= middle:
+            room.active[active] = room.order[begun]
+            begun, active = begun + 1, active + 1
+        active = _without_ended(found, room.active, active, middle)
+        best, w0, w1 = _nearest(found, room.active[:active], t0, t1)
         wall = index[best] if best >= 0 else -1
         same = pieces > 0 and (
-            piece_wall[pieces - 1] == wall
-            or (wall >= 0 and piece_wall[pieces - 1] >= 0 and line[piece_wall[pieces - 1]] == line[wall])
+            room.piece_wall[pieces - 1] == wall
+            or (wall >= 0 and room.piece_wall[pieces - 1] >= 0 and line[room.piece_wall[pieces - 1]] == line[wall])
         )
         if same:
-            piece[pieces - 1, 2], piece[pieces - 1, 3] = t1, w1
+            room.piece[pieces - 1, 2], room.piece[pieces - 1, 3] = t1, w1
         else:
-            piece[pieces, 0], piece[pieces, 1], piece[pieces, 2], piece[pieces, 3] = t0, w0, t1, w1
-            piece_wall[pieces] = wall
+            room.piece[pieces, 0], room.piece[pieces, 1] = t0, w0
+            room.piece[pieces, 2], room.piece[pieces, 3] = t1, w1
+            room.piece_wall[pieces] = wall
             pieces += 1
     return pieces
 
 
 @njit(cache=True)
-def _sort(values, count):  # type: ignore[no-untyped-def]
-    """Sort the first `count` values in place; `np.sort` takes a second to compile."""
-    for i in range(1, count):
-        value, k = values[i], i
-        while k > 0 and values[k - 1] > value:
-            values[k] = values[k - 1]
-            k -= 1
-        values[k] = value
+def _walls_in(plan, beam, own, room):  # type: ignore[no-untyped-def]
+    """Clip the walls in a beam, from its window outwards, until nothing beyond them can be seen; their number.
+
+    Cells of the index are visited in strips across the beam. What has not been visited lies beyond all strips, so that
+    walls which fill the whole view within them hide it.
+    """
+    x0, y0, edge, columns, rows = plan.cells.grid
+    x1, y1 = x0 + columns * edge, y0 + rows * edge
+    sx, sy = beam[0], beam[1]
+    ax, ay, bx, by = beam[2] - sx, beam[3] - sy, beam[4] - sx, beam[5] - sy
+    length, width = 0.5 * (np.hypot(ax, ay) + np.hypot(bx, by)), np.hypot(ax - bx, ay - by)
+    corner = np.empty((4, 2))
+    near, count = 1.0 if own >= 0 else 0.0, 0
+    room.visit[-1] += 1
+    while True:
+        far = near + max(_STRIP_CELLS * edge, near * width) / length
+        for k, (r, dx, dy) in enumerate(((near, ax, ay), (near, bx, by), (far, bx, by), (far, ax, ay))):
+            corner[k, 0], corner[k, 1] = sx + r * dx, sy + r * dy
+        if _leaves(corner, x0 - edge, x1 + edge, 0, ax, bx) or _leaves(corner, y0 - edge, y1 + edge, 1, ay, by):
+            return count
+        count = _clip_cells(plan, beam, own, corner, count, room)
+        if _is_filled(room, count, far):
+            return count
+        near = far
 
 
 @njit(cache=True)
-def _nearest(found, t0, t1):  # type: ignore[no-untyped-def]
-    """Find the nearest of the clipped walls from t0 to t1, where none of them ends: its index (or -1), w0, w1."""
+def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-def]
+    """Whether the near side of a strip is beyond [low, high] along one axis and its beam runs on outwards."""
+    return (min(corner[0, axis], corner[1, axis]) > high and min(first, second) >= 0.0) or (
+        max(corner[0, axis], corner[1, axis]) < low and max(first, second) <= 0.0
+    )
+
+
+@njit(cache=True)
+def _clip_cells(plan, beam, own, corner, count, room):  # type: ignore[no-untyped-def]
+    """Clip the walls in the cells of a strip which were not clipped before, and give their number with the others."""
+    x0, y0, edge, columns, rows = plan.cells.grid
+    columns, rows, visit = int(columns), int(rows), room.visit[-1]
+    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
+    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
+    first, last = max(0, int(np.floor((low - y0) / edge))), min(rows - 1, int(np.floor((high - y0) / edge)))
+    for row in range(first, last + 1):
+        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
+        if left > right:
+            continue
+        start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
+        stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
+        if start > stop:
+            continue
+        for entry in range(plan.cells.start[row * columns + start], plan.cells.start[row * columns + stop + 1]):
+            wall = plan.cells.piece[entry]
+            if room.visit[wall] == visit:
+                continue
+            room.visit[wall] = visit
+            if own >= 0 and plan.line[wall] == plan.line[own]:
+                continue
+            t0, w0, t1, w1 = _clip(beam, plan.pieces_m[wall], own >= 0)
+            if t1 - t0 > 1e-12:
+                room.found[count, 0], room.found[count, 1] = t0, w0
+                room.found[count, 2], room.found[count, 3] = t1, w1
+                room.wall[count] = wall
+                k = count
+                while k > 0 and room.found[room.order[k - 1], 0] > t0:
+                    room.order[k] = room.order[k - 1]
+                    k -= 1
+                room.order[k] = count
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def _is_filled(room, count, far):  # type: ignore[no-untyped-def]
+    """Whether walls no farther than `far` fill the whole view."""
+    reach = 1e-12
+    for k in range(count):
+        i = room.order[k]
+        if room.found[i, 0] > reach:
+            return False
+        if min(room.found[i, 1], room.found[i, 3]) * far >= 1.0:
+            reach = max(reach, room.found[i, 2] + 1e-12)
+            if reach >= 1.0:
+                return True
+    return False
+
+
+@njit(cache=True)
+def _sort(values, count):  # type: ignore[no-untyped-def]
+    """Sort the first `count` values in place (Shell 1959); `np.sort` takes a second to compile."""
+    gap = 1
+    while 3 * gap + 1 < count:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, count):
+            value, k = values[i], i
+            while k >= gap and values[k - gap] > value:
+                values[k] = values[k - gap]
+                k -= gap
+            values[k] = value
+        gap //= 3
+
+
+@njit(cache=True)
+def _without_ended(found, active, count, place):  # type: ignore[no-untyped-def]
+    """Leave out the clipped walls that end before a place; the number of the others."""
+    kept = 0
+    for k in range(count):
+        if found[active[k], 2] >= place:
+            active[kept] = active[k]
+            kept += 1
+    return kept
+
+
+@njit(cache=True)
+def _nearest(found, active, t0, t1):  # type: ignore[no-untyped-def]
+    """Find the nearest of the clipped walls that reach from t0 to t1: its index (or -1), w0, w1."""
     middle = 0.5 * (t0 + t1)
     best, best_w, best_slope = -1, 0.0, 0.0
-    for k in range(len(found)):
-        if found[k, 0] <= middle <= found[k, 2]:
-            slope = (found[k, 3] - found[k, 1]) / (found[k, 2] - found[k, 0])
-            w = found[k, 1] + slope * (middle - found[k, 0])
-            if w > best_w:
-                best, best_w, best_slope = k, w, slope
+    for k in active:
+        slope = (found[k, 3] - found[k, 1]) / (found[k, 2] - found[k, 0])
+        w = found[k, 1] + slope * (middle - found[k, 0])
+        if w > best_w or (w == best_w and k < best):
+            best, best_w, best_slope = k, w, slope
     return best, best_w + best_slope * (t0 - middle), best_w + best_slope * (t1 - middle)
 
 
@@ -258,8 +377,9 @@ def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _add_points(beam, reflected, piece, points, bins, grid, node, pair, pairs):  # type: ignore[no-untyped-def]
+def _add_points(beam, reflected, piece, receivers, node, pair, pairs):  # type: ignore[no-untyped-def]
     """Pair a node with the points between the window of its beam and one piece of its view."""
+    points, bins, grid = receivers.points_m, receivers.start, receivers.grid
     x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
     rows = (len(bins) - 1) // columns
     corner = _corners(beam, reflected, piece)

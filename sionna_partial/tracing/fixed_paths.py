@@ -162,9 +162,8 @@ class PathScene:
             What is being done.
         """
         base, (tx, rx) = self.parameters(tx_m), (tx_m - self.shift_m, rx_m - self.shift_m)
-        for candidates, share, message in self.written.candidates(self.solver, tx, rx) if len(rx) else ():
-            paths, rows = self.solver.verify_rows(candidates, tx, rx)
-            yield FixedPaths(self, base, rx_m, [(candidates.rows(rows), paths)]), share, message
+        for candidates, paths, share, message in self.written.paths(self.solver, tx, rx) if len(rx) else ():
+            yield FixedPaths(self, base, rx_m, [(candidates, paths)]), share, message
 
 
 class FixedPaths:

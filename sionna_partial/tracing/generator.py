@@ -1,5 +1,6 @@
 """Which candidates a scene has follows from what it is: exact ones for a plan, those that rays find for a mesh."""
 
+import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial as partial_function
@@ -12,8 +13,9 @@ from scipy.spatial import cKDTree
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.candidates import Candidates, Wedges, specular_candidates
-from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, diffraction_candidates, find_wedges
+from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
+from sionna_partial.tracing.candidates import Candidates, Room, Wedges, specular_candidates
+from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.mesh_candidates import mesh_candidates
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.rays import shoot_rays
@@ -27,10 +29,14 @@ from sionna_partial.tracing.scene import (
 )
 from sionna_partial.tracing.solver import SceneSolver
 
-Generator = Callable[[SceneSolver, NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[Candidates, float, str]]]
-"""Gives the candidates between a transmitter (3,) and receivers (N, 3) in scene coordinates [m], block by block: the
-candidates, the share of the work done, and what is being done."""
+Found = tuple[Candidates, SolvedPaths, float, str]
+"""Candidates that are paths, these paths, the fraction of the work done, and what is being done."""
 
+Finder = Callable[[SceneSolver, NDArray[np.float64], NDArray[np.float64]], Iterator[Found]]
+"""Finds the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m], block by block."""
+
+CANDIDATES_AT_ONCE = 100_000
+"""Number of candidates that Sionna RT verifies together, about, which bounds the memory."""
 
 REFLECTION, DIFFRACTION = 1, 8
 """Sionna RT's `InteractionType.SPECULAR` and `DIFFRACTION`."""
@@ -50,13 +56,13 @@ class WrittenScene:
         Names of its shapes in the order in which faces are counted.
     wedges : Wedges or None
         Edges at which an extruded floor plan diffracts; None for a mesh.
-    candidates : Generator
+    paths : Finder
     """
 
     xml: Path
     shapes: tuple[str, ...]
     wedges: Wedges | None
-    candidates: Generator
+    paths: Finder
 
     @property
     def is_plan(self) -> bool:
@@ -89,12 +95,12 @@ def write_scene_of(
         shapes = tuple(f"part{index}" for index in range(len(partial.mesh.materials)))
         vertices_m = partial.mesh.vertices_m - [*partial.origin_m, 0.0]
         return WrittenScene(
-            xml, shapes, None, partial_function(_mesh_candidates, vertices_m, partial.mesh.triangles, settings)
+            xml, shapes, None, partial_function(_mesh_paths, vertices_m, partial.mesh.triangles, settings)
         )
     geometry = build_scene(partial, scene_settings)
     xml = write_scene(geometry, folder, offset_m=partial.origin_m, frequency_hz=settings.frequency_hz)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)
-    return WrittenScene(xml, SHAPES, wedges, partial_function(_plan_candidates, geometry, wedges, settings))
+    return WrittenScene(xml, SHAPES, wedges, partial_function(_plan_paths, geometry, wedges, settings))
 
 
 def bends_at(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> NDArray[np.bool_]:
@@ -119,37 +125,113 @@ def bends_at(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> NDArray[n
     return kept
 
 
-def _plan_candidates(
+def _plan_paths(
     geometry: SceneGeometry,
     wedges: Wedges,
     settings: TraceSettings,
     solver: SceneSolver,
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
-) -> Iterator[tuple[Candidates, float, str]]:
-    """Exact candidates of an extruded floor plan: beams, then beams over edges."""
-    part = 0.2 if settings.diffraction else 1.0
-    beams = trace_beams(geometry.plan, tx_m[:2], rx_m[:, :2], settings.max_depth)
-    for candidates, share in specular_candidates(beams, geometry, tx_m, rx_m, settings.max_depth):
-        yield candidates, part * share, "verifying reflections"
-    if not settings.diffraction:
+) -> Iterator[Found]:
+    """Find the paths of an extruded floor plan that are strong enough to matter.
+
+    First the bounds of all candidates are added up. Those that a link can do without, if its strongest candidates are
+    as strong as their bounds, are left out. Where Sionna RT finds less than that, more of them follow.
+    """
+    material = next(iter(solver.materials.values()), np.array([2.0, 0.0, 1.0]))  # none is needed without surfaces
+    bounds, tolerance_db = strengths_of(material, settings.frequency_hz, len(rx_m)), settings.power_tolerance_db
+    candidates = _PlanCandidates(geometry, wedges, settings, tx_m, rx_m)
+    if tolerance_db == 0.0:
+        yield from _verified(solver, candidates.blocks(bounds), tx_m, rx_m)
         return
-    sides = settings.diffraction_walls
-    bent = diffraction_candidates(geometry, wedges, tx_m, rx_m, settings.max_depth, walls_a_side=sides)
-    for candidates, share in bent:
-        yield candidates, part + (1.0 - part) * share, "verifying diffractions"
+    nothing = np.ones(len(rx_m), np.int64)
+    for _, share, _ in candidates.blocks(bounds._replace(first=nothing, last=nothing)):
+        yield *_nothing(solver, tx_m, rx_m), 0.4 * share, "listing paths"
+    power, expected = np.zeros(len(rx_m)), expected_power(bounds.power, bounds.reflected)
+    done, wanted = bounds.first, levels_needed(bounds.power, dropped_power(expected, tolerance_db))
+    for low, high in ((0.4, 0.9), (0.9, 1.0)):
+        if not (wanted > done).any():
+            return
+        strengths = bounds._replace(first=done, last=np.where(wanted > done, wanted, 0), power=bounds.power[:0])
+        for found, paths, share, message in _verified(solver, candidates.blocks(strengths), tx_m, rx_m):
+            indirect = ~paths.is_direct
+            power += np.bincount(paths.path_rx[indirect], np.abs(paths.a[indirect]) ** 2, len(rx_m))
+            yield found, paths, low + (high - low) * share, message
+        done, wanted = wanted, levels_needed(bounds.power, dropped_power(power, tolerance_db))
 
 
-def _mesh_candidates(
+class _PlanCandidates:
+    """Exact candidates of an extruded floor plan: beams, then beams over edges, both traced once."""
+
+    def __init__(
+        self,
+        geometry: SceneGeometry,
+        wedges: Wedges,
+        settings: TraceSettings,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+    ) -> None:
+        self._geometry, self._settings, self._room = geometry, settings, Room.of(geometry, tx_m, rx_m)
+        self._beams = trace_beams(geometry.plan, tx_m[:2], rx_m[:, :2], settings.max_depth)
+        self._best = np.zeros(len(self._beams.pair_rx), np.uint8)
+        self._bent = None
+        if settings.diffraction:
+            self._bent = DiffractionCandidates(
+                geometry, wedges, self._room, settings.max_depth, settings.diffraction_walls
+            )
+
+    def blocks(self, strengths: Strengths) -> Iterator[tuple[Candidates, float, str]]:
+        """List those that are asked for."""
+        part, depth = 1.0 if self._bent is None else 0.2, self._settings.max_depth
+        for candidates, share in specular_candidates(
+            self._beams, self._geometry, self._room, depth, strengths, self._best
+        ):
+            yield candidates, part * share, "verifying reflections"
+        if self._bent is not None:
+            for candidates, share in self._bent.blocks(strengths):
+                yield candidates, part + (1.0 - part) * share, "verifying diffractions"
+
+
+def _mesh_paths(
     vertices_m: NDArray[np.float64],
     triangles: NDArray[np.int64],
     settings: TraceSettings,
     solver: SceneSolver,
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
-) -> Iterator[tuple[Candidates, float, str]]:
-    """Candidates of a mesh: chains that rays meet, and the receivers that each can reach."""
+) -> Iterator[Found]:
+    """Find the paths of a mesh: chains that rays meet, and the receivers that each can reach."""
     depth = settings.max_depth
     rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, settings.samples_per_tx, depth)
-    for candidates, share in mesh_candidates(vertices_m, triangles, rays, tx_m, rx_m, max_depth=depth):
-        yield candidates, share, "verifying reflections"
+    blocks = mesh_candidates(vertices_m, triangles, rays, tx_m, rx_m, max_depth=depth)
+    labelled = ((candidates, share, "verifying reflections") for candidates, share in blocks)
+    yield from _verified(solver, labelled, tx_m, rx_m)
+
+
+def _verified(
+    solver: SceneSolver,
+    blocks: Iterator[tuple[Candidates, float, str]],
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+) -> Iterator[Found]:
+    """Verify candidates, many blocks of one kind at once."""
+    waiting: list[Candidates] = []
+    doing = ""
+    for candidates, share, message in itertools.chain(blocks, [(None, 1.0, "")]):
+        full = sum(len(each.rx) for each in waiting) >= CANDIDATES_AT_ONCE
+        if waiting and (candidates is None or full or not candidates.is_like(waiting[0])):
+            together = Candidates.concatenate(waiting)
+            paths, rows = solver.verify(together, tx_m, rx_m)
+            yield together.rows(rows), paths, share, doing
+            waiting = []
+        if candidates is not None and len(candidates.rx):
+            waiting.append(candidates)
+            doing = message
+
+
+def _nothing(
+    solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+) -> tuple[Candidates, SolvedPaths]:
+    """No path at all."""
+    none = Candidates(np.zeros(0, np.int32), np.zeros((0, 1), np.int32), np.zeros((0, 1, 3)))
+    return none, solver.verify(none, tx_m, rx_m)[0]

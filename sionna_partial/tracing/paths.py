@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -74,11 +75,9 @@ class PathColumns:
     """
 
     def __init__(self, depth: int) -> None:
-        shape = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
-        kind = {"path_tx": np.int32, "path_rx": np.int32, "a": np.complex128, "interactions": np.uint8}
+        types = _column_types(depth)
         self._columns: dict[str, NDArray[Any]] = {
-            field.name: np.zeros((0, *shape.get(field.name, ())), kind.get(field.name, np.float64))
-            for field in fields(SolvedPaths)
+            name: np.zeros((0, *shape), kind) for name, (shape, kind) in types.items()
         }
 
     def append(self, parts: list[SolvedPaths]) -> None:
@@ -99,6 +98,59 @@ class PathColumns:
     def paths(self) -> SolvedPaths:
         """Return all paths. Nothing may be added any more."""
         return SolvedPaths(**self._columns)
+
+
+class PathFiles:
+    """All paths of a trace, in a `.npy` file for each column.
+
+    Parameters
+    ----------
+    depth : int
+        Largest number of interactions of a path.
+    folder : Path
+        An existing folder.
+    """
+
+    def __init__(self, depth: int, folder: Path) -> None:
+        self._depth, self._folder, self._count = depth, folder, 0
+        for name in _column_types(depth):
+            self._file(name).write_bytes(bytes(_HEADER_BYTES))
+
+    def append(self, parts: list[SolvedPaths]) -> None:
+        """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
+        joined = join_paths(parts, self._depth)
+        self._count += len(joined.a)
+        for name in _column_types(self._depth):
+            with self._file(name).open("ab") as stream:
+                getattr(joined, name).tofile(stream)
+
+    def close(self) -> None:
+        """Write the headers: the files can be read."""
+        for name, (shape, kind) in _column_types(self._depth).items():
+            header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": (self._count, *shape)}
+            text = repr(header).ljust(_HEADER_BYTES - 11) + "\n"
+            size = (_HEADER_BYTES - 10).to_bytes(2, "little")
+            with self._file(name).open("r+b") as stream:
+                stream.write(b"\x93NUMPY\x01\x00" + size + text.encode("latin1"))
+
+    def _file(self, name: str) -> Path:
+        return self._folder / f"{name}.npy"
+
+
+_HEADER_BYTES = 192
+"""Length of the header of a `.npy` file: a multiple of 64 with room for any shape."""
+
+
+def _column_types(depth: int) -> dict[str, tuple[tuple[int, ...], type]]:
+    """Shape of an entry, and type, of each column of paths with at most `depth` interactions."""
+    shape = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
+    kind = {"path_tx": np.int32, "path_rx": np.int32, "a": np.complex128, "interactions": np.uint8}
+    return {field.name: (shape.get(field.name, ()), kind.get(field.name, np.float64)) for field in fields(SolvedPaths)}
+
+
+def path_bytes(depth: int) -> int:
+    """Return the size of a path with room for `depth` interactions [bytes]."""
+    return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind in _column_types(depth).values())
 
 
 def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:

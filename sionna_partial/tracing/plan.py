@@ -1,19 +1,43 @@
 """The plan that beams run in: walls that meet only at ends, the lines they lie on, and points sorted into bins."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numba import njit
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from sionna_partial.planar import cross
+from sionna_partial.planar import cross, span_in_strip
 
-_WALLS_AT_ONCE = 64
-"""Number of walls that are cut together, which bounds the memory."""
+_SAME_LINE_M = 1e-6
+"""Distance from a line within which the ends of collinear walls lie [m]."""
+
+_WALLS_PER_CELL = 4.0
+"""Number of wall pieces in a cell of the index, on average over the cells that hold any."""
 
 
-@dataclass(frozen=True)
-class Plan:
+class WallIndex(NamedTuple):
+    """Square cells over a plan, row by row, and the wall pieces that may cross each.
+
+    Parameters
+    ----------
+    grid : (5,) float64 array
+        Corner x0 and y0 and edge of the cells [m], numbers of columns and rows.
+    start : (B + 1,) int64 array
+        First entry of each cell.
+    piece : (E,) int32 array
+        Pieces, cell by cell.
+    """
+
+    grid: NDArray[np.float64]
+    start: NDArray[np.int64]
+    piece: NDArray[np.int32]
+
+
+class Plan(NamedTuple):
     """Walls of a floor plan, cut where they cross.
 
     Parameters
@@ -22,15 +46,16 @@ class Plan:
         End points of the pieces [m].
     owner, line : (K,) int32 arrays
         Wall segment that each piece is a part of, and number of the infinite line that it lies on.
+    cells : WallIndex
     """
 
     pieces_m: NDArray[np.float64]
     owner: NDArray[np.int32]
     line: NDArray[np.int32]
+    cells: WallIndex
 
 
-@dataclass(frozen=True)
-class PointBins:
+class PointBins(NamedTuple):
     """Points sorted into square bins, row by row.
 
     Parameters
@@ -52,9 +77,9 @@ class PointBins:
 
 
 def prepare_plan(walls_m: NDArray[np.float64]) -> Plan:
-    """Cut walls (S, 2, 2) [m] where they cross and find collinear ones."""
+    """Cut walls (S, 2, 2) [m] where they cross, and find collinear ones."""
     pieces_m, owner = _split_at_crossings(walls_m)
-    return Plan(pieces_m, owner, _line_ids(pieces_m))
+    return Plan(pieces_m, owner, _line_ids(pieces_m), _index(pieces_m))
 
 
 def bin_points(points_m: NDArray[np.float64]) -> PointBins:
@@ -85,17 +110,15 @@ def grow(array, size):  # type: ignore[no-untyped-def]
 def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Cut segments where others cross them: the pieces (K, 2, 2), which meet only at ends, and their owners (K,)."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
-    owners, places = [np.repeat(np.arange(len(walls)), 2)], [np.tile([0.0, 1.0], len(walls))]
-    for first in range(0, len(walls), _WALLS_AT_ONCE):
-        own = along[first : first + _WALLS_AT_ONCE, None]
-        away = start - start[first : first + _WALLS_AT_ONCE, None]
-        area = cross(own, along)
-        area[np.abs(area) < 1e-12] = np.inf
-        u, v = cross(away, along) / area, cross(away, own) / area
-        crossed = (u > 1e-9) & (u < 1.0 - 1e-9) & (v > 1e-9) & (v < 1.0 - 1e-9)
-        owners.append(first + np.nonzero(crossed)[0])
-        places.append(u[crossed])
-    owner, place = np.concatenate(owners), np.concatenate(places)
+    lines = shapely.linestrings(walls)
+    own, other = shapely.STRtree(lines).query(lines, predicate="intersects")
+    area = cross(along[own], along[other])
+    area[np.abs(area) < 1e-12] = np.inf
+    away = start[other] - start[own]
+    u, v = cross(away, along[other]) / area, cross(away, along[own]) / area
+    crossed = (u > 1e-9) & (u < 1.0 - 1e-9) & (v > 1e-9) & (v < 1.0 - 1e-9)
+    owner = np.concatenate([np.repeat(np.arange(len(walls)), 2), own[crossed]])
+    place = np.concatenate([np.tile([0.0, 1.0], len(walls)), u[crossed]])
     order = np.lexsort([place, owner])
     owner, place = owner[order], place[order, None]
     ends = np.where(place < 1.0, start[owner] + place * along[owner], walls[owner, 1])
@@ -105,9 +128,54 @@ def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 
 def _line_ids(walls: NDArray[np.float64]) -> NDArray[np.int32]:
     """Give numbers to the infinite lines that the segments lie on; collinear segments share one."""
-    line = np.full(len(walls), -1, np.int32)
-    for i, (start, end) in enumerate(walls):
-        if line[i] < 0:
-            away = cross(end - start, walls - start) / np.hypot(*(end - start))
-            line[(line < 0) & (np.abs(away) < 1e-6).all(axis=1)] = line.max() + 1
-    return line
+    if len(walls) == 0:
+        return np.zeros(0, np.int32)
+    along = walls[:, 1] - walls[:, 0]
+    length = np.hypot(*along.T)
+    angle = np.arctan2(along[:, 1], along[:, 0])
+    middle = walls.mean(axis=(0, 1))
+    span = float(np.abs(walls - middle).max()) + 1.0
+    offset = cross(along, walls[:, 0] - middle) / length
+    flip = np.cos(angle) + 1e-3 * np.sin(angle) < 0.0  # one of the two directions of a line
+    normal = np.column_stack([np.cos(2 * angle) * span, np.sin(2 * angle) * span, np.where(flip, -offset, offset)])
+    first, second = cKDTree(normal).query_pairs(0.1, output_type="ndarray").T
+    away = np.abs(cross(along[first, None], walls[second] - walls[first, :1])) / length[first, None]
+    back = np.abs(cross(along[second, None], walls[first] - walls[second, :1])) / length[second, None]
+    same = (away < _SAME_LINE_M).all(axis=1) & (back < _SAME_LINE_M).all(axis=1)
+    pairs = coo_array((np.ones(same.sum()), (first[same], second[same])), shape=(len(walls),) * 2)
+    return np.asarray(connected_components(pairs, directed=False)[1], dtype=np.int32)
+
+
+def _index(walls: NDArray[np.float64]) -> WallIndex:
+    """Sort wall pieces into cells."""
+    if len(walls) == 0:
+        return WallIndex(np.array([0.0, 0.0, 1.0, 1.0, 1.0]), np.zeros(2, np.int64), np.zeros(0, np.int32))
+    low, high = walls.min(axis=(0, 1)), walls.max(axis=(0, 1))
+    length = float(np.hypot(*(walls[:, 1] - walls[:, 0]).T).sum())
+    edge = max(0.05, length * _WALLS_PER_CELL / len(walls) / 2.0, float((high - low).max()) / 1000)
+    columns, rows = np.floor((high - low) / edge).astype(np.int64) + 1
+    grid = np.array([low[0], low[1], edge, columns, rows])
+    cell, piece = _cells_of(walls, grid)
+    order = np.argsort(cell, kind="stable")
+    start = np.searchsorted(cell[order], np.arange(rows * columns + 1))
+    return WallIndex(grid, start, piece[order])
+
+
+@njit(cache=True)
+def _cells_of(walls, grid):  # type: ignore[no-untyped-def]
+    """Cells that each wall may cross: their numbers, and the walls."""
+    x0, y0, edge, columns, rows = grid[0], grid[1], grid[2], int(grid[3]), int(grid[4])
+    cell, piece, count = np.empty(1024, np.int64), np.empty(1024, np.int32), np.int64(0)
+    for i in range(len(walls)):
+        low, high = min(walls[i, 0, 1], walls[i, 1, 1]), max(walls[i, 0, 1], walls[i, 1, 1])
+        first = max(0, int(np.floor((low - y0) / edge - 1e-6)))
+        last = min(rows - 1, int(np.floor((high - y0) / edge + 1e-6)))
+        for row in range(first, last + 1):
+            left, right = span_in_strip(walls[i], y0 + (row - 1e-6) * edge, y0 + (row + 1 + 1e-6) * edge)
+            start = max(0, int(np.floor((left - x0) / edge - 1e-6)))
+            stop = min(columns - 1, int(np.floor((right - x0) / edge + 1e-6)))
+            cell, piece = grow(cell, count + columns), grow(piece, count + columns)
+            for column in range(start, stop + 1):
+                cell[count], piece[count] = row * columns + column, i
+                count += 1
+    return cell[:count], piece[:count]

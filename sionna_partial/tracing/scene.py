@@ -324,7 +324,7 @@ def _open_ends(partial: PartialMap, outlines: Outlines) -> NDArray[np.bool_]:
     """Find the vertices (V,) where one wall ends and the cell beyond its end is not free."""
     ends, tails = outlines.segments.ravel(), outlines.segments[:, ::-1].ravel()
     along = outlines.vertices_m[ends] - outlines.vertices_m[tails]
-    along *= partial.resolution_m / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    along *= 0.75 * partial.resolution_m / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     beyond = partial.state_at(outlines.vertices_m[ends] + along + partial.origin_m)
     is_open = np.zeros(len(outlines.vertices_m), dtype=bool)
     is_open[ends] = beyond != CellState.FREE

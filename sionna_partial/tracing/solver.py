@@ -131,24 +131,8 @@ class SceneSolver:
         candidates: Candidates,
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
-    ) -> SolvedPaths:
-        """Verify candidates and compute their coefficients.
-
-        Parameters
-        ----------
-        candidates : Candidates
-        tx_m, rx_m : (3,) and (N, 3) arrays
-            Transmitter and receivers, in scene coordinates [m].
-        """
-        return self.verify_rows(candidates, tx_m, rx_m)[0]
-
-    def verify_rows(
-        self,
-        candidates: Candidates,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
     ) -> tuple[SolvedPaths, NDArray[np.intp]]:
-        """Verify candidates as `verify` does, and say which of them the paths are.
+        """Verify candidates and compute their coefficients.
 
         Parameters
         ----------

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
-from sionna_partial.errors import PositionError
-from sionna_partial.files import temporary_folder
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.errors import MemoryLimitError, PositionError
+from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
-from sionna_partial.tracing.generator import Generator, WrittenScene, bends_at, write_scene_of
-from sionna_partial.tracing.paths import PathColumns, SolvedPaths
+from sionna_partial.tracing.generator import Finder, WrittenScene, bends_at, write_scene_of
+from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
 from sionna_partial.tracing.probe import fast_engine_works
 from sionna_partial.tracing.scene import scene_settings_of
 from sionna_partial.tracing.solver import SceneSolver
@@ -34,9 +34,12 @@ Progress = Callable[[float, str], None]
 SHORTEST_M = 0.011
 """Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
 
-RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 3_000, 50_000
+RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 6_000, 50_000
 """Number of receivers whose paths are found together, which bounds the memory. A mesh has fewer paths, and costs rays
 each time."""
+
+SAMPLE = 100
+"""Number of receivers from which the number of all paths is estimated."""
 
 Solve = Callable[[NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[SolvedPaths, float, str]]]
 """Solves the paths from one transmitter (3,) to receivers (N, 3), in scene coordinates, block by block: the paths of a
@@ -99,6 +102,8 @@ def trace_links(
     *,
     settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
+    folder: str | Path | None = None,
+    memory_gb: float = MEMORY_GB,
     progress: Progress | None = None,
 ) -> TracedLinks:
     """Trace every path from one or more transmitters to N receivers with Sionna RT.
@@ -121,8 +126,13 @@ def trace_links(
         Receiver positions [m]; N may be 0.
     settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
+    folder : path, optional
+        Where the paths are written while they are traced, an `.npy` file for each array. The arrays of the result are
+        then read from there when they are needed, and `memory_gb` does not limit them.
+    memory_gb : float
+        How much memory the paths may take [GB]. Their size is estimated first, from some of the receivers.
     progress : callable, optional
-        Called as ``progress(share_done, message)``.
+        Called as ``progress(fraction_done, message)``.
 
     Returns
     -------
@@ -130,6 +140,8 @@ def trace_links(
 
     Raises
     ------
+    MemoryLimitError
+        If the paths would take more than `memory_gb`.
     PositionError
         For a transmitter or receiver that is not finite, outside the map or inside a wall, or a receiver within 1.1 cm
         of a transmitter (at low frequencies, where Friis' formula is above 0 dB).
@@ -142,12 +154,34 @@ def trace_links(
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
-    tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
-    report = progress or (lambda share, message: None)
+    places, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
+    tx_m = places.reshape(np.shape(tx))
+    report, depth = progress or (lambda share, message: None), max(1, settings.max_depth)
     report(0.0, "building the scene")
-    with temporary_folder() as folder:
-        tracer = _Tracer(partial, folder, settings, scene_settings)
-        return tracer.links(tx_m.reshape(np.shape(tx)), rx_m, report)
+    with temporary_folder() as work:
+        tracer = Tracer(partial, work, settings, scene_settings)
+        tracer.require_memory(places, rx_m, None if folder is not None else memory_gb)
+        if folder is None:
+            return _traced_links(tracer, tx_m, rx_m, report)
+        with atomic_files(folder) as place:
+            columns = PathFiles(depth, place)
+            link_state, gain_db = tracer.links(tx_m, rx_m, report, columns)
+            columns.close()
+            for name, values in (("tx", tx_m), ("rx", rx_m), ("link_state", link_state), ("gain_db", gain_db)):
+                np.save(place / f"{name}.npy", values)
+    stored = {field.name: np.load(Path(folder) / f"{field.name}.npy", mmap_mode="r") for field in _ARRAYS}
+    return TracedLinks(**stored, settings=settings, scene_settings=scene_settings)
+
+
+def _traced_links(
+    tracer: "Tracer", tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
+) -> TracedLinks:
+    columns = PathColumns(max(1, tracer.settings.max_depth))
+    link_state, gain_db = tracer.links(tx_m, rx_m, report, columns)
+    found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
+    return TracedLinks(
+        tx_m, rx_m, link_state, gain_db, **found, settings=tracer.settings, scene_settings=tracer.scene_settings
+    )
 
 
 def trace_each(
@@ -181,13 +215,24 @@ def trace_each(
         for place, receivers in zip(tx, rx, strict=True)
     ]
     with temporary_folder() as folder:
-        tracer = _Tracer(partial, folder, settings, scene_settings)
-        return [tracer.links(tx_m[0], rx_m, lambda share, message: None) for tx_m, rx_m in places]
+        tracer = Tracer(partial, folder, settings, scene_settings)
+        return [_traced_links(tracer, tx_m[0], rx_m, lambda share, message: None) for tx_m, rx_m in places]
+
+
+_ARRAYS = tuple(field for field in fields(TracedLinks) if not field.name.endswith("settings"))
 
 
 @dataclass(frozen=True)
-class _Tracer:
-    """Traces links on one scene, which is written to `folder` when the first are asked for."""
+class Tracer:
+    """Finds paths on one scene, which is written to `folder` when the first are asked for.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    folder : Path
+    settings, scene_settings : TraceSettings, SceneSettings
+        From `checked_settings`.
+    """
 
     partial: PartialMap
     folder: Path
@@ -195,42 +240,70 @@ class _Tracer:
     scene_settings: SceneSettings
 
     @cached_property
-    def solver(self) -> tuple[Solve, int]:
+    def _solver(self) -> tuple[Solve, int]:
         """How paths are found, and for how many receivers at once."""
         return _solver(self.partial, self.folder, self.settings, self.scene_settings)
 
-    def links(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> TracedLinks:
-        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3) [m]."""
-        places = tx_m.reshape(-1, 3)
-        paths = self._paths(places, rx_m, report)
-        shape = (*tx_m.shape[:-1], len(rx_m))
-        link_state, gain_db = _summary(paths, len(places), len(rx_m))
-        return TracedLinks(
-            tx=tx_m,
-            rx=rx_m,
-            link_state=link_state.reshape(shape),
-            gain_db=gain_db.reshape(shape),
-            **{field.name: getattr(paths, field.name) for field in fields(SolvedPaths)},
-            settings=self.settings,
-            scene_settings=self.scene_settings,
-        )
+    def links(
+        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress, columns: PathColumns | PathFiles
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3) [m] into columns of paths.
 
-    def _paths(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> SolvedPaths:
-        """Find all paths between transmitters (T, 3) and receivers (N, 3) [m]."""
+        Returns their link states and path gains [dB], (N,) or (T, N).
+        """
+        places = tx_m.reshape(-1, 3)
+        shape, links = (*tx_m.shape[:-1], len(rx_m)), len(places) * len(rx_m)
+        power, is_direct = np.zeros(links), np.zeros(links, bool)
+        for block in self._blocks(places, rx_m, report):
+            columns.append(block)
+            for paths in block:
+                link = paths.path_tx.astype(np.int64) * len(rx_m) + paths.path_rx
+                np.add.at(power, link, np.abs(paths.a) ** 2)
+                is_direct[link[paths.is_direct]] = True
+        link_state, gain_db = link_summary(power, is_direct)
+        return link_state.reshape(shape), gain_db.reshape(shape)
+
+    def require_memory(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], memory_gb: float | None) -> None:
+        """Say how much memory the paths will take, estimated from some receivers of a large job.
+
+        Raises a MemoryLimitError if that is more than `memory_gb`.
+        """
+        if len(tx_m) * len(rx_m) <= RECEIVERS_OF_PLAN:
+            return
+        some = rx_m[np.linspace(0, len(rx_m) - 1, min(len(rx_m), SAMPLE)).astype(int)]
+        found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, lambda share, message: None))
+        count = round(found / len(some) * len(rx_m) * len(tx_m))
+        size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth)) / 1e9
+        _log.info("about %d paths, which take %.1f GB", count, size_gb)
+        if memory_gb is not None and size_gb > memory_gb:
+            raise MemoryLimitError(
+                f"memory_gb = {memory_gb:g} is too little for about {count:,} paths, which take {size_gb:.1f} GB: give "
+                "a folder for the paths, fewer receivers, or more memory_gb."
+            )
+
+    def _blocks(
+        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
+    ) -> Iterator[list[SolvedPaths]]:
+        """Find all paths between transmitters (T, 3) and receivers (N, 3) [m], some receivers at a time."""
+        if len(rx_m) == 0:
+            return
+        at_once = self._solver[1]
+        starts = [(tx, start) for tx in range(len(tx_m)) for start in range(0, len(rx_m), at_once)]
+        for number, (tx, start) in enumerate(starts):
+
+            def within(share: float, message: str, number: int = number) -> None:
+                report(0.1 + 0.9 * (number + share) / len(starts), message)
+
+            yield [paths.between(tx, start) for paths in self.paths(tx_m[tx], rx_m[start : start + at_once], within)]
+
+    def paths(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator[SolvedPaths]:
+        """Find all paths between a transmitter (3,) and receivers (N, 3) [m], some paths at a time."""
         shift = np.array([*self.partial.origin_m, 0.0])
-        columns = PathColumns(max(1, self.settings.max_depth))
-        if len(rx_m):
-            solve, at_once = self.solver
-            blocks = [(tx, start) for tx in range(len(tx_m)) for start in range(0, len(rx_m), at_once)]
-            for number, (index, start) in enumerate(blocks):
-                parts = []
-                for paths, share, message in solve(tx_m[index] - shift, rx_m[start : start + at_once] - shift):
-                    parts.append(paths.between(index, start))
-                    report(0.1 + 0.9 * (number + share) / len(blocks), message)
-                columns.append(parts)
-        found = columns.paths()
-        found.vertices_m[:] += shift
-        return found
+        for paths, share, message in self._solver[0](tx_m - shift, rx_m - shift):
+            report(share, message)
+            if len(paths.a):
+                yield replace(paths, vertices_m=paths.vertices_m + shift)
+        report(1.0, "traced")
 
 
 def checked_settings(
@@ -285,7 +358,7 @@ def _solver(
     if _shoots(settings, scene) or not fast_engine_works():
         solve = partial_function(_shoot, scene, settings)
     else:
-        solve = partial_function(_verify, scene.candidates, SceneSolver(scene.xml, scene.shapes, settings))
+        solve = partial_function(_verify, scene.paths, SceneSolver(scene.xml, scene.shapes, settings))
     return solve, RECEIVERS_OF_PLAN if scene.is_plan else RECEIVERS_OF_MESH
 
 
@@ -304,11 +377,11 @@ def _shoots(settings: TraceSettings, scene: WrittenScene) -> bool:
 
 
 def _verify(
-    candidates_between: Generator, solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+    find: Finder, solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
 ) -> Iterator[tuple[SolvedPaths, float, str]]:
     """Verify the candidates of the scene."""
-    for candidates, share, message in candidates_between(solver, tx_m, rx_m):
-        yield solver.verify(candidates, tx_m, rx_m), share, message
+    for _, paths, share, message in find(solver, tx_m, rx_m):
+        yield paths, share, message
 
 
 def _shoot(
@@ -318,13 +391,6 @@ def _shoot(
     for paths, share in stock_paths(scene.xml, settings, tx_m, rx_m):
         kept = paths if scene.wedges is None else paths.take(bends_at(scene.wedges, paths, settings.diffraction_walls))
         yield kept, share, f"shooting rays to {len(rx_m)} receivers"
-
-
-def _summary(paths: SolvedPaths, transmitters: int, receivers: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Link state and path gain [dB] of all links, transmitter by transmitter."""
-    link, links = paths.path_tx.astype(np.int64) * receivers + paths.path_rx, transmitters * receivers
-    power = np.bincount(link, weights=np.abs(paths.a) ** 2, minlength=links).astype(float)
-    return link_summary(power, np.isin(np.arange(links), link[paths.is_direct]))
 
 
 def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:

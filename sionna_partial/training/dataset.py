@@ -24,7 +24,7 @@ from sionna_partial.training.home_process import (
     run_home,
     stop_homes,
 )
-from sionna_partial.training.home_sources import HomeSource, home_sources
+from sionna_partial.training.home_sources import Home, HomeSource, home_sources
 from sionna_partial.training.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER
 
 HomeProgress = Callable[[int, int, str], None]
@@ -66,7 +66,7 @@ class DatasetReport:
 
 def build_dataset(
     folder: str | os.PathLike[str],
-    homes: Iterable[int | str | os.PathLike[str]],
+    homes: Iterable[Home],
     settings: DatasetSettings | None = None,
     *,
     scheduler: str | None = None,
@@ -89,8 +89,8 @@ def build_dataset(
     folder : path-like
         Folder of the data set. With a `scheduler`, all workers must see it under the same path: it must be on a file
         system that they share. A worker that does not see it ends the run with an error.
-    homes : iterable of int or path-like
-        Seeds of `make_home`, and complete maps or folders of them (`home_sources`).
+    homes : iterable of int, (int, str) or path-like
+        Seeds of `make_home`, pairs of a seed and a kind, and complete maps or folders of them (`home_sources`).
     settings : DatasetSettings, optional
     scheduler : str, optional
         Address of a dask scheduler (tcp://host:8786), or path of a scheduler file. By default this machine works.

@@ -13,7 +13,7 @@ from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.training.baselines import MAJORITY_FILE, Baselines, answers
 from sionna_partial.training.dataset_links import Dataset, LinkTraces, open_links, require_like
-from sionna_partial.training.link_table import LinkTable
+from sionna_partial.training.link_table import LinkTable, stage_name
 from sionna_partial.training.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
 
 ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
@@ -38,8 +38,8 @@ class Row:
         Whether the predictor was trained on the homes of these links.
     receivers : {"indoor", "anywhere"}
         Whether receivers were drawn indoors, or from the whole map area.
-    stage : int
-        Steps that the robot has explored.
+    stage : float
+        Steps that the robot has explored; below 1, the fraction that it was to observe.
     ends_seen : {"all", "both", "one", "none"}
         Which links: all, or those with so many ends in observed cells.
     answer : str
@@ -49,7 +49,7 @@ class Row:
 
     homes: str
     receivers: str
-    stage: int
+    stage: float
     ends_seen: str
     answer: str
     metrics: Metrics
@@ -62,7 +62,7 @@ class Difference:
     Parameters
     ----------
     receivers : {"indoor", "anywhere"}
-    stage : int
+    stage : float
     baseline : str
     homes : int
     accuracy, accuracy_error : float
@@ -72,7 +72,7 @@ class Difference:
     """
 
     receivers: str
-    stage: int
+    stage: float
     baseline: str
     homes: int
     accuracy: float
@@ -104,7 +104,7 @@ class Evaluation:
     homes: Mapping[str, tuple[str, ...]]
     rows: tuple[Row, ...]
     differences: tuple[Difference, ...]
-    calibrations: Mapping[int, Calibration]
+    calibrations: Mapping[float, Calibration]
     notes: tuple[str, ...]
 
     def select(self, **wanted: object) -> list[Row]:
@@ -154,10 +154,10 @@ def evaluate(
     homes = _homes(model, links)
     contestants = _Contestants(model, baselines or Baselines.load(_baselines_folder(model)), _paper(model))
     rows, differences, calibrations = [], [], {}
-    parts = list(itertools.product(homes, map(int, np.unique(links.stage))))
+    parts = list(itertools.product(homes, map(float, np.unique(links.stage))))
     for index, (name, stage) in enumerate(parts):
         if progress:
-            progress(index / len(parts), f"measuring on {name} homes after {stage} steps")
+            progress(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
         both = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
         for receivers, some, given in contestants.answers(both):
             rows += list(_rows(name, receivers, stage, some, given))
@@ -275,7 +275,7 @@ def _paper(model: Predictor) -> Predictor | None:
 
 
 def _rows(
-    homes: str, receivers: str, stage: int, links: LinkTable, given: Mapping[str, LinkPrediction]
+    homes: str, receivers: str, stage: float, links: LinkTable, given: Mapping[str, LinkPrediction]
 ) -> Iterator[Row]:
     ends = links.context.tx_seen.astype(np.int64) + links.context.rx_seen
     cells = {"all": np.ones(len(links), dtype=bool)} | {name: ends == count for name, count in ENDS_SEEN.items()}
@@ -286,7 +286,7 @@ def _rows(
 
 
 def _differences(
-    receivers: str, stage: int, links: LinkTable, given: Mapping[str, LinkPrediction]
+    receivers: str, stage: float, links: LinkTable, given: Mapping[str, LinkPrediction]
 ) -> Iterator[Difference]:
     """Compare the first answer with each of the others."""
     scores = {answer: home_scores(prediction, links) for answer, prediction in given.items()}

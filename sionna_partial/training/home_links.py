@@ -12,7 +12,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.learning.features import LinkFeatures, link_features
 from sionna_partial.maps.explore import explore
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.settings import DatasetSettings
+from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings
 from sionna_partial.tracing.trace import trace_each
 from sionna_partial.training.link_table import LinkTable
 
@@ -21,6 +21,8 @@ NEAREST_M = 0.1
 
 FROM_BORDER_CELLS = 0.25
 """Distance of transmitters and receivers from the borders of their cells [cells]."""
+
+_LIDAR_FRACTION = 2 / 3
 
 MAX_DRAWS = 1000
 """Number of times that places which cannot be used are drawn again."""
@@ -46,7 +48,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     """Trace the links of a home on what a robot has seen of it at every stage, and on the whole of it.
 
     Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
-    cells, the second half (`anywhere`) from all cells of the map area that are not walls. The map area is the bounding
+    cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,
+    `short_link_fraction` within `SHORT_LINK_M` of the transmitter. The map area is the bounding
     box of the known cells and `margin_m` around it, whatever the size of the grid: a small home in a large empty grid
     would have receivers outside and no others. None is where a robot with errors has mapped a wall, as no link can be
     predicted there. No receiver is nearer than `NEAREST_M` to its transmitter.
@@ -83,14 +86,42 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
             "cells end at walls."
         )
     area = map_area(home, settings.margin_m)
-    rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
-    maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=settings.sensor)
+    rng = np.random.default_rng(_home_seed(name, settings))
+    maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=home_sensor(name, settings))
     places = _draw_places(area, maps, name, settings, rng)
     truth = _truth(area, places, settings)
     seen = zip(settings.stages, maps, _features(maps, places, settings), strict=True)
     return LinkTable.concatenate(
         _stage_links(name, area, stage, partial, phi, places, truth) for stage, partial, phi in seen
     )
+
+
+def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
+    """Return the sensor of the robot in a home: that of the settings, or one that is drawn for the home's name.
+
+    Parameters
+    ----------
+    name : str
+        Name of the home.
+    settings : DatasetSettings
+
+    Returns
+    -------
+    SensorSettings
+    """
+    if isinstance(settings.sensor, SensorSettings):
+        return settings.sensor
+    rng = np.random.default_rng([1, *_home_seed(name, settings)])
+    values = {key: low + rng.random() ** 2 * (high - low) for key, (low, high) in MIXED_SENSORS.items()}
+    values["field_of_view_deg"] = float(rng.uniform(*MIXED_SENSORS["field_of_view_deg"]))
+    values["range_m"] = float(np.exp(rng.uniform(*np.log(MIXED_SENSORS["range_m"]))))
+    if rng.random() < _LIDAR_FRACTION:
+        values["field_of_view_deg"] = 360.0
+    return SensorSettings(**values)
+
+
+def _home_seed(name: str, settings: DatasetSettings) -> list[int]:
+    return [settings.seed, *hashlib.sha256(name.encode()).digest()]
 
 
 def map_area(home: PartialMap, margin_m: float) -> PartialMap:
@@ -144,13 +175,25 @@ def _receivers(
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Draw receivers (count, 3) that are not at the transmitter [m]."""
-    rx_m = _points_in(cells, count, home, settings.rx_height_m, rng)
+    short = round(settings.short_link_fraction * count)
+    rx_m = np.concatenate(
+        [
+            _points_in(cells, count - short, home, settings.rx_height_m, rng),
+            _points_in(cells & _within(home, tx_m, SHORT_LINK_M), short, home, settings.rx_height_m, rng),
+        ]
+    )
     for _ in range(MAX_DRAWS):
         near = np.linalg.norm(rx_m - tx_m, axis=1) < NEAREST_M
         if not near.any():
             return rx_m
         rx_m[near] = _points_in(cells, int(near.sum()), home, settings.rx_height_m, rng)
     raise MapError(f"home {name!r} is too small, all of it is within {NEAREST_M:g} m of a transmitter: leave it out.")
+
+
+def _within(home: PartialMap, place_m: NDArray[np.float64], distance_m: float) -> NDArray[np.bool_]:
+    """Cells (ny, nx) whose centres are so near to a place."""
+    x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
+    return np.hypot(x[None] - place_m[0], y[:, None] - place_m[1]) <= distance_m
 
 
 def _points_in(
@@ -194,7 +237,7 @@ def _features(maps: list[PartialMap], places: _Places, settings: DatasetSettings
 def _stage_links(
     name: str,
     home: PartialMap,
-    stage: int,
+    stage: float,
     partial: PartialMap,
     phi: LinkFeatures,
     places: _Places,
@@ -203,7 +246,7 @@ def _stage_links(
     inside, link_state, gain_db = truth
     return LinkTable(
         home=np.full(len(phi), name),
-        stage=np.full(len(phi), stage, dtype=np.int64),
+        stage=np.full(len(phi), stage, dtype=np.float64),
         phi=phi,
         link_state=link_state,
         gain_db=gain_db,

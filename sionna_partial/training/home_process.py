@@ -26,7 +26,7 @@ from typing import Literal
 from sionna_partial.errors import BackendError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.settings import DatasetSettings
-from sionna_partial.training.home_links import home_links
+from sionna_partial.training.home_links import home_links, home_sensor
 from sionna_partial.training.home_sources import HomeSource
 from sionna_partial.training.shards import INDEX_FILE, shard_metadata, shard_path, write_shard
 
@@ -85,7 +85,8 @@ class HomeTask:
         """What the shard notes beside its links."""
         plain = json.dumps(asdict(self.settings), default=lambda number: number.item())  # a number of NumPy's
         settings = json.loads(plain)
-        return {"home": self.source.record, "settings": settings, "versions": self.versions}
+        sensor = asdict(home_sensor(self.source.name, self.settings))
+        return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
 
     @property
     def is_done(self) -> bool:

@@ -10,6 +10,10 @@ from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import HOME_KINDS, HomeKind, is_whole, require
+
+Home = int | tuple[int, HomeKind | None] | str | os.PathLike[str]
+"""Seed of `make_home`, seed and kind, or path of a complete map or of a folder of them."""
 
 MAP_SUFFIXES = (".yaml", ".yml", ".npz")
 """Files in a folder that are taken for maps."""
@@ -28,30 +32,34 @@ class HomeSource:
         Name of the home; its shard has it too.
     origin : int or str
         Seed of `make_home`, or absolute path of a complete map.
+    kind : HomeKind or None
+        Kind that `make_home` makes.
     """
 
     name: str
     origin: int | str
+    kind: HomeKind | None = None
 
     @property
     def record(self) -> dict[str, object]:
         """What a data set notes about the home."""
-        return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin}
+        kind = {"kind": self.kind} if self.kind else {}
+        return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin, **kind}
 
     def load(self) -> PartialMap:
         """Make or read the home; errors are those of `make_home` and `load_map`."""
-        return make_home(self.origin) if isinstance(self.origin, int) else load_map(self.origin)
+        return make_home(self.origin, self.kind) if isinstance(self.origin, int) else load_map(self.origin)
 
 
-def home_sources(homes: Iterable[int | str | os.PathLike[str]]) -> list[HomeSource]:
+def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
     """Name the homes to build from.
 
     Parameters
     ----------
     homes : iterable of int or path-like
-        Seeds of `make_home`; complete maps that `load_map` reads; folders of such maps, directly or each in a folder
-        with a `map.yaml` or `scene.xml`. A map has the name of its file, or of its folder if the file is called
-        map or scene.
+        Seeds of `make_home`, or pairs of a seed and a kind (None: drawn); complete maps that `load_map` reads; folders
+        of such maps, directly or each in a folder with a `map.yaml` or `scene.xml`. A map has the name of its file, or
+        of its folder if the file is called map or scene.
 
     Returns
     -------
@@ -77,9 +85,14 @@ def home_sources(homes: Iterable[int | str | os.PathLike[str]]) -> list[HomeSour
     return list(sources.values())
 
 
-def _sources(home: int | str | os.PathLike[str]) -> Iterator[HomeSource]:
+def _sources(home: Home) -> Iterator[HomeSource]:
     if isinstance(home, int) and not isinstance(home, bool):
         yield HomeSource(f"make_home({home})", home)
+    elif isinstance(home, tuple) and len(home) == 2:
+        seed, kind = home
+        require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
+        require(kind is None or kind in HOME_KINDS, "kind", kind, f"choose one of {HOME_KINDS}, or None.")
+        yield HomeSource(f"make_home({seed}, {kind})" if kind else f"make_home({seed})", seed, kind)
     elif isinstance(home, (str, os.PathLike)):
         path = Path(os.path.abspath(home))
         if not path.exists():

@@ -20,8 +20,9 @@ class LinkTable:
     ----------
     home : (N,) str array
         Name of the home, such as "make_home(10003)".
-    stage : (N,) int64 array
-        Steps that the robot has explored.
+    stage : (N,) float64 array
+        Steps that the robot has explored; a number below 1 is the fraction of the home's free area that it was to
+        observe.
     phi : LinkFeatures
         Features of the trace on the partial map, with their context.
     link_state : (N,) uint8 array of LinkState
@@ -44,7 +45,7 @@ class LinkTable:
     """
 
     home: NDArray[np.str_]
-    stage: NDArray[np.int64]
+    stage: NDArray[np.float64]
     phi: LinkFeatures
     link_state: NDArray[np.uint8]
     gain_db: NDArray[np.float64]
@@ -91,6 +92,11 @@ class LinkTable:
         columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in COLUMNS}
         complete_maps = {name: home for table in tables for name, home in table.complete_maps.items()}
         return cls(phi=phi, complete_maps=complete_maps, **columns)
+
+
+def stage_name(stage: float) -> str:
+    """Return what tables and messages call a stage: "50 steps", or "25 % observed"."""
+    return f"{stage:g} steps" if stage >= 1 or stage == 0 else f"{100 * stage:g} % observed"
 
 
 COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")

@@ -9,6 +9,7 @@ from typing import Any
 
 from sionna_partial.files import atomic_files
 from sionna_partial.training.evaluate import Difference, Evaluation, Row
+from sionna_partial.training.link_table import stage_name
 from sionna_partial.training.metrics import DEFINITIONS, Metrics
 
 REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")
@@ -96,7 +97,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         "rows": [{**asdict(row), "metrics": row.metrics.as_json()} for row in evaluation.rows],
         "differences": [_finite(asdict(difference)) for difference in evaluation.differences],
         "calibration": {
-            str(stage): {
+            f"{stage:g}": {
                 "links": calibration.state.links.tolist(),
                 "confidence": calibration.state.confidence.tolist(),
                 "accuracy": calibration.state.accuracy.tolist(),
@@ -185,7 +186,7 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
         if rows:
             where = "indoors" if receivers == "indoor" else "anywhere"
             title = f"Test homes, receivers {where}: {first} minus other, mean and standard error over homes"
-            header = ["steps", "other", "homes", "accuracy", "RMSE [dB]"]
+            header = ["stage", "other", "homes", "accuracy", "RMSE [dB]"]
             yield f"### {title}\n\n{markdown_table(header, map(_difference_cells, rows), names=2)}"
 
 
@@ -193,14 +194,14 @@ def _by_stage(rows: Sequence[Row]) -> str:
     """Tabulate accuracy and gain error, a line for each answer and a column for each stage."""
     stages, answers = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "answer"))
     found = {(row.answer, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
-    header = ["accuracy, RMSE", *(f"{stage} steps" for stage in stages)]
+    header = ["accuracy, RMSE", *(stage_name(stage) for stage in stages)]
     cells = ([answer, *(found.get((answer, stage), _MISSING) for stage in stages)] for answer in answers)
     return markdown_table(header, cells)
 
 
 def _section(title: str, rows: Sequence[Row]) -> str:
-    header = ["steps", "answer", *(label for label, _ in _COLUMNS.values())]
-    cells = ([str(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links)
+    header = ["stage", "answer", *(label for label, _ in _COLUMNS.values())]
+    cells = ([stage_name(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links)
     return f"### {title}\n\n{markdown_table(header, cells, names=2)}"
 
 
@@ -212,7 +213,7 @@ def _cells(metrics: Metrics) -> list[str]:
 def _difference_cells(each: Difference) -> list[str]:
     pairs = ((each.accuracy, each.accuracy_error, ".3f"), (each.rmse_db, each.rmse_error_db, ".2f"))
     texts = [f"{value:+{form}} ± {_text(error, form)}" for value, error, form in pairs]
-    return [str(each.stage), each.baseline, str(each.homes), *texts]
+    return [stage_name(each.stage), each.baseline, str(each.homes), *texts]
 
 
 def _text(value: float, form: str) -> str:

@@ -73,7 +73,7 @@ _FEATURES = {
 
 _COLUMNS = (
     _of_table("home", pa.string()),
-    _of_table("stage", pa.int64()),
+    _of_table("stage", pa.float64()),
     *(_position(field, axis) for field in ("tx_m", "rx_m") for axis in range(3)),
     *(
         _of_features(name, field, pa.uint8() if field == "link_state" else pa.float64())

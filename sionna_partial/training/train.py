@@ -192,6 +192,6 @@ def _card_metrics(evaluation: Evaluation) -> dict[str, Any]:
         stages: dict[str, dict[str, Any]] = {}
         for row in evaluation.select(homes="test", receivers=receivers, ends_seen="all"):
             if row.answer != "paper":
-                stages.setdefault(str(row.stage), {})[row.answer] = row.metrics.as_json()
+                stages.setdefault(f"{row.stage:g}", {})[row.answer] = row.metrics.as_json()
         metrics[name] = stages
     return metrics

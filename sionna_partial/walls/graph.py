@@ -4,39 +4,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.walls.bridges import find_bridges
 from sionna_partial.walls.chains import WallGraph
 
 _KEY = 1 << 32
 
 
-def wall_graph(partial: PartialMap, wall: NDArray[np.bool_], bridge_gap_m: float) -> WallGraph:
+def wall_graph(wall: NDArray[np.bool_]) -> WallGraph:
     """Connect the centres of boundary wall cells.
 
     Edges join wall cells that touch by a side, unless both blocks of two by two cells beside the edge are full, and
-    by a corner where a block holds just these two. Short gaps between facing wall ends are bridged, and spurs of one
-    cell are cut off. Single cells become squares.
+    by a corner where a block holds just these two. Spurs of one cell are cut off. Single cells become squares.
 
     Parameters
     ----------
-    partial : PartialMap
-        The map, for its FREE and UNKNOWN cells.
     wall : (ny, nx) bool array
         Cleaned wall cells.
-    bridge_gap_m : float
-        Longest gap that is bridged [m].
 
     Returns
     -------
     WallGraph
     """
-    posts = _lone_cells(wall)
-    graph = _cut_spurs(_index(_lattice_edges(wall), posts))
-    bridges = find_bridges(graph, partial, bridge_gap_m)
-    ends = graph.points[np.concatenate([graph.edges, bridges])]
-    lone = posts[~np.isin(_key(posts), _key(ends))]
-    return _index(np.concatenate([ends, _squares(lone)]), np.zeros((0, 2), dtype=np.int64))
+    graph = _cut_spurs(_index(_lattice_edges(wall)))
+    return _index(np.concatenate([graph.points[graph.edges], _squares(_lone_cells(wall))]))
 
 
 def lattice_graph(wall: NDArray[np.bool_]) -> WallGraph:
@@ -52,8 +41,7 @@ def lattice_graph(wall: NDArray[np.bool_]) -> WallGraph:
     -------
     WallGraph
     """
-    ends = np.concatenate([_lattice_edges(wall), _squares(_lone_cells(wall))])
-    return _index(ends, np.zeros((0, 2), dtype=np.int64))
+    return _index(np.concatenate([_lattice_edges(wall), _squares(_lone_cells(wall))]))
 
 
 def _lattice_edges(wall: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -86,15 +74,10 @@ def _squares(centres: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack([corners, np.roll(corners, -1, axis=1)], 2).reshape(-1, 2, 2)
 
 
-def _key(points: NDArray[np.int64]) -> NDArray[np.int64]:
-    return points[..., 1] * _KEY + points[..., 0]
-
-
-def _index(ends: NDArray[np.int64], more: NDArray[np.int64]) -> WallGraph:
-    """Graph of edges given by their ends (E, 2, 2), and of points without edges."""
-    key = _key(np.concatenate([ends.reshape(-1, 2), more]))
-    unique, inverse = np.unique(key, return_inverse=True)
-    edges = np.sort(inverse[: 2 * len(ends)].reshape(-1, 2), axis=1)
+def _index(ends: NDArray[np.int64]) -> WallGraph:
+    """Graph of edges given by their ends (E, 2, 2)."""
+    unique, inverse = np.unique(ends[..., 1].ravel() * _KEY + ends[..., 0].ravel(), return_inverse=True)
+    edges = np.sort(inverse.reshape(-1, 2), axis=1)
     edges = np.unique(edges, axis=0) if len(edges) else edges
     return WallGraph(np.stack([unique % _KEY, unique // _KEY], 1), edges.astype(np.int64))
 
@@ -107,4 +90,4 @@ def _cut_spurs(graph: WallGraph) -> WallGraph:
     junction = np.where(ends[:, 0] > ends[:, 1], graph.edges[:, 0], graph.edges[:, 1])
     spurs = np.bincount(junction[spur], minlength=len(degree))
     spur &= spurs[junction] < degree[junction]
-    return _index(graph.points[graph.edges[~spur]], graph.points[degree == 0])
+    return _index(graph.points[graph.edges[~spur]])

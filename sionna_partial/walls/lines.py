@@ -8,7 +8,7 @@ RAGGED_FACTOR = 2.0
 """How much farther than the tolerance a line may be from ragged walls."""
 
 _CORNERS = 64
-_RESIDUAL_COST = 16.0
+_RESIDUAL_COST = 3.0
 _RAGGED_TURNS = 4
 _RAGGED_SPACING = 10.0
 _LEVEL_CELLS = 1.0
@@ -24,9 +24,9 @@ def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.
     (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
     lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
     more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
-    notches of one cell then need no runs of their own. The split minimises the number of runs plus eight times their
-    residual variances [cells^2]; a line is the least-squares one where that keeps the tolerance, and a ragged one is
-    parallel to an axis where that moves its ends by half a cell at most.
+    notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
+    residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a
+    ragged one is parallel to an axis where that moves its ends by half a cell at most.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
         _accumulate(sums, element)
         length = abs(points[k + 1, i] - points[start, i])
         if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
-            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums)
+            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums) / max(tolerance, 0.25) ** 2
             if total < cost[k + 1] - 1e-12:
                 cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
 

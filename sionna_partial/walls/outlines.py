@@ -14,7 +14,7 @@ from sionna_partial.walls.graph import wall_graph
 from sionna_partial.walls.lines import fit_runs
 
 _REACH_CELLS = 1.0
-_OFFSET_CELLS = 0.6
+_OFFSET_CELLS = 1.0
 _MIN_SHIFT_CELLS = 0.25
 
 
@@ -44,49 +44,102 @@ class _Fit:
     lines: NDArray[np.float64]
 
 
-def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.2) -> Outlines:
+def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.5) -> Outlines:
     """Outline the walls of a map.
 
-    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Only WALL cells,
-    and the gaps of a cell or two between them, bear outlines.
+    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Of a wall that
+    was seen from one side, the face on that side is outlined. Only WALL cells, and short gaps between them, bear
+    outlines. An end that UNKNOWN cells follow reaches the border of the last cell. A map that is turned, mirrored,
+    padded with UNKNOWN cells or moved has the same outlines, transformed; only where a map equals its own mirror image
+    may they depend on the orientation.
 
     Parameters
     ----------
     partial : PartialMap
     tolerance_cells : float
         Largest distance of an outline from the lattice line through the cell centres [cells]. From 0.5 on, the
-        staircase of a tilted wall becomes one straight line. Twice as much is allowed where a wall is ragged, that is
-        where its face turns to and fro at least once in 10 cells.
+        staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
+        noise made thick and rough, and again twice as much where a face turns to and fro at least once in 10 cells.
     bridge_gap_m : float
-        Longest gap in a seen wall that is closed [m]; never more than two cells.
+        Longest gap of UNKNOWN cells in a seen wall that is closed [m].
 
     Returns
     -------
     Outlines
         Segments meet only at shared vertices.
     """
-    partial, corner = _crop(partial)
+    state, corner = _crop(partial.state, 1 + int(bridge_gap_m / partial.resolution_m + 1e-6))
+    turned, turn = _canonical(state)
+    cells = assemble(_lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m), 1.0)
+    vertices = turn.back(_extended(cells, turned)) + corner
+    return Outlines(vertices * partial.resolution_m, cells.segments)
+
+
+def _extended(outlines: Outlines, state: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Vertices [cells], with ends that UNKNOWN cells follow moved from the centre of the last cell to its border."""
+    vertices, segments = outlines.vertices_m.copy(), outlines.segments
+    ends, tails = segments.ravel(), segments[:, ::-1].ravel()
+    along = vertices[ends] - vertices[tails]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    column, row = np.clip(np.floor(vertices[ends] + along).astype(int), 0, np.array(state.shape)[::-1] - 1).T
+    is_open = (np.bincount(ends)[ends] == 1) & (state[row, column] == CellState.UNKNOWN)
+    tips = shapely.linestrings(np.stack([vertices[ends], vertices[ends] + 0.5 * along], axis=1)[is_open])
+    index = np.nonzero(is_open)[0]
+    tip, line = shapely.STRtree(np.append(shapely.linestrings(vertices[segments]), tips)).query(tips, "intersects")
+    own = (line == index[tip] // 2) | (line == len(segments) + tip)
+    index = np.delete(index, tip[~own])
+    vertices[ends[index]] += 0.5 * along[index]
+    return vertices
+
+
+def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> list[NDArray[np.float64]]:
+    """Polylines (n, 2) [cells] that meet only at equal vertices."""
     walls = wall_cells(partial, bridge_gap_m)
-    graph = wall_graph(partial, walls.cells, bridge_gap_m)
+    graph = wall_graph(walls.cells)
     chains = wall_chains(graph)
     places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
-    fits = [_fit(places, shift, chain, tolerance_cells) for chain in chains]
+    fits = [_fit(places, shift, chain, (1.0 + walls.noise) * tolerance_cells) for chain in chains]
     plain = [np.full(len(f.lines), graph.points[c.points[0], 0] % 2 == 0) for c, f in zip(chains, fits, strict=True)]
     while True:
         lines, runs = _polylines(graph, places, chains, fits, plain)
         if not _keep_crossing(lines, runs, plain):
-            return assemble([line + corner for line in lines], partial.resolution_m)
+            return lines
 
 
-def _crop(partial: PartialMap) -> tuple[PartialMap, NDArray[np.float64]]:
-    """Cut a map to its walls and one cell around, and say where its lower-left corner was [cells]."""
-    wall = partial.state == CellState.WALL
-    bounds = [np.nonzero(wall.any(axis=axis))[0] if wall.any() else np.zeros(1, dtype=int) for axis in (0, 1)]
-    (left, right), (bottom, top) = ((int(used[0]), int(used[-1])) for used in bounds)
-    part = partial.state[max(bottom - 1, 0) : top + 2, max(left - 1, 0) : right + 2]
-    missing = [[int(bottom == 0), int(top + 1 == wall.shape[0])], [int(left == 0), int(right + 1 == wall.shape[1])]]
-    state = np.pad(part, missing, constant_values=CellState.UNKNOWN)
-    return PartialMap(state, partial.resolution_m), np.array([left - 1.0, bottom - 1.0])
+def _crop(state: NDArray[np.uint8], margin: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+    """Cut cells to the walls and a margin around, and return where the lower-left corner was [cells]."""
+    row, column = (np.nonzero((state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
+    (bottom, top), (left, right) = ((used[0], used[-1]) if len(used) else (0, 0) for used in (row, column))
+    padded = np.pad(state, margin, constant_values=CellState.UNKNOWN)
+    part = padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1]
+    return part, np.array([left, bottom], dtype=float) - margin
+
+
+@dataclass(frozen=True)
+class _Turn:
+    """Transposes a grid or not, then flips rows and columns or not."""
+
+    transpose: bool
+    flips: tuple[bool, bool]
+    shape: tuple[int, int]
+
+    def apply(self, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        turned = state.T if self.transpose else state
+        return np.ascontiguousarray(turned[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1])
+
+    def back(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (n, 2) of the turned grid, in the original one."""
+        height, width = self.shape[::-1] if self.transpose else self.shape
+        flipped = np.where(self.flips[::-1], np.array([width, height]) - points, points)
+        return flipped[:, ::-1] if self.transpose else flipped
+
+
+def _canonical(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], _Turn]:
+    """Turn or mirror a grid to its one orientation of the smallest bytes: the outlines turn with the map."""
+    turns = [_Turn(t, (r, c), state.shape) for t in (False, True) for r in (False, True) for c in (False, True)]
+    turned = [turn.apply(state) for turn in turns]
+    best = min(range(8), key=lambda k: (turned[k].shape, turned[k].tobytes()))
+    return turned[best], turns[best]
 
 
 def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArray[np.float64]:

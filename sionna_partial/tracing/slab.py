@@ -49,12 +49,25 @@ def reflection_loss_db(
     require(polarisation in ("te", "tm"), "polarisation", polarisation, "choose 'te' or 'tm'.")
     angle = np.asarray(angle_deg, dtype=np.float64)
     require(bool(np.all((angle >= 0.0) & (angle <= 90.0))), "angle_deg", angle_deg, "give degrees from 0 to 90.")
-    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
-    eta = np.asarray(permittivity) - 1j * loss
-    cosine = np.cos(np.radians(angle))
-    root = np.sqrt(eta - np.sin(np.radians(angle)) ** 2)
-    first, second = (cosine, root) if polarisation == "te" else (eta * cosine, root)
-    face = (first - second) / (first + second)
-    inside = np.exp(-4j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
+    te, tm = reflection_coefficients(
+        permittivity, conductivity_s_m, thickness_m, frequency_hz, np.cos(np.radians(angle))
+    )
     with np.errstate(divide="ignore"):
-        return -20.0 * np.log10(np.abs(face * (1.0 - inside) / (1.0 - face**2 * inside)))
+        return -20.0 * np.log10(np.abs(te if polarisation == "te" else tm))
+
+
+def reflection_coefficients(
+    permittivity: ArrayLike,
+    conductivity_s_m: ArrayLike,
+    thickness_m: ArrayLike,
+    frequency_hz: float,
+    cosine: ArrayLike,
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return the reflection coefficients of a slab, TE and TM (arguments as above, with the cosine of the angle)."""
+    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
+    eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
+    root = np.sqrt(eta - (1.0 - cosine**2))
+    inside = np.exp(-4j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
+    faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
+    te, tm = (face * (1.0 - inside) / (1.0 - face**2 * inside) for face in faces)
+    return te, tm

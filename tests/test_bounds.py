@@ -1,0 +1,118 @@
+"""Bounds of the power of candidates hold for what Sionna RT finds, and what is left out changes no link."""
+
+import numpy as np
+import pytest
+from extruded import ROOM, SPLINTERS, drawn, extrude
+
+import sionna_partial as sp
+from sionna_partial.constants import LinkState
+from sionna_partial.tracing.bounds import LEVELS, dropped_power, level_of, levels_needed, strengths_of, utd_terms
+from sionna_partial.tracing.slab import reflection_coefficients
+
+DRYWALL = np.array([2.94, 0.1226, 0.1])
+
+
+def _indirect_power(links: sp.TracedLinks) -> np.ndarray:
+    indirect = (links.interactions > 0).any(axis=1)
+    return np.bincount(links.path_rx[indirect], np.abs(links.a[indirect]) ** 2, len(links.rx))
+
+
+class TestReflection:
+    def test_no_angle_reflects_more_than_its_bound(self) -> None:
+        cosine = np.random.default_rng(0).uniform(0.0, 1.0, 20_000)
+        table = strengths_of(DRYWALL, 28e9, 1).reflection
+        bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
+        for coefficient in reflection_coefficients(*DRYWALL, 28e9, cosine):
+            assert (np.abs(coefficient) ** 2 <= bound).all()
+
+    def test_it_is_not_far_above(self) -> None:
+        cosine = np.linspace(0.0, 1.0, 1000)
+        table = strengths_of(DRYWALL, 28e9, 1).reflection
+        bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
+        largest = np.max([np.abs(each) for each in reflection_coefficients(*DRYWALL, 28e9, cosine)], axis=0) ** 2
+        assert np.median(bound / np.maximum(largest, 1e-9)) < 1.1
+
+
+def test_a_term_is_at_most_half_the_incident_field_at_its_shadow_boundary() -> None:
+    terms = np.empty(4)
+    utd_terms(1.5 * np.pi, 0.7, 0.7 + np.pi, 3.0, terms)
+    assert terms[1] == pytest.approx(3.0)
+    assert (terms < 3.0 + 1e-9).all()
+
+
+class TestLevels:
+    def test_levels_fall_with_the_power(self) -> None:
+        levels = [level_of(power) for power in 10.0 ** -np.arange(0.0, 25.0, 0.1)]
+        assert levels == sorted(levels)
+        assert (levels[0], levels[-1], level_of(0.0)) == (1, LEVELS - 1, LEVELS - 1)
+
+    def test_what_is_beyond_the_needed_levels_is_at_most_what_may_be_missing(self) -> None:
+        power = np.random.default_rng(1).uniform(0.0, 1.0, (50, LEVELS)) ** 8
+        allowed = np.random.default_rng(2).uniform(0.0, 5.0, 50)
+        needed = levels_needed(power, allowed)
+        for row, count, most in zip(power, needed, allowed, strict=True):
+            assert row[count:].sum() <= most
+            assert count == 1 or row[count - 1 :].sum() > most
+
+    def test_a_link_without_paths_may_miss_what_no_receiver_notices(self) -> None:
+        assert dropped_power(np.array([0.0, 1e-8]), 0.1) == pytest.approx([1e-15, 1e-8 * (10**0.01 - 1)])
+
+
+@pytest.mark.parametrize("walls", [ROOM, np.concatenate([ROOM, SPLINTERS])], ids=["room", "splinters"])
+def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, tmp_path) -> None:
+    """Sum of |a|^2 over all paths of a link, against the sum of all bounds."""
+    from extruded import everything
+
+    from sionna_partial.tracing.beams import trace_beams
+    from sionna_partial.tracing.candidates import Room, specular_candidates
+    from sionna_partial.tracing.diffraction import DiffractionCandidates, find_wedges
+    from sionna_partial.tracing.scene import SHAPES, write_scene
+    from sionna_partial.tracing.solver import SceneSolver
+
+    geometry = extrude(walls)
+    tx, rx = np.array([1.07, 1.93, 1.2]), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4], [2.2, 3.4, 1.2]])
+    room, wedges = Room.of(geometry, tx, rx), find_wedges(geometry, open_ends=False)
+    solver = SceneSolver(write_scene(geometry, tmp_path, offset_m=(0.0, 0.0)), SHAPES, sp.TraceSettings())
+    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], 4)
+    for kind in ("reflected", "diffracted"):
+        strengths = everything(len(rx))
+        blocks = (
+            specular_candidates(beams, geometry, room, 4, strengths, np.zeros(len(beams.pair_rx), np.uint8))
+            if kind == "reflected"
+            else DiffractionCandidates(geometry, wedges, room, 3).blocks(strengths)
+        )
+        paths = [solver.verify(block, tx, rx)[0] for block, _ in blocks if len(block.rx)]
+        found = sum(np.bincount(each.path_rx, np.abs(each.a) ** 2, len(rx)) for each in paths)
+        bound = strengths.power.sum(axis=1)
+        assert (found <= bound * (1 + 1e-3)).all()
+        assert (found > 0).all()
+
+
+@pytest.mark.parametrize("tolerance_db", [0.02, 0.1, 0.5])
+def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance(tolerance_db: float) -> None:
+    plan = drawn(
+        "############ #..........# #.##..#....# #....#.....# #.#....##..# #..#...#...# #..........# ############", 0.6
+    )
+    tx, rx = (1.3, 1.2, 1.5), [[x, y, 1.4] for x in (0.9, 2.3, 3.8, 5.2, 6.3) for y in (0.8, 2.1, 3.5, 4.0)]
+    rx = [place for place in rx if plan.state_at(np.array([place]))[0] == 0]
+    every, some = (
+        sp.trace_links(plan, tx, rx, settings=sp.TraceSettings(power_tolerance_db=each)) for each in (0.0, tolerance_db)
+    )
+    assert len(some.a) < 0.7 * len(every.a)
+    assert some.link_state.tolist() == every.link_state.tolist()
+    assert set(every.link_state.tolist()) == {LinkState.LOS, LinkState.NLOS}
+    lost_db = 10 * np.log10(_indirect_power(every) / _indirect_power(some))
+    assert (lost_db >= -1e-6).all()
+    assert lost_db.max() <= tolerance_db
+    assert np.abs(every.gain_db - some.gain_db).max() <= tolerance_db
+
+
+def test_a_receiver_keeps_its_paths_whoever_else_is_there() -> None:
+    plan = drawn("######### #.......# #..##...# #.......# #########", 0.7)
+    rx = np.array([[x, 1.1, 1.5] for x in np.linspace(1.0, 5.4, 12)])
+    together = sp.trace_links(plan, (1.6, 2.6, 1.5), rx)
+    for index in (0, 7):
+        alone = sp.trace_links(plan, (1.6, 2.6, 1.5), rx[[index]])
+        mine = together.path_rx == index
+        np.testing.assert_array_equal(alone.a, together.a[mine])
+        np.testing.assert_array_equal(alone.vertices_m, together.vertices_m[mine])
