@@ -2,11 +2,10 @@
 
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from numbers import Integral, Real
 from typing import Literal, TypeVar, get_args
-
-import numpy as np
 
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
@@ -84,7 +83,7 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
 
 def are_stages(value: object) -> bool:
     """Whether `value` has increasing whole numbers (of steps), or increasing fractions in [0, 1), one at least."""
-    stages = list(value) if np.iterable(value) else []
+    stages = list(value) if isinstance(value, Iterable) else []
     numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
     return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))

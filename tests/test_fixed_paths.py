@@ -402,7 +402,7 @@ class TestNothingThere:
         shares = [share for share, _ in calls]
         assert shares == sorted(shares)
         assert shares[-1] == pytest.approx(1.0)
-        assert {message for _, message in calls} == {"listing paths", "verifying reflections", "verifying diffractions"}
+        assert {message for _, message in calls} == {"verifying reflections", "verifying diffractions", "traced"}
 
 
 class TestErrors:

@@ -26,7 +26,7 @@ OPEN = sp.SceneSettings(floor_extent="none")
 FLOOR = sp.SceneSettings(floor_extent="map", ceiling=False, material=sp.Material(thickness_m=0.02))
 TX = np.array([1.03, 1.92, 1.4])
 RX = np.array([[3.2, 2.1, 1.1], [1.5, 3.3, 0.4], [5.1, 0.7, 2.2], [1.1, 1.8, 0.2]])
-SETTINGS = sp.TraceSettings(max_depth=2)
+SETTINGS = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
 
 
 def all_slopes(found: GainGradients) -> NDArray[np.float64]:

@@ -253,6 +253,14 @@ class TestRefused:
         ):
             home_links(replace(home, state=state), "ruin", SETTINGS)
 
+    def test_home_that_is_cut_off_at_the_border_of_its_grid_is_closed_there(
+        self, home: PartialMap, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        column = int(np.flatnonzero((home.state == CellState.FREE).any(axis=0))[-3])
+        table = home_links(replace(home, state=home.state[:, :column]), "cut", SETTINGS)
+        assert len(table) > 0
+        assert "home 'cut' has free cells at the border of its grid" in caplog.text
+
     def test_table_without_context(self) -> None:
         table = make_table(homes=1, links=3)
         with pytest.raises(PredictorError, match=r"phi has no context: give the LinkFeatures of link_features\."):

@@ -142,6 +142,8 @@ class PathScene:
             parts += part.parts
             if progress is not None:
                 progress(share, message)
+        if progress is not None:
+            progress(1.0, "traced")
         return FixedPaths(self, self.parameters(tx_m), rx_m, parts)
 
     def blocks(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> Iterator[tuple["FixedPaths", float, str]]:

@@ -1,6 +1,7 @@
 """One home -> LinkTable: a robot explores it, and each link is traced on what was seen at every stage and in truth."""
 
 import hashlib
+import logging
 import math
 from dataclasses import dataclass, replace
 
@@ -26,6 +27,8 @@ _LIDAR_FRACTION = 2 / 3
 
 MAX_DRAWS = 1000
 """Number of times that places which cannot be used are drawn again."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     Parameters
     ----------
     home : PartialMap
-        A complete home.
+        A complete home. Where its free cells reach the border of the grid, walls are put around them.
     name : str
         Name of the home, from which its seed is made.
     settings : DatasetSettings, optional
@@ -80,11 +83,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     """
     require_map("home", home)
     settings = settings or DatasetSettings()
-    if not home.is_complete:
-        raise MapError(
-            f"home {name!r} is not complete, a free cell touches an unknown one: give maps of whole homes, whose free "
-            "cells end at walls."
-        )
+    home = _closed(home, name)
     area = map_area(home, settings.margin_m)
     rng = np.random.default_rng(_home_seed(name, settings))
     maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=home_sensor(name, settings))
@@ -94,6 +93,22 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     return LinkTable.concatenate(
         _stage_links(name, area, stage, partial, phi, places, truth) for stage, partial, phi in seen
     )
+
+
+def _closed(home: PartialMap, name: str) -> PartialMap:
+    """Return a complete home, with a ring of walls around its grid if it lacks nothing else."""
+    if home.is_complete:
+        return home
+    x, y = home.origin_m
+    origin_m = (x - home.resolution_m, y - home.resolution_m)
+    closed = replace(home, state=np.pad(home.state, 1, constant_values=CellState.WALL), origin_m=origin_m)
+    if not closed.is_complete:
+        raise MapError(
+            f"home {name!r} is not complete, a free cell touches an unknown one: give maps of whole homes, whose free "
+            "cells end at walls."
+        )
+    _log.warning("home %r has free cells at the border of its grid: they are taken to end at walls there", name)
+    return closed
 
 
 def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
