@@ -22,7 +22,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.unobserved import GRAZE, in_cells, wall_shares
+from sionna_partial.learning.unobserved import GRAZE, in_cells, map_line_shares
 from sionna_partial.maps.partial_map import PartialMap
 
 _ASIDE_CELLS = 1.5
@@ -60,7 +60,9 @@ def _beside_walls(partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[
     along = ends - starts
     lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
     aside = _ASIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
-    left, right = (wall_shares(partial.state, starts + step, ends + step) > GRAZE for step in (aside, -aside))
+    left, right = (
+        map_line_shares(partial, starts + step, ends + step)[:, CellState.WALL] > GRAZE for step in (aside, -aside)
+    )
     return left & right
 
 

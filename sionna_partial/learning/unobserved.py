@@ -1,16 +1,15 @@
 """How much of straight lines has not been observed: the grid integral behind d_unobs (paper, Section III-C)."""
 
 import itertools
-import os
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.cores import core_count
+from sionna_partial.maps.partial_map import PartialMap, alike_cells
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
@@ -49,7 +48,7 @@ def unobserved_lengths_m(
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     if partial.is_complete:
         return np.zeros(len(end_m))
-    shares = unknown_shares(partial.state, in_cells(partial, start_m), in_cells(partial, end_m))
+    shares = map_line_shares(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, CellState.UNKNOWN]
     return shares * np.linalg.norm(end_m - start_m, axis=1)
 
 
@@ -72,7 +71,7 @@ def walled_lengths_m(
         Between 0 and the lengths of the segments [m].
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
-    shares = wall_shares(partial.state, in_cells(partial, start_m), in_cells(partial, end_m))
+    shares = map_line_shares(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, CellState.WALL]
     return shares * np.linalg.norm(end_m - start_m, axis=1)
 
 
@@ -81,26 +80,26 @@ def in_cells(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.f
     return np.round((points_m[..., :2] - partial.origin_m) / partial.resolution_m, 6)
 
 
-def unknown_shares(
-    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] that are unknown."""
-    return line_shares(state, starts, ends)[:, CellState.UNKNOWN]
-
-
-def wall_shares(
-    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the shares (N,), in [0, 1], of the segments from `starts` to `ends` (N, 2) [cells] in known walls."""
-    return line_shares(state, starts, ends)[:, CellState.WALL]
+def map_line_shares(partial: PartialMap, starts: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return `line_shares` on the cells of a map."""
+    return _shares(partial.state, partial.alike_cells, starts, ends)
 
 
 def line_shares(
     state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the shares (N, 3), in [0, 1], of segments in cells of each CellState; all outside the grid is unknown."""
-    shares, alike = np.zeros((len(ends), len(CellState))), _alike_cells(state)
-    bounds = np.linspace(0, len(ends), 1 + min(len(os.sched_getaffinity(0)), 1 + len(ends) // _SEGMENTS_OF_CORE))
+    """Return the fractions (N, 3), in [0, 1], of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
+
+    All cells outside the grid are unknown.
+    """
+    return _shares(state, alike_cells(state), starts, ends)
+
+
+def _shares(
+    state: NDArray[np.uint8], alike: NDArray[np.int32], starts: NDArray[np.float64], ends: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    shares = np.zeros((len(ends), len(CellState)))
+    bounds = np.linspace(0, len(ends), 1 + min(core_count(), 1 + len(ends) // _SEGMENTS_OF_CORE))
     blocks = [slice(int(low), int(high)) for low, high in itertools.pairwise(bounds)]
 
     def fill(block: slice) -> None:
@@ -112,16 +111,6 @@ def line_shares(
         with ThreadPoolExecutor(len(blocks)) as pool:
             list(pool.map(fill, blocks))
     return np.clip(shares, 0.0, 1.0)
-
-
-def _alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return how many cells in every direction, corners included, are in the state of the cell."""
-    alike = np.full(state.shape, max(state.shape), dtype=np.int32)
-    for kind in CellState:
-        cells = state == kind
-        if cells.any() and not cells.all():
-            alike[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
-    return alike
 
 
 @njit(cache=True, nogil=True)

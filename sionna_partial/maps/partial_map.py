@@ -7,6 +7,7 @@ from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, PositionError
@@ -126,6 +127,11 @@ class PartialMap:
         touches = reached[2:, 1:-1] | reached[:-2, 1:-1] | reached[1:-1, 2:] | reached[1:-1, :-2]
         return bool(free.any() and not (free & touches).any())
 
+    @cached_property
+    def alike_cells(self) -> NDArray[np.int32]:
+        """How many cells in every direction, corners included, are in the state of each cell (ny, nx)."""
+        return alike_cells(self.state)
+
     @property
     def observed_fraction(self) -> float:
         """Share of the interior that has been seen, in [0, 1].
@@ -228,6 +234,16 @@ class PartialMap:
                 place = tuple(float(v) for v in flat[index])
                 raise PositionError(f"{which} = {place}{more} {what}: {remedy}")
         return points
+
+
+def alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Return how many cells in every direction, corners included, are in the state of the cell."""
+    alike = np.full(state.shape, max(state.shape), dtype=np.int32)
+    for kind in CellState:
+        cells = state == kind
+        if cells.any() and not cells.all():
+            alike[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
+    return alike
 
 
 def require_map(name: str, value: object) -> None:
