@@ -63,7 +63,8 @@ def compare(partial: sp.PartialMap, receivers: int, rays: int, *, diffraction: b
     heights = np.append(1.5, rng.uniform(0.8, 2.0, len(places) - 1))
     tx, rx = np.append(places[0], heights[0]), np.column_stack([places, heights])[1:]
     depth = 3 if diffraction else 6
-    links = sp.trace_links(partial, tx, rx, settings=sp.TraceSettings(max_depth=depth, diffraction=diffraction))
+    settings = sp.TraceSettings(max_depth=depth, diffraction=diffraction, power_tolerance_db=0.0)
+    links = sp.trace_links(partial, tx, rx, settings=settings)
     with TemporaryDirectory() as folder:
         sp.export_scene(partial, folder + "/scene")
         stock = isolated(true_paths, folder + "/scene", tx, rx, rays=rays, max_depth=depth, diffraction=diffraction)

@@ -33,7 +33,7 @@ NEAREST_M = 0.05
 
 CELLS = sp.SceneSettings(outline="cells")
 WALLS_ALONE = sp.SceneSettings(outline="cells", floor_extent="none", ceiling=False)
-REFERENCE = sp.TraceSettings(max_depth=3, diffraction_walls=1)
+REFERENCE = sp.TraceSettings(max_depth=3, diffraction_walls=1, power_tolerance_db=0.0)
 TRIALS = {
     "defaults, as written": (False, None, None),
     "defaults, at centres": (True, None, None),
@@ -180,7 +180,7 @@ def print_orders(homes: Sequence[Reference]) -> None:
     """
     links, reached = Counter[str](), Counter[str]()
     for reference in homes:
-        trial = trace(reference, True, sp.TraceSettings(max_depth=3), WALLS_ALONE)
+        trial = trace(reference, True, sp.TraceSettings(max_depth=3, power_tolerance_db=0.0), WALLS_ALONE)
         kinds = [kind for each in trial.links for kind in simplest(each)]
         for kind, state, found in zip(kinds, trial.truth, trial.found, strict=True):
             if found != sp.LinkState.LOS:

@@ -83,6 +83,7 @@ class TestPredict:
             "scene_settings": SceneSettings(),
             "trace_settings": TraceSettings(),
             "receivers": "indoor",
+            "memory_gb": 2.0,
         }
         names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
         assert [(coverage, path.name) for coverage, path in calls[1:]] == [("coverage", name) for name in names]
@@ -90,7 +91,7 @@ class TestPredict:
 
     def test_every_option(self, map_path: Path, calls: list[Any], tmp_path: Path) -> None:
         options = "--rx-height 1 --spacing 0.3 --frequency 60e9 --max-depth 2 --predictor paper --material 4,0.1,0.2"
-        options += " --receivers anywhere"
+        options += " --receivers anywhere --no-diffraction --wall-height 2.7 --memory 1.5"
         result = run(
             "predict",
             map_path,
@@ -107,15 +108,17 @@ class TestPredict:
             ".CSV",
         )
         assert result.exit_code == 0, result.output
-        _, tx, settings = calls[0]
+        scene, tx, settings = calls[0]
+        assert scene.wall_height_m == 2.7
         assert tx == (1.0, -0.5, 2.0)
         assert settings == {
             "rx_height_m": 1.0,
             "spacing_m": 0.3,
             "predictor": "paper",
             "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2)),
-            "trace_settings": TraceSettings(frequency_hz=60e9, max_depth=2),
+            "trace_settings": TraceSettings(frequency_hz=60e9, max_depth=2, diffraction=False),
             "receivers": "anywhere",
+            "memory_gb": 1.5,
         }
         assert [path.name for _, path in calls[1:]] == ["coverage.nc", "coverage.csv"]
 
@@ -238,8 +241,8 @@ class TestPredict:
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path, "--strict", "--up", "y", "--height-band", 0.5, 2)
         assert read == [
-            (tmp_path, {"strict": False, "height_band_m": None, "up": None}),
-            (tmp_path, {"strict": True, "height_band_m": (0.5, 2.0), "up": "y"}),
+            (tmp_path, {"strict": False, "wall_height_m": None, "height_band_m": None, "up": None}),
+            (tmp_path, {"strict": True, "wall_height_m": None, "height_band_m": (0.5, 2.0), "up": "y"}),
         ]
 
     def test_warnings_are_one_line_each(

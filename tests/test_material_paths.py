@@ -16,7 +16,7 @@ from sionna_partial.tracing.fixed_paths import PathScene
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 from sionna_partial.tracing.trace import trace_links
 
-SETTINGS = sp.TraceSettings(max_depth=2)
+SETTINGS = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
 TX = TX_M + np.array([[0.0, 0.0, 0.0]] * 3 + [[0.31, 0.11, 0.2]])
 RX = np.array([*RX_M[:3], RX_M[1]])
 
@@ -128,7 +128,7 @@ def test_each_material_of_a_mesh_counts_for_itself() -> None:
     kinds = (sp.Material(4.0, 0.2, 0.02), sp.Material(6.0, 1.0, 0.03))
     mesh = merged_mesh(vertices, triangles, np.repeat([0, 1], 12), kinds)
     partial = mesh_map(mesh, MeshReading(observed=OBSERVED, resolution_m=0.1))
-    scene = PathScene(partial, settings=sp.TraceSettings(max_depth=2))
+    scene = PathScene(partial, settings=sp.TraceSettings(max_depth=2, power_tolerance_db=0.0))
     tx, rx = np.tile([1.5, 1.0, 1.5], (2, 1)), np.array([[2.2, 2.9, 1.2], [4.0, 3.5, 1.5]])
     paths = find_material_paths(scene, scene.materials, tx, rx, quiet)
     new = (sp.Material(2.5, 0.1, 0.02), sp.Material(9.0, 0.05, 0.03))
@@ -137,7 +137,7 @@ def test_each_material_of_a_mesh_counts_for_itself() -> None:
         replace(partial, mesh=replace(mesh_of(partial), materials=new)),
         tx[0],
         rx,
-        settings=sp.TraceSettings(max_depth=2),
+        settings=sp.TraceSettings(max_depth=2, power_tolerance_db=0.0),
     )
     np.testing.assert_allclose(link_gains_db(power, paths.link, 2), expected.gain_db, atol=0.15)
     many = paths.powers(np.array([[4.0, 6.0], [2.5, 9.0]]), np.array([[0.2, 1.0], [0.1, 0.05]]))

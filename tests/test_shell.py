@@ -12,7 +12,7 @@ class TestProgress:
         with show_progress() as report:
             for now[0], share in ((130.0, 0.1), (161.0, 0.25), (200.0, 0.5), (222.0, 0.75)):
                 report(share, f"at {now[0]:g}")
-        assert capsys.readouterr().err.splitlines() == ["25% at 161", "75% at 222"]
+        assert capsys.readouterr().err.splitlines() == ["25% at 161 0:03:03 left", "75% at 222 0:00:41 left"]
 
     def test_an_error_stands_alone(self, capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(ValueError, match="float"), show_progress() as report:

@@ -50,6 +50,7 @@ class MeasuredBuilding:
     ) -> MaterialPaths:
         """Find the paths of the measured links."""
         reflecting = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in self.start.values()]
+        settings = replace(settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
         scene = PathScene(self.with_materials(reflecting), settings=settings, scene_settings=scene_settings)
         return find_material_paths(
             scene, tuple(self.start), measured.tx, measured.rx, lambda share, what: report(0.02 + 0.28 * share, what)
