@@ -6,7 +6,8 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
-LEARNED_FROM := build/predictor/{camera,lidar,wide,errors}
+LEARNED_FROM := build/predictor/{camera,mixed,large}
+FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
 .PHONY: help demo test lint format lock scenes predictor wheel wheel-check clean
 
@@ -38,14 +39,13 @@ scenes: $(READY) ## Make the demo scenes again (scenes/)
 
 predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
 	@rm -rf build/predictor
-	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 700 --first-seed 10000
-	@$(BIN)/sionna-partial dataset build/predictor/lidar --homes 350 --first-seed 10700 --field-of-view 360 --range 8
-	@$(BIN)/sionna-partial dataset build/predictor/wide --homes 350 --first-seed 11050 --field-of-view 120 --range 5
-	@$(BIN)/sionna-partial dataset build/predictor/errors --homes 350 --first-seed 11400 \
-		--range-noise 0.03 --drift 0.01 --missed-walls 0.05
+	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 300 --first-seed 100000
+	@$(BIN)/sionna-partial dataset build/predictor/mixed --homes 200 --first-seed 110000 --mixed-sensors $(FRACTIONS)
+	@$(BIN)/sionna-partial dataset build/predictor/large --homes 135 --first-seed 200000 --mixed-sensors $(FRACTIONS) \
+		--kind floor --kind floor --kind hall --kind warehouse --short-links 0.5
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
-			--networks $$networks --test-share 0.15 --out build/predictor/$$networks; \
+			--networks $$networks --passes 8 --test-share 0.1 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/

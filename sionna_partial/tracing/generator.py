@@ -36,7 +36,7 @@ Finder = Callable[[SceneSolver, NDArray[np.float64], NDArray[np.float64]], Itera
 """Finds the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m], block by block."""
 
 CANDIDATES_AT_ONCE = 100_000
-"""Number of candidates that Sionna RT verifies together, about, which bounds the memory."""
+"""Number of candidates that Sionna RT verifies together, which bounds the memory."""
 
 REFLECTION, DIFFRACTION = 1, 8
 """Sionna RT's `InteractionType.SPECULAR` and `DIFFRACTION`."""
@@ -155,7 +155,7 @@ def _plan_paths(
         strengths = bounds._replace(first=done, last=np.where(wanted > done, wanted, 0), power=bounds.power[:0])
         for found, paths, share, message in _verified(solver, candidates.blocks(strengths), tx_m, rx_m):
             indirect = ~paths.is_direct
-            power += np.bincount(paths.path_rx[indirect], np.abs(paths.a[indirect]) ** 2, len(rx_m))
+            np.add.at(power, paths.path_rx[indirect], np.abs(paths.a[indirect]) ** 2)
             yield found, paths, low + (high - low) * share, message
         done, wanted = wanted, levels_needed(bounds.power, dropped_power(power, tolerance_db))
 
@@ -221,8 +221,10 @@ def _verified(
         full = sum(len(each.rx) for each in waiting) >= CANDIDATES_AT_ONCE
         if waiting and (candidates is None or full or not candidates.is_like(waiting[0])):
             together = Candidates.concatenate(waiting)
-            paths, rows = solver.verify(together, tx_m, rx_m)
-            yield together.rows(rows), paths, share, doing
+            for start in range(0, len(together.rx), CANDIDATES_AT_ONCE):
+                part = together.rows(np.arange(start, min(start + CANDIDATES_AT_ONCE, len(together.rx))))
+                paths, rows = solver.verify(part, tx_m, rx_m)
+                yield part.rows(rows), paths, share, doing
             waiting = []
         if candidates is not None and len(candidates.rx):
             waiting.append(candidates)
