@@ -148,8 +148,8 @@ class TestEvaluate:
     def test_progress(self, table):
         calls = []
         evaluate(trained_on("home 0"), table, baselines=fitted_baselines(), progress=lambda *call: calls.append(call))
-        assert calls[0] == (0.0, "measuring on test homes after 0 steps")
-        assert calls[-1] == (0.75, "measuring on train homes after 100 steps")
+        assert calls[0] == (0.0, "measuring on test homes at 0 steps")
+        assert calls[-1] == (0.75, "measuring on train homes at 100 steps")
 
 
 class TestHomeScores:

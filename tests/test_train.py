@@ -105,7 +105,7 @@ class TestTrain:
         settings = dataclasses.replace(UNTRAINED, networks="map", passes=1)
         seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
         assert seeing.predictor.settings == settings
-        assert {"map_network", "link_network"} <= set(seeing.predictor.model.output)
+        assert {"near_map_network", "far_map_network", "link_network"} <= set(seeing.predictor.model.output)
         assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")
         links = table.take(~table.anywhere & np.isin(table.home, seeing.test_homes))
         (row,) = seeing.evaluation.select(receivers="indoor", ends_seen="all", answer="predictor")
