@@ -179,7 +179,7 @@ def predict_map(
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     tx_m = _transmitter(partial, tx)
     grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
-    complete = partial.is_complete
+    complete = partial.is_complete and partial.state_at(tx_m) != CellState.UNKNOWN
     chosen = None if complete and predictor is None else _predictor(predictor)
     model = None if complete else chosen
     if model is not None:

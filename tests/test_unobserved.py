@@ -285,3 +285,21 @@ def test_agrees_with_dense_samples(state, start, end):
     crossings = sum(state.shape) + 2
     tolerance_m = crossings * whole_m / count + 1e-9
     assert length_m(partial, start_m, end_m) == pytest.approx(share * whole_m, abs=tolerance_m)
+
+
+class TestCompleteMap:
+    """A closed room, and unknown space around it in which another part of the building may be."""
+
+    ROOM = extruded.drawn("??????? ?#####? ?#...#? ?#...#? ?#####? ??????? ???????", 1.0)
+
+    def test_nothing_is_unobserved_from_a_known_cell(self) -> None:
+        inside, outside = np.array([3.5, 4.5, 1.5]), np.array([[2.5, 3.5, 1.5], [0.5, 0.5, 1.5]])
+        assert self.ROOM.is_complete
+        assert unobserved_lengths_m(self.ROOM, inside, outside).tolist() == [0.0, 0.0]
+        assert unobserved_lengths_m(self.ROOM, outside, inside).tolist() == [0.0, 0.0]
+
+    def test_between_unknown_cells_it_is_what_it_is(self) -> None:
+        start, end = np.array([0.5, 0.5, 1.5]), np.array([[6.5, 0.5, 1.5], [3.5, 6.5, 1.5]])
+        lengths_m = unobserved_lengths_m(self.ROOM, start, end)
+        assert lengths_m[0] == pytest.approx(6.0)
+        assert 0.0 < lengths_m[1] < np.hypot(3.0, 6.0)

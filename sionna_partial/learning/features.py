@@ -180,7 +180,8 @@ def unobserved_distance_m(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> 
     """Measure how much of the direct line has not been observed: d_unobs of the paper (Section III-C).
 
     This is the length of the segment from transmitter to receiver inside unknown cells, exact to rounding. Everything
-    outside the grid is unknown. On a complete map nothing unknown can be reached, and the length is 0 by definition.
+    outside the grid is unknown. On a complete map nothing unknown can be reached from a known cell, and the length
+    is 0 by definition where an end is in one.
     A segment along the border of cells is in the freest of them, as in `PartialMap.state_at`.
 
     Parameters

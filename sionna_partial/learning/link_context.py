@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.unobserved import unobserved_lengths_m, walled_lengths_m
+from sionna_partial.learning.unobserved import is_enclosed, unobserved_lengths_m, walled_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import TracedLinks, path_gain_db
@@ -96,8 +96,9 @@ class LinkContext:
 
     @cached_property
     def complete(self) -> NDArray[np.bool_]:
-        """Whether the map of each link (N,) is complete."""
-        return np.array([each.is_complete for each in self.maps], dtype=bool)[self.map_index]
+        """Whether the map of each link (N,) is complete, and knows one of its ends."""
+        complete = np.array([each.is_complete for each in self.maps], dtype=bool)[self.map_index]
+        return complete & (self.tx_seen | self.rx_seen)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
         """Return the links that an index array, a mask (N,) or a slice selects."""
@@ -205,10 +206,14 @@ def path_unobserved_m(
     Returns
     -------
     (P,) float64 array
-        [m]; 0 on a complete map.
+        [m]; 0 for links that a complete map encloses.
     """
     total_m = np.zeros(len(start_m))
-    if partial.is_complete:
+    crossing = ~is_enclosed(partial, start_m, end_m)
+    if not crossing.all():
+        rows = np.flatnonzero(crossing)
+        if len(rows):
+            total_m[rows] = path_unobserved_m(partial, start_m[rows], interactions[rows], vertices_m[rows], end_m[rows])
         return total_m
     here_m = start_m.copy()
     for depth in range(interactions.shape[1]):

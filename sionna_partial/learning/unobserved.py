@@ -31,8 +31,9 @@ def unobserved_lengths_m(
 ) -> NDArray[np.float64]:
     """Measure the length of segments inside unknown cells, exact to rounding.
 
-    Everything outside the grid is unknown. On a complete map nothing unknown can be reached, and the length is 0 by
-    definition. A segment along the border of cells is in the freest of them, as in `PartialMap.state_at`.
+    Everything outside the grid is unknown. On a complete map nothing unknown can be reached from a known cell, and the
+    length of a segment that has an end in one is 0 by definition. A segment along the border of cells is in the freest
+    of them, as in `PartialMap.state_at`.
 
     Parameters
     ----------
@@ -46,10 +47,20 @@ def unobserved_lengths_m(
         Between 0 and the lengths of the segments [m].
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
-    if partial.is_complete:
-        return np.zeros(len(end_m))
+    lengths_m, open_ended = np.zeros(len(end_m)), ~is_enclosed(partial, start_m, end_m)
+    start_m, end_m = start_m[open_ended], end_m[open_ended]
     shares = map_line_shares(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, CellState.UNKNOWN]
-    return shares * np.linalg.norm(end_m - start_m, axis=1)
+    lengths_m[open_ended] = shares * np.linalg.norm(end_m - start_m, axis=1)
+    return lengths_m
+
+
+def is_enclosed(partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a complete map holds at least one end of each link (N,), so that nothing unknown is on its way."""
+    if not partial.is_complete:
+        return np.zeros(len(end_m), dtype=bool)
+    known = (partial.state_at(points_m) != CellState.UNKNOWN for points_m in (start_m, end_m))
+    enclosed: NDArray[np.bool_] = np.logical_or(*known)
+    return enclosed
 
 
 def walled_lengths_m(
