@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sionna_partial.inverse.slab import reflection_loss_db
 
 import sionna_partial as sp
 from sionna_partial.resources import scenes_folder
+from sionna_partial.tracing.slab import reflection_loss_db
 
 HIDDEN = sp.Material(relative_permittivity=5.24, conductivity_s_m=0.626, thickness_m=0.03)
 """Concrete at 28 GHz, whose slabs are nearly opaque: their conductivity hardly shows."""
