@@ -60,6 +60,15 @@ def buildings() -> None:
         isolated(measure, name, count)
     for path in sorted((MAPS / "floors").glob("*/map.yaml")):
         isolated(measure, str(path), 50_000)
+    row = isolated(place)
+    print(f"\nplace_transmitter on half the hall: {row['seconds']:.1f} s, {row['memory_gb']:.2f} GB")
+
+
+def place() -> dict:
+    """Time the placement of a transmitter on half the hall."""
+    start = time.perf_counter()
+    sp.place_transmitter(hall(half=True))
+    return {"seconds": time.perf_counter() - start, "memory_gb": peak_memory_gb()}
 
 
 def limits() -> None:
