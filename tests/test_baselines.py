@@ -92,7 +92,7 @@ class TestBaselines:
 
     def test_shipped(self):
         shipped = Baselines.load(PREDICTORS_FOLDER)
-        assert shipped.distance.homes == Predictor.load("paper").homes
+        assert shipped.distance.homes == Predictor.load().homes
         assert sum(shipped.majority.shares) == pytest.approx(1.0)
 
 
