@@ -179,12 +179,12 @@ def predict_map(
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     tx_m = _transmitter(partial, tx)
     grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
+    at_once = _receivers_at_once(partial, grid, memory_gb)
     complete = partial.is_complete and partial.state_at(tx_m) != CellState.UNKNOWN
     chosen = None if complete and predictor is None else _predictor(predictor)
     model = None if complete else chosen
     if model is not None:
         _warn_of_other_traces(model, trace_settings)
-    at_once = _receivers_at_once(partial, grid, memory_gb)
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
     columns: list[dict[str, NDArray[Any]]] = []

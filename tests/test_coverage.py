@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, WALL_PARTS, predict_map, require_coverage
-from sionna_partial.errors import MapError, PositionError, SettingsError
+from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
@@ -422,3 +422,14 @@ def test_what_is_no_coverage_map_is_named(coverage, spoil, message):
     require_coverage(coverage)
     with pytest.raises(SettingsError, match=message):
         require_coverage(spoil(coverage))
+
+
+class TestMemory:
+    def test_a_job_that_does_not_fit_is_refused_before_it_starts(self, no_work):
+        with pytest.raises(MemoryLimitError, match=r"memory_gb = 0\.1 .* receivers on a map of 96 cells"):
+            predict_map(map_of(PICTURE), TX, memory_gb=0.1)
+
+    def test_the_answer_does_not_depend_on_the_blocks(self, coverage, monkeypatch):
+        for name in ("_FEWEST_RECEIVERS", "_MOST_RECEIVERS"):
+            monkeypatch.setattr(coverage_module, name, 7)
+        assert predict_map(map_of(PICTURE), TX, spacing_m=0.25).identical(coverage)
