@@ -32,10 +32,10 @@ from stage_scores import (
 )
 
 import sionna_partial as sp
+from sionna_partial.datasets.dataset_links import LinkTraces, open_links, require_like, settings_for
+from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.settings import NetworkKind
-from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
-from sionna_partial.training.link_table import LinkTable
-from sionna_partial.training.train import split_homes
+from sionna_partial.training import split_homes
 
 SEED = 0
 """Of the split of the homes, and of the trainings."""

@@ -9,8 +9,8 @@ import argparse
 import resource
 import tempfile
 
+from sionna_partial.datasets.dataset import build_dataset
 from sionna_partial.settings import DatasetSettings
-from sionna_partial.training.dataset import build_dataset
 
 
 def main() -> None:

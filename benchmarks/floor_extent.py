@@ -17,12 +17,12 @@ import numpy as np
 from stage_scores import DIFFERENCES, INDOORS, Scores, definitions, difference_tables, publish, say, score, stage_table
 
 import sionna_partial as sp
+from sionna_partial.datasets.dataset import build_dataset
+from sionna_partial.datasets.dataset_links import open_links
+from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.datasets.shards import INDEX_FILE
 from sionna_partial.settings import DatasetSettings, SceneSettings
-from sionna_partial.training.dataset import build_dataset
-from sionna_partial.training.dataset_links import open_links
-from sionna_partial.training.link_table import LinkTable
-from sionna_partial.training.shards import INDEX_FILE
-from sionna_partial.training.train import split_homes
+from sionna_partial.training import split_homes
 
 Extent = Literal["observed", "map"]
 

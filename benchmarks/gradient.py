@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from stock import peak_memory_gb
 
 import sionna_partial as sp
-from sionna_partial.inverse.differentiable_links import DifferentiableLinks, DifferentiableScene
-from sionna_partial.learning.networks import import_keras
-from sionna_partial.learning.windows import CELLS_M
+from sionna_partial.differentiable.scene import DifferentiableLinks, DifferentiableScene
+from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.prediction.windows import CELLS_M
 from sionna_partial.tracing.fixed_paths import FixedPaths
 
 import_keras()

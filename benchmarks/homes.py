@@ -24,9 +24,9 @@ from scipy import ndimage
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.learning.features import unobserved_distance_m
 from sionna_partial.plots.figures import figure_png
-from sionna_partial.walls.outlines import wall_outlines
+from sionna_partial.prediction.features import unobserved_distance_m
+from sionna_partial.scene.outlines import wall_outlines
 
 FIRST_SEED = 70_000
 HEIGHT_M = 1.5

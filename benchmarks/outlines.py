@@ -25,7 +25,7 @@ from scipy import ndimage
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.walls.outlines import wall_outlines
+from sionna_partial.scene.outlines import wall_outlines
 
 FIRST_SEED = 60_000
 STEPS = (50, 100, 150, 200)

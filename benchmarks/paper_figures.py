@@ -27,17 +27,17 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.datasets.home_links import home_links, map_area
+from sionna_partial.datasets.home_sources import home_sources
+from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
+from sionna_partial.evaluation.metrics import measure
 from sionna_partial.files import atomic_files
-from sionna_partial.maps.homes import HomeKind
 from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.figures import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
+from sionna_partial.simulation.homes import HomeKind
 from sionna_partial.tracing.trace import trace_each
-from sionna_partial.training.home_links import home_links, map_area
-from sionna_partial.training.home_sources import home_sources
-from sionna_partial.training.link_table import LinkTable
-from sionna_partial.training.metrics import measure
 
 Homes = dict[str, sp.PartialMap]
 

@@ -27,10 +27,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.inverse.placement import TransmitterPlacement, place_transmitter
-from sionna_partial.inverse.placement_area import PlacementArea, placement_area
-from sionna_partial.inverse.placement_objective import PlacementObjective
-from sionna_partial.learning.predictor import LinkPrediction
+from sionna_partial.placement.area import PlacementArea, placement_area
+from sionna_partial.placement.objective import PlacementObjective
+from sionna_partial.placement.placement import TransmitterPlacement, place_transmitter
+from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.tracing.trace import trace_each
 
 FIRST_SEED = 50_100

@@ -19,7 +19,7 @@ from stock import isolated, peak_memory_gb
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.tracing.scene import build_scene
+from sionna_partial.scene.scene import build_scene
 
 MAPS = Path(__file__).parent / "../../shared"
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.evaluation.evaluate import home_scores, mean_and_error
+from sionna_partial.evaluation.metrics import DEFINITIONS, Metrics, measure
 from sionna_partial.files import atomic_write
-from sionna_partial.training.evaluate import home_scores, mean_and_error
-from sionna_partial.training.link_table import LinkTable
-from sionna_partial.training.metrics import DEFINITIONS, Metrics, measure
-from sionna_partial.training.report import markdown_table
+from sionna_partial.reports import markdown_table
 
 INDOORS = "Receivers were drawn indoors. A stage is the number of steps that the robot has explored."
 

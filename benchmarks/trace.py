@@ -30,7 +30,7 @@ from stock import Paths, isolated, limit_cores, peak_memory_gb, trace_stock, tru
 
 import sionna_partial as sp
 from sionna_partial.resources import demo_homes, scenes_folder
-from sionna_partial.tracing.scene import build_scene
+from sionna_partial.scene.scene import build_scene
 
 STOCK_RAYS, STOCK_TABLE = 100_000, 10_000_000
 """Stock on the full grid: few rays, as its time grows with rays x receivers, and a table large for its memory."""

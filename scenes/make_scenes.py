@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.explore import explore
-from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.tracing.scene import export_scene
+from sionna_partial.scene.scene import export_scene
+from sionna_partial.simulation.explore import explore
+from sionna_partial.simulation.homes import make_home
 
 STEPS = (50, 100, 150, 200)
 

@@ -7,17 +7,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from sionna_partial.calibration.calibration import MaterialCalibration, calibrate_materials
     from sionna_partial.constants import CellState, LinkState
     from sionna_partial.coverage import predict_map
+    from sionna_partial.datasets.dataset import build_dataset
+    from sionna_partial.datasets.shards import read_dataset
+    from sionna_partial.differentiable.scene import DifferentiableScene
     from sionna_partial.errors import SionnaPartialError
+    from sionna_partial.evaluation.evaluate import evaluate
     from sionna_partial.export import save_coverage
-    from sionna_partial.inverse.calibration import MaterialCalibration, calibrate_materials
-    from sionna_partial.inverse.differentiable_links import DifferentiableScene
-    from sionna_partial.inverse.placement import TransmitterPlacement, place_transmitter
-    from sionna_partial.learning.features import LinkFeatures, link_features
-    from sionna_partial.learning.predictor import LinkPrediction, Predictor
-    from sionna_partial.maps.explore import Exploration, explore, explore_trajectory
-    from sionna_partial.maps.homes import make_home
     from sionna_partial.maps.map_files import (
         load_map,
         map_from_array,
@@ -27,18 +25,20 @@ if TYPE_CHECKING:
         save_map,
     )
     from sionna_partial.maps.partial_map import PartialMap
+    from sionna_partial.placement.placement import TransmitterPlacement, place_transmitter
     from sionna_partial.plots.coverage_plot import plot_coverage
     from sionna_partial.plots.exploration_plot import animate_exploration, plot_exploration
     from sionna_partial.plots.material_plot import plot_calibration
     from sionna_partial.plots.placement_plot import plot_placement
+    from sionna_partial.prediction.features import LinkFeatures, link_features
+    from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+    from sionna_partial.scene.scene import export_scene
     from sionna_partial.settings import DatasetSettings, Material, SceneSettings, SensorSettings, TraceSettings
+    from sionna_partial.simulation.explore import Exploration, explore, explore_trajectory
+    from sionna_partial.simulation.homes import make_home
     from sionna_partial.tracing.gradients import GainGradients, gain_gradients
-    from sionna_partial.tracing.scene import export_scene
     from sionna_partial.tracing.trace import TracedLinks, trace_links
-    from sionna_partial.training.dataset import build_dataset
-    from sionna_partial.training.evaluate import evaluate
-    from sionna_partial.training.shards import read_dataset
-    from sionna_partial.training.train import train
+    from sionna_partial.training import train
 
 __version__ = "0.1.0"
 
@@ -55,21 +55,21 @@ _PUBLIC = {
         "map_from_slam",
         "save_map",
     ),
-    "maps.homes": ("make_home",),
-    "maps.explore": ("Exploration", "explore", "explore_trajectory"),
-    "tracing.scene": ("export_scene",),
+    "simulation.homes": ("make_home",),
+    "simulation.explore": ("Exploration", "explore", "explore_trajectory"),
+    "scene.scene": ("export_scene",),
     "tracing.trace": ("TracedLinks", "trace_links"),
     "tracing.gradients": ("GainGradients", "gain_gradients"),
-    "learning.features": ("LinkFeatures", "link_features"),
-    "learning.predictor": ("LinkPrediction", "Predictor"),
-    "training.shards": ("read_dataset",),
-    "training.dataset": ("build_dataset",),
-    "training.evaluate": ("evaluate",),
-    "training.train": ("train",),
-    "inverse.differentiable_links": ("DifferentiableScene",),
+    "prediction.features": ("LinkFeatures", "link_features"),
+    "prediction.predictor": ("LinkPrediction", "Predictor"),
+    "datasets.shards": ("read_dataset",),
+    "datasets.dataset": ("build_dataset",),
+    "evaluation.evaluate": ("evaluate",),
+    "training": ("train",),
+    "differentiable.scene": ("DifferentiableScene",),
     "coverage": ("predict_map",),
-    "inverse.calibration": ("MaterialCalibration", "calibrate_materials"),
-    "inverse.placement": ("TransmitterPlacement", "place_transmitter"),
+    "calibration.calibration": ("MaterialCalibration", "calibrate_materials"),
+    "placement.placement": ("TransmitterPlacement", "place_transmitter"),
     "export": ("save_coverage",),
     "plots.coverage_plot": ("plot_coverage",),
     "plots.exploration_plot": ("animate_exploration", "plot_exploration"),

@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
-from sionna_partial.learning.features import LinkFeatures, features_of_paths
-from sionna_partial.learning.predictor import LinkPrediction, Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import LinkFeatures, features_of_paths
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
 from sionna_partial.tracing.trace import SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
 

@@ -15,11 +15,11 @@ from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SceneError
 from sionna_partial.export import FORMATS, save_coverage
 from sionna_partial.files import atomic_files, atomic_write
-from sionna_partial.learning.predictor import Predictor
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.figures import figure_png
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.trace import Progress
 

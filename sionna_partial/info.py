@@ -9,8 +9,8 @@ from pathlib import Path
 
 from sionna_partial import __version__
 from sionna_partial.errors import SionnaPartialError
-from sionna_partial.learning.predictor import SHIPPED
 from sionna_partial.llvm import load_llvm
+from sionna_partial.prediction.predictor import SHIPPED
 from sionna_partial.resources import PREDICTORS_FOLDER, demo_homes
 from sionna_partial.tracing.contract import TESTED_VERSIONS, contract_breaches, contract_remedy, sionna_version
 

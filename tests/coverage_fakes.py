@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
-from sionna_partial.learning.features import LinkFeatures, unobserved_distance_m
-from sionna_partial.learning.link_context import ContextSums
-from sionna_partial.learning.predictor import LinkPrediction
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import LinkFeatures, unobserved_distance_m
+from sionna_partial.prediction.link_context import ContextSums
+from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import PredictorSettings, SceneSettings, TraceSettings
 from sionna_partial.tracing.paths import SolvedPaths
 

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.link_context import REACHES_M, LinkContext
+from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.link_context import REACHES_M, LinkContext
 from sionna_partial.settings import DatasetSettings
-from sionna_partial.training.link_table import LinkTable
 
 KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670
 """Seeds of homes that end their process, never end, raise, end their process at the first try, and find a full disk."""
@@ -45,7 +45,7 @@ if "home_process" in " ".join(sys.orig_argv):
 
 def install() -> None:
     """Replace the making and the tracing of homes in this process."""
-    from sionna_partial.training import home_links, home_sources
+    from sionna_partial.datasets import home_links, home_sources
 
     home_sources.make_home = make_home  # type: ignore[assignment]
     home_links.home_links = fake_links  # type: ignore[assignment]

@@ -8,12 +8,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.bounds import Strengths, strengths_of
-from sionna_partial.tracing.candidates import Candidates, Room, Wedges, specular_candidates
-from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, DiffractionCandidates
-from sionna_partial.tracing.scene import SceneGeometry
+from sionna_partial.tracing.plan.beams import trace_beams
+from sionna_partial.tracing.plan.bounds import Strengths, strengths_of
+from sionna_partial.tracing.plan.candidates import Candidates, Room, Wedges, specular_candidates
+from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
 
 Blocks = list[tuple[Candidates, float]]
 

@@ -6,9 +6,9 @@ import json
 import numpy as np
 from predictor_links import corridors, make_context, make_links, quick_predictor
 
-from sionna_partial.training.baselines import Baselines, Majority
-from sionna_partial.training.link_table import COLUMNS, LinkTable
-from sionna_partial.training.shards import INDEX_FILE, shard_path, write_shard
+from sionna_partial.datasets.link_table import COLUMNS, LinkTable
+from sionna_partial.datasets.shards import INDEX_FILE, shard_path, write_shard
+from sionna_partial.evaluation.baselines import Baselines, Majority
 
 
 def make_table(homes=4, links=300, stages=(0, 100), seed=0):

@@ -5,8 +5,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.inverse.material_fit import MaterialTarget, Point
-from sionna_partial.inverse.material_paths import MaterialPaths
+from sionna_partial.calibration.material_fit import MaterialTarget, Point
+from sionna_partial.calibration.material_paths import MaterialPaths
 from sionna_partial.tracing.slab import reflection_loss_db
 
 FREQUENCY_HZ, THICKNESS_M = 28e9, 0.03

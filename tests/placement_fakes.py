@@ -8,9 +8,9 @@ import pytest
 from coverage_fakes import FakePredictor, map_of
 from numpy.typing import NDArray
 
-from sionna_partial.inverse import placement
-from sionna_partial.inverse.placement_area import PlacementArea, placement_area
-from sionna_partial.inverse.placement_objective import PlacementObjective
+from sionna_partial.placement import placement
+from sionna_partial.placement.area import PlacementArea, placement_area
+from sionna_partial.placement.objective import PlacementObjective
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 TWO_ROOMS = """

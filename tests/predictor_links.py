@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.link_context import REACHES_M, LinkContext
-from sionna_partial.learning.networks import free_space_gain_db
-from sionna_partial.learning.predictor import Predictor
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 
 QUIET = pytest.mark.filterwarnings("ignore:__array__ implementation doesn't accept a copy:DeprecationWarning:keras")

@@ -9,11 +9,7 @@ from predictor_links import LOS, NLOS, OUTAGE, QUICK, QUIET, assert_valid, make_
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.networks import OUTPUT_WIDTHS
-from sionna_partial.learning.predictor import Predictor
-from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.training.baselines import (
+from sionna_partial.evaluation.baselines import (
     Baselines,
     Majority,
     answers,
@@ -22,6 +18,10 @@ from sionna_partial.training.baselines import (
     nothing_seen,
     tr38901_indoor,
 )
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.paper_networks import OUTPUT_WIDTHS
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
 

@@ -7,8 +7,8 @@ import pytest
 from extruded import ROOM, SPLINTERS, points_of
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.plan import prepare_plan
+from sionna_partial.scene.floor_plan import prepare_plan
+from sionna_partial.tracing.plan.beams import trace_beams
 
 
 def _chains(beams, rx: int) -> set[tuple[int, ...]]:

@@ -6,7 +6,7 @@ from extruded import ROOM, SPLINTERS, drawn, extrude
 
 import sionna_partial as sp
 from sionna_partial.constants import LinkState
-from sionna_partial.tracing.bounds import LEVELS, dropped_power, level_of, levels_needed, strengths_of, utd_terms
+from sionna_partial.tracing.plan.bounds import LEVELS, dropped_power, level_of, levels_needed, strengths_of, utd_terms
 from sionna_partial.tracing.slab import reflection_coefficients
 
 DRYWALL = np.array([2.94, 0.1226, 0.1])
@@ -63,10 +63,10 @@ def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, 
     """Sum of |a|^2 over all paths of a link, against the sum of all bounds."""
     from extruded import everything
 
-    from sionna_partial.tracing.beams import trace_beams
-    from sionna_partial.tracing.candidates import Room, specular_candidates
-    from sionna_partial.tracing.diffraction import DiffractionCandidates, find_wedges
-    from sionna_partial.tracing.scene import SHAPES, write_scene
+    from sionna_partial.scene.scene import SHAPES, write_scene
+    from sionna_partial.tracing.plan.beams import trace_beams
+    from sionna_partial.tracing.plan.candidates import Room, specular_candidates
+    from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
     from sionna_partial.tracing.solver import SceneSolver
 
     geometry = extrude(walls)

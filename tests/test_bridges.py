@@ -7,10 +7,10 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.inverse.bridges import STEEPEST, moved_lengths_m, moved_paths
-from sionna_partial.inverse.smooth_lengths import SmoothLengths
-from sionna_partial.learning.networks import import_keras
-from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.differentiable.path_power import STEEPEST, moved_lengths_m, moved_paths
+from sionna_partial.differentiable.smooth_lengths import SmoothLengths
+from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 

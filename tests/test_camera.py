@@ -8,9 +8,9 @@ from hypothesis.extra.numpy import arrays
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.camera import MISSED_PATCH_M, Camera, view_corners_m
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
+from sionna_partial.simulation.camera import MISSED_PATCH_M, Camera, view_corners_m
 
 NOWHERE = np.empty((0, 2), dtype=np.intp)
 EXACT = SensorSettings()

@@ -8,8 +8,8 @@ import trimesh
 from extruded import ROOM, extrude, specular_blocks, specular_lengths_m
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.candidates import BEND, CEILING, EDGE, FLOOR, Candidates, faces_of
-from sionna_partial.tracing.scene import SHAPES, SceneGeometry, write_scene
+from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
+from sionna_partial.tracing.plan.candidates import BEND, CEILING, EDGE, FLOOR, Candidates, faces_of
 
 TX = np.array([1.1, 0.7, 1.2])
 RX = np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4]])

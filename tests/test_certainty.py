@@ -10,11 +10,11 @@ from hypothesis.extra import numpy as hnp
 from test_context_networks import features
 
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.learning.certainty import possible_states
-from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.certainty import possible_states
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings
-from sionna_partial.training.home_links import home_links
 
 OUTAGE, LOS, NLOS = LinkState.OUTAGE, LinkState.LOS, LinkState.NLOS
 CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
@@ -153,7 +153,7 @@ def test_a_trace_without_walls_is_not_contradicted(state, tx, rx):
 
 def test_rules_hold_on_explored_homes():
     """Where the true home is traced, at most one link in a thousand contradicts them."""
-    from sionna_partial.maps.homes import make_home
+    from sionna_partial.simulation.homes import make_home
 
     chosen = DatasetSettings(links_per_home=200, transmitters_per_home=2, stages=(50, 150))
     tables = [home_links(make_home(seed), f"home {seed}", chosen) for seed in (91000, 91001, 91002)]

@@ -8,8 +8,8 @@ import pytest
 from coverage_fakes import PICTURE, map_of
 from meshes import room
 
+from sionna_partial.checkpoint import Checkpoint, run_fingerprint, write_json
 from sionna_partial.errors import OutputError
-from sionna_partial.inverse.checkpoint import Checkpoint, run_fingerprint, write_json
 from sionna_partial.maps.map_files import load_map
 
 

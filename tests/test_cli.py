@@ -16,13 +16,13 @@ from PIL import Image
 from typer.testing import CliRunner, Result
 
 from sionna_partial import __version__, cli, info
-from sionna_partial.commands import shell
+from sionna_partial.cli import shell
 from sionna_partial.errors import BackendError, MapError, OutputError
 from sionna_partial.info import Finding
-from sionna_partial.maps.explore import explore
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.simulation.explore import explore
 
 pytestmark = pytest.mark.usefixtures("command_line")
 
@@ -286,7 +286,7 @@ class TestExportScene:
 class TestExplore:
     def test_made_home(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap) -> None:
         asked: list[int] = []
-        monkeypatch.setattr("sionna_partial.maps.homes.make_home", lambda seed: asked.append(seed) or room)
+        monkeypatch.setattr("sionna_partial.simulation.homes.make_home", lambda seed: asked.append(seed) or room)
         result = run("explore", "--out", tmp_path / "maps", "--seed", "7", "--steps", "6", "--steps", "2")
         assert result.exit_code == 0, result.output
         assert asked == [7]
@@ -344,7 +344,7 @@ class TestInfo:
 
     def test_works_without_llvm_and_tensorflow(self) -> None:
         block = "import sys; sys.modules.update(tensorflow=None, keras=None, drjit=None, mitsuba=None)"
-        code = f"{block}\nfrom sionna_partial.cli import app\napp(['info'])"
+        code = f"{block}\nfrom sionna_partial.cli.app import app\napp(['info'])"
         environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/no/such/libLLVM.so", "COLUMNS": "200"}
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
         result = subprocess.run(

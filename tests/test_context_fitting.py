@@ -13,20 +13,20 @@ from scipy.stats import norm
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning import context_fitting as module
-from sionna_partial.learning.context_fitting import fit_context_networks
-from sionna_partial.learning.context_networks import (
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction import map_fitting as module
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.map_fitting import fit_context_networks
+from sionna_partial.prediction.map_networks import (
     LINK_INPUTS,
     LINK_NETWORK,
     context_networks,
     evaluate_context_networks,
     link_inputs,
 )
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.link_context import REACHES_M, LinkContext
-from sionna_partial.learning.networks import free_space_gain_db
-from sionna_partial.learning.windows import WINDOW_CELLS, WINDOWS, transmitter_places, transmitter_windows
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.windows import WINDOW_CELLS, WINDOWS, transmitter_places, transmitter_windows
 from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET

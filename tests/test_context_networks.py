@@ -11,9 +11,12 @@ from hypothesis import strategies as st
 from predictor_links import FREQUENCY_HZ, LOS, NLOS, OUTAGE, QUIET, make_seen_links
 
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.learning import context_networks as module
-from sionna_partial.learning.certainty import possible_states
-from sionna_partial.learning.context_networks import (
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction import map_networks as module
+from sionna_partial.prediction.certainty import possible_states
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.map_networks import (
     CONTEXT_SHAPES,
     LINK_INPUTS,
     LINK_NETWORK,
@@ -26,11 +29,8 @@ from sionna_partial.learning.context_networks import (
     link_inputs,
     look,
 )
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.link_context import REACHES_M, LinkContext
-from sionna_partial.learning.networks import STD_RANGE_DB, free_space_gain_db, import_keras, own_input
-from sionna_partial.learning.windows import CELLS_M, WINDOW_CELLS, WINDOWS, map_windows, transmitter_windows
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, own_input
+from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS, map_windows, transmitter_windows
 
 pytestmark = QUIET
 

@@ -8,10 +8,10 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from sionna_partial import cli
-from sionna_partial.commands.shell import rate_and_rest, show_rate
+from sionna_partial.cli.shell import rate_and_rest, show_rate
+from sionna_partial.datasets.dataset import DatasetReport
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import DatasetSettings, Material, SensorSettings
-from sionna_partial.training.dataset import DatasetReport
 
 pytestmark = pytest.mark.usefixtures("command_line")
 
@@ -32,7 +32,7 @@ class TestDataset:
             failed = {str(home): "the roof fell in\nTraceback" for home in homes if isinstance(home, Path)}
             return DatasetReport(folder, ("a", "b"), ("c",), failed, 90.0)
 
-        monkeypatch.setattr("sionna_partial.training.dataset.build_dataset", build)
+        monkeypatch.setattr("sionna_partial.datasets.dataset.build_dataset", build)
         return calls
 
     def test_defaults(self, calls: list[Any]) -> None:
@@ -128,7 +128,7 @@ class TestRate:
         self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
         now = 100.0
-        monkeypatch.setattr("sionna_partial.commands.shell.monotonic", lambda: now)
+        monkeypatch.setattr("sionna_partial.cli.shell.monotonic", lambda: now)
         with show_rate("homes") as report:
             report(50, 60, "starting")
             now = 110.0

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 from link_tables import make_dataset, make_table
 
+from sionna_partial.datasets.dataset_links import LinkTraces, open_links, require_like, settings_for
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.training.dataset_links import LinkTraces, open_links, require_like, settings_for
 
 _AT = (("one", 28e9), ("two", 60e9))
 

@@ -12,10 +12,10 @@ from predictor_links import QUIET
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
+from sionna_partial.differentiable import scene as differentiable_links
+from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.inverse import differentiable_links
-from sionna_partial.inverse.link_distribution import LinkDistribution
-from sionna_partial.learning.networks import import_keras
+from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
 from sionna_partial.tracing.probe import TX_M, small_room
 

@@ -7,12 +7,11 @@ import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
 from predictor_links import LOS, OUTAGE, QUIET, context_predictor, corridors, quick_predictor
 
+from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.predictor import LinkPrediction, Predictor
-from sionna_partial.learning.windows import map_windows
-from sionna_partial.training import evaluate as evaluate_module
-from sionna_partial.training.baselines import Baselines
-from sionna_partial.training.evaluate import (
+from sionna_partial.evaluation import evaluate as evaluate_module
+from sionna_partial.evaluation.baselines import Baselines
+from sionna_partial.evaluation.evaluate import (
     ALWAYS_OUTAGE,
     WITH_INDOOR,
     WITHOUT_INDOOR,
@@ -20,8 +19,9 @@ from sionna_partial.training.evaluate import (
     home_scores,
     mean_and_error,
 )
-from sionna_partial.training.link_table import LinkTable
-from sionna_partial.training.metrics import measure
+from sionna_partial.evaluation.metrics import measure
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.windows import map_windows
 
 pytestmark = QUIET
 
@@ -140,7 +140,7 @@ class TestEvaluate:
             drawn.append(len(tx_m))
             return map_windows(partial, tx_m)
 
-        monkeypatch.setattr("sionna_partial.learning.context_networks.map_windows", counted)
+        monkeypatch.setattr("sionna_partial.prediction.map_networks.map_windows", counted)
         predictor = dataclasses.replace(context_predictor("map"), homes=("home 0",))
         evaluate(predictor, table, baselines=fitted_baselines())
         assert drawn == [1] * (2 * 2 * len(corridors()))

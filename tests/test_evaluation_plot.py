@@ -6,9 +6,9 @@ from link_tables import fitted_baselines, make_table
 from predictor_links import QUIET, quick_predictor
 
 from sionna_partial.errors import SettingsError
+from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.plots.evaluation_plot import plot_stages
 from sionna_partial.plots.figures import figure_png
-from sionna_partial.training.evaluate import evaluate
 
 pytestmark = QUIET
 

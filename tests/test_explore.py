@@ -12,13 +12,13 @@ from scipy.spatial.distance import pdist
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.explore import Exploration, explore, explore_trajectory
-from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.mesh_map import MeshReading, cut_to_known, mesh_map
+from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.robot import FORWARD_M, TURN_DEG
 from sionna_partial.settings import SensorSettings
+from sionna_partial.simulation.explore import Exploration, explore, explore_trajectory
+from sionna_partial.simulation.homes import make_home
+from sionna_partial.simulation.robot import FORWARD_M, TURN_DEG
 
 GIBSON = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson"
 

@@ -8,9 +8,9 @@ import pytest
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import MapError, PositionError, PredictorError
-from sionna_partial.learning.features import LinkFeatures, link_features, unobserved_distance_m
-from sionna_partial.learning.link_context import REACHES_M, LinkContext
-from sionna_partial.learning.unobserved import unobserved_lengths_m
+from sionna_partial.prediction.features import LinkFeatures, link_features, unobserved_distance_m
+from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import TracedLinks
 

@@ -18,9 +18,9 @@ from predictor_links import (
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.networks import free_space_gain_db
-from sionna_partial.learning.predictor import Predictor
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET

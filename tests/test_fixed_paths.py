@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError, PositionError, SettingsError
-from sionna_partial.maps.mesh import merged_mesh
-from sionna_partial.maps.mesh_map import MeshReading, mesh_map
+from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.tracing import fixed_paths
 from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS, FixedPaths, PathParameters, PathScene
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room

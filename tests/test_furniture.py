@@ -3,7 +3,7 @@ import pytest
 import shapely
 from shapely import LineString, Polygon, box
 
-from sionna_partial.maps.furniture import furnish, parts_of, union_of
+from sionna_partial.simulation.furniture import furnish, parts_of, union_of
 
 ROOM = box(0, 0, 5, 4)
 DOOR = LineString([(1, 0), (1.9, 0)])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sionna_partial.inverse.gain_errors import BLOCKED_DB, MISSED_DB, GainErrors, fit_errors
+from sionna_partial.calibration.gain_errors import BLOCKED_DB, MISSED_DB, GainErrors, fit_errors
 
 ERRORS_DB = np.linspace(-90.0, 60.0, 30_001)
 KINDS = [GainErrors(3.0, 0.0, 0.0), GainErrors(1.5, 0.35, 0.05), GainErrors(6.0, 0.1, 0.2)]

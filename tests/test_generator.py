@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.errors import SettingsError
-from sionna_partial.maps.mesh import SceneMesh
-from sionna_partial.maps.mesh_map import MeshReading, mesh_map
+from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.tracing import trace
 from sionna_partial.tracing.generator import bends_at, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths

@@ -9,15 +9,15 @@ import pytest
 from link_tables import assert_same, make_table
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.datasets import home_links as module
+from sionna_partial.datasets.home_links import NEAREST_M, home_links, home_sensor, map_area
+from sionna_partial.datasets.link_table import LinkTable, stage_name
 from sionna_partial.errors import MapError, PositionError, PredictorError
-from sionna_partial.learning.features import link_features
-from sionna_partial.maps.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
+from sionna_partial.simulation.explore import explore
 from sionna_partial.tracing.trace import trace_links
-from sionna_partial.training import home_links as module
-from sionna_partial.training.home_links import NEAREST_M, home_links, home_sensor, map_area
-from sionna_partial.training.link_table import LinkTable, stage_name
 
 SETTINGS = DatasetSettings(
     links_per_home=31, transmitters_per_home=3, stages=(0, 3, 40), trace=TraceSettings(max_depth=2)

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from sionna_partial.datasets.home_sources import HomeSource, home_sources
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.homes import make_home
 from sionna_partial.maps.map_files import save_map
-from sionna_partial.training.home_sources import HomeSource, home_sources
+from sionna_partial.simulation.homes import make_home
 
 
 @pytest.fixture

@@ -11,12 +11,12 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError
-from sionna_partial.maps import homes
-from sionna_partial.maps.buildings import LARGEST_M
-from sionna_partial.maps.explore import explore
-from sionna_partial.maps.homes import DOOR_M, LARGE_RESOLUTION_M, STYLES, make_home
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.simulation import homes
+from sionna_partial.simulation.buildings import LARGEST_M
+from sionna_partial.simulation.explore import explore
+from sionna_partial.simulation.homes import DOOR_M, LARGE_RESOLUTION_M, STYLES, make_home
 
 SEEDS = range(12)
 SCENES = Path(__file__).resolve().parents[1] / "scenes"

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
-from sionna_partial.cli import app
-from sionna_partial.inverse import material_search
+from sionna_partial.calibration import material_search
+from sionna_partial.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("command_line")
 

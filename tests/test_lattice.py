@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.scene.lattice import lattice_outlines
+from sionna_partial.scene.scene import build_scene
 from sionna_partial.settings import SceneSettings
-from sionna_partial.tracing.scene import build_scene
-from sionna_partial.walls.lattice import lattice_outlines
 
 Segment = tuple[tuple[float, float], ...]
 

@@ -10,7 +10,7 @@ from predictor_links import QUIET, quick_predictor
 from typer.testing import CliRunner, Result
 
 from sionna_partial import cli
-from sionna_partial.learning.predictor import Predictor
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 
 pytestmark = [QUIET, pytest.mark.usefixtures("command_line")]
@@ -61,7 +61,7 @@ class TestTrain:
             seen.update(options)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("sionna_partial.training.train.train", train)
+        monkeypatch.setattr("sionna_partial.training.train", train)
         run("train", folder, "--out", tmp_path / "run")
         assert seen["settings"] == PredictorSettings("map", frequency_hz=60e9, diffraction=False)
         assert seen["test_share"] == 0.3
@@ -110,7 +110,7 @@ class TestEvaluate:
             seen.extend(arguments)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("sionna_partial.training.evaluate.evaluate", evaluate)
+        monkeypatch.setattr("sionna_partial.evaluation.evaluate.evaluate", evaluate)
         run("evaluate", dataset, "--out", tmp_path / "report")
         assert seen == ["map", [dataset]]
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning.link_context import REACHES_M, ContextSums, LinkContext
-from sionna_partial.learning.unobserved import unobserved_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.link_context import REACHES_M, ContextSums, LinkContext
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import TracedLinks, trace_links
 

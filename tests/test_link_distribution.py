@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.inverse.link_distribution import LinkDistribution
-from sionna_partial.learning.networks import import_keras
-from sionna_partial.learning.predictor import LinkPrediction
+from sionna_partial.differentiable.link_distribution import LinkDistribution
+from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.prediction.predictor import LinkPrediction
 
 THRESHOLD_DB = -100.0
 

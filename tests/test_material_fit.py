@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from material_fakes import FREQUENCY_HZ, fake_target, point, quiet
 
-from sionna_partial.inverse import material_fit
-from sionna_partial.inverse.gain_errors import GainErrors
-from sionna_partial.inverse.material_fit import Posterior, descend, lossless_scale_s_m, prior_posterior
+from sionna_partial.calibration import material_fit
+from sionna_partial.calibration.gain_errors import GainErrors
+from sionna_partial.calibration.material_fit import Posterior, descend, lossless_scale_s_m, prior_posterior
 
 GRADIENT_STEP = 1e-5
 

@@ -8,10 +8,10 @@ from meshes import OBSERVED, room
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.inverse import material_paths
-from sionna_partial.inverse.material_paths import MaterialPaths, find_material_paths, link_gains_db
-from sionna_partial.maps.mesh import SceneMesh, merged_mesh
-from sionna_partial.maps.mesh_map import MeshReading, mesh_map
+from sionna_partial.calibration import material_paths
+from sionna_partial.calibration.material_paths import MaterialPaths, find_material_paths, link_gains_db
+from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.mesh import SceneMesh, merged_mesh
 from sionna_partial.tracing.fixed_paths import PathScene
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 from sionna_partial.tracing.trace import trace_links

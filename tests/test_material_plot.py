@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import sionna_partial as sp
-from sionna_partial.inverse.material_fit import Posterior
+from sionna_partial.calibration.material_fit import Posterior
 from sionna_partial.plots.figures import figure_png
 from sionna_partial.plots.material_plot import ANGLES_DEG, plot_calibration
 

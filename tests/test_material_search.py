@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from material_fakes import FREQUENCY_HZ, THICKNESS_M, fake_target, point, quiet
 
-from sionna_partial.inverse.material_fit import descend
-from sionna_partial.inverse.material_search import search
+from sionna_partial.calibration.material_fit import descend
+from sionna_partial.calibration.material_search import search
 
 
 class TestSearch:

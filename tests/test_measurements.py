@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sionna_partial.errors import MeasurementError
-from sionna_partial.inverse.measurements import Measurements, measurements_of
+from sionna_partial.measurements.measurements import Measurements, measurements_of
 
 TX = np.array([[1.0, 2.0, 1.5], [1.0, 2.0, 1.5], [3.0, 4.0, 2.0]])
 RX = np.array([[2.0, 2.0, 1.5], [4.0, 1.0, 1.5], [5.0, 5.0, 1.0]])

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from meshes import areas_m2, box, open_edges, scene_mesh, surface_m2
 
 from sionna_partial.errors import MapError
-from sionna_partial.maps import mesh as mesh_module
-from sionna_partial.maps.mesh import SceneMesh, mesh_arrays, mesh_of_arrays
-from sionna_partial.maps.mesh_cut import clip_slab, merge_points
+from sionna_partial.maps.mesh import mesh as mesh_module
+from sionna_partial.maps.mesh.cut import clip_slab, merge_points
+from sionna_partial.maps.mesh.mesh import SceneMesh, mesh_arrays, mesh_of_arrays
 from sionna_partial.settings import Material
 
 CONCRETE = Material(itu="concrete")

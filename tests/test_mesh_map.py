@@ -15,8 +15,8 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.mesh import SceneMesh
-from sionna_partial.maps.mesh_map import MeshReading, cut_to_known, mesh_map, raised
+from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map, raised
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)

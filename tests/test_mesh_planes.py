@@ -4,7 +4,7 @@ import trimesh
 from mesh_rays import TURN
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.mesh_planes import PLANE_TOLERANCE_M, MeshPlanes, face_at, group_planes
+from sionna_partial.tracing.mesh.planes import PLANE_TOLERANCE_M, MeshPlanes, face_at, group_planes
 
 
 def planes_of(mesh: trimesh.Trimesh) -> MeshPlanes:

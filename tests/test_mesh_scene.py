@@ -9,9 +9,9 @@ import pytest
 from meshes import box, surface_m2
 
 from sionna_partial.errors import MapError
-from sionna_partial.maps import mesh_scene
-from sionna_partial.maps.mesh import SceneMesh
-from sionna_partial.maps.mesh_scene import exported_record, read_exported_mesh, read_mitsuba_scene
+from sionna_partial.maps.mesh import mitsuba_xml as mesh_scene
+from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.maps.mesh.mitsuba_xml import exported_record, read_exported_mesh, read_mitsuba_scene
 from sionna_partial.maps.ros_map import MapWarning
 from sionna_partial.settings import Material
 

@@ -6,8 +6,7 @@ import pytest
 from predictor_links import LOS, NLOS, OUTAGE, make_links, p_kept, true_gain
 
 from sionna_partial.constants import LinkState
-from sionna_partial.learning.predictor import LinkPrediction
-from sionna_partial.training.metrics import (
+from sionna_partial.evaluation.metrics import (
     CONFIDENCE_BINS,
     DEFINITIONS,
     PIT_BINS,
@@ -17,6 +16,7 @@ from sionna_partial.training.metrics import (
     pit_shares,
     reliability,
 )
+from sionna_partial.prediction.predictor import LinkPrediction
 
 
 def prediction(p_outage, p_los, p_nlos, los_db=(-60.0, 2.0), nlos_db=(-90.0, 8.0)):

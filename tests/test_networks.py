@@ -3,8 +3,8 @@ import pytest
 from predictor_links import FREQUENCY_HZ, LOS, NLOS, QUIET, arrays, assert_valid, make_links, quick_predictor
 
 from sionna_partial.constants import LinkState
-from sionna_partial.learning.features import LinkFeatures
-from sionna_partial.learning.networks import (
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.paper_networks import (
     FEATURES,
     GAIN_NETWORKS,
     OUTPUT_WIDTHS,

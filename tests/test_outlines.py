@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.walls.outlines import Outlines, wall_outlines
+from sionna_partial.scene.outlines import Outlines, wall_outlines
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}

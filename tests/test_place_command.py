@@ -11,8 +11,8 @@ from placement_fakes import HALF_SEEN, use_fake_search
 from typer.testing import CliRunner, Result
 
 from sionna_partial import cli
-from sionna_partial.inverse import placement
 from sionna_partial.maps.map_files import save_map
+from sionna_partial.placement import placement
 
 pytestmark = pytest.mark.usefixtures("command_line")
 

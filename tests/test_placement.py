@@ -10,10 +10,10 @@ from placement_fakes import HALF_SEEN, TOP_M, TWO_ROOMS, FakeScene, FakeViews, s
 
 import sionna_partial as sp
 from sionna_partial.errors import OutputError, PositionError, SettingsError
-from sionna_partial.inverse import placement
-from sionna_partial.inverse.placement import Effort, TransmitterPlacement, place_transmitter
-from sionna_partial.inverse.placement_area import placement_area
 from sionna_partial.maps.map_files import save_map
+from sionna_partial.placement import placement
+from sionna_partial.placement.area import placement_area
+from sionna_partial.placement.placement import Effort, TransmitterPlacement, place_transmitter
 
 HOME = map_of(HALF_SEEN, 0.5, (0.0, 0.0))
 

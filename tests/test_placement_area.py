@@ -6,8 +6,8 @@ from placement_fakes import two_rooms
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import PositionError
-from sionna_partial.inverse.placement_area import CLEARANCE_M, PlacementArea, placement_area
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area
 
 
 class TestRoom:

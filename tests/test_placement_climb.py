@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from placement_fakes import TOP_M, two_rooms
 
-from sionna_partial.inverse.placement_climb import TRIALS_M, Climb, climb_on, next_places, smoothed_slope
+from sionna_partial.placement.climb import TRIALS_M, Climb, climb_on, next_places, smoothed_slope
 
 AREA = two_rooms()
 NONE_BESIDE = np.zeros((0, 3))

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import SettingsError
-from sionna_partial.inverse.link_distribution import LinkDistribution
-from sionna_partial.inverse.placement_objective import PlacementObjective
-from sionna_partial.learning.predictor import LinkPrediction
+from sionna_partial.placement.objective import PlacementObjective
+from sionna_partial.prediction.predictor import LinkPrediction
 
 PROBABILITIES = np.array([[0.1, 1.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.3], [0.3, 0.0, 1.0, 0.2]])
 MEANS_DB = np.array([[-150.0] * 4, [-80.0, -90.0, -70.0, -101.0], [-105.0, -110.0, -99.0, -95.0]])

@@ -3,10 +3,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sionna_partial.checkpoint import Checkpoint
 from sionna_partial.errors import OutputError
-from sionna_partial.inverse.checkpoint import Checkpoint
-from sionna_partial.inverse.placement_climb import Climb
-from sionna_partial.inverse.placement_state import PlacementState
+from sionna_partial.placement.climb import Climb
+from sionna_partial.placement.state import PlacementState
 
 STARTS_M, SCORES = np.array([[0.1, 1.0 / 3.0, 1.5], [2.0, 3.0, 1.5]]), np.array([0.5, 1.0 / 7.0])
 CLIMB = Climb(STARTS_M[:1], SCORES[:1])

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 import sionna_partial as sp
-from sionna_partial.inverse import placement_views
-from sionna_partial.inverse.differentiable_links import DifferentiableScene
-from sionna_partial.inverse.placement_area import PlacementArea, placement_area
-from sionna_partial.inverse.placement_objective import PlacementObjective
-from sionna_partial.inverse.placement_views import PlacementViews
-from sionna_partial.learning.predictor import LinkPrediction
+from sionna_partial.differentiable.scene import DifferentiableScene
+from sionna_partial.placement import views as placement_views
+from sionna_partial.placement.area import PlacementArea, placement_area
+from sionna_partial.placement.objective import PlacementObjective
+from sionna_partial.placement.views import PlacementViews
+from sionna_partial.prediction.predictor import LinkPrediction
 
 SETTINGS = sp.TraceSettings(max_depth=1, diffraction=False)
 PLACES_M = np.array([[1.02, 1.13, 1.4], [2.21, 0.93, 1.4]])

@@ -17,11 +17,11 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.learning import predictor as predictor_module
-from sionna_partial.learning.context_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
-from sionna_partial.learning.networks import STD_RANGE_DB, parts
-from sionna_partial.learning.predictor import SHIPPED, LinkPrediction, Predictor
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction import predictor as predictor_module
+from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
+from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
 
 pytestmark = QUIET
 

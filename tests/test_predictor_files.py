@@ -22,10 +22,10 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.learning.context_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
-from sionna_partial.learning.networks import FEATURES, assemble, import_keras, parts
-from sionna_partial.learning.predictor import Predictor
-from sionna_partial.learning.predictor_files import FORMAT, digest, pack
+from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
+from sionna_partial.prediction.paper_networks import FEATURES, assemble, import_keras, parts
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.predictor_files import FORMAT, digest, pack
 
 pytestmark = QUIET
 

@@ -1,9 +1,9 @@
 import numpy as np
 import trimesh
 
-from sionna_partial.tracing.mesh_planes import MeshPlanes, group_planes
-from sionna_partial.tracing.ray_chains import MARGIN, Chains, collect_chains, view_chains
-from sionna_partial.tracing.rays import Rays
+from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
+from sionna_partial.tracing.mesh.rays import Rays
+from sionna_partial.tracing.mesh.sequences import MARGIN, Chains, collect_chains, view_chains
 
 UP = np.array([0.0, 0.0, 1.0])
 

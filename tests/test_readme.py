@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 import sionna_partial as sp
-from sionna_partial.inverse import material_search
+from sionna_partial.calibration import material_search
 from sionna_partial.resources import scenes_folder
 
 README = Path(__file__).resolve().parents[1] / "README.md"

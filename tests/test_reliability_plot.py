@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sionna_partial.errors import SettingsError
+from sionna_partial.evaluation.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability
 from sionna_partial.plots.figures import figure_png
 from sionna_partial.plots.reliability_plot import plot_reliability
-from sionna_partial.training.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability
 
 
 def calibration(error=0.0, links=100):

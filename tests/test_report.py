@@ -7,9 +7,9 @@ from link_tables import fitted_baselines, make_table
 from predictor_links import QUIET, quick_predictor
 
 from sionna_partial.errors import OutputError
-from sionna_partial.training.evaluate import WITH_INDOOR, evaluate
-from sionna_partial.training.metrics import DEFINITIONS
-from sionna_partial.training.report import REPORT_FILES, as_json, markdown, markdown_table, save_report, summary
+from sionna_partial.evaluation.evaluate import WITH_INDOOR, evaluate
+from sionna_partial.evaluation.metrics import DEFINITIONS
+from sionna_partial.reports import REPORT_FILES, as_json, markdown, markdown_table, save_report, summary
 
 pytestmark = QUIET
 

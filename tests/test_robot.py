@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.robot import ROBOT_RADII_M, Robot, _fitting_radius, _Router
 from sionna_partial.settings import SensorSettings
+from sionna_partial.simulation.robot import ROBOT_RADII_M, Robot, _fitting_radius, _Router
 
 FREE, WALL, UNKNOWN = (int(state) for state in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
 

@@ -18,11 +18,11 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.mesh import merged_mesh
-from sionna_partial.maps.mesh_map import MeshReading, cut_to_known, mesh_map
+from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
+from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.scene.scene import FAR_M, build_scene, export_scene, write_mesh_scene, write_scene
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
-from sionna_partial.tracing.scene import FAR_M, build_scene, export_scene, write_mesh_scene, write_scene
 
 ROOM = """
     ????????????
@@ -121,7 +121,7 @@ def test_floor_of_the_whole_map_and_no_floor() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 15), st.integers(1, 15))
 def test_floor_and_its_triangles_cover_the_observed_area_once(seed: int, ny: int, nx: int) -> None:
-    from sionna_partial.tracing.scene import _triangles
+    from sionna_partial.scene.scene import _triangles
 
     state = np.random.default_rng(seed).choice(3, (ny, nx)).astype(np.uint8)
     partial = PartialMap(state, 0.1)

@@ -23,7 +23,7 @@ from sionna_partial.settings import (
     SensorSettings,
     TraceSettings,
 )
-from sionna_partial.tracing.diffraction import MAX_REFLECTIONS
+from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
 
 ITU_BANDS_OF_SIONNA = """
 from sionna_partial.llvm import load_llvm

@@ -14,10 +14,8 @@ import pytest
 from dataset_fakes import fake_links
 from link_tables import assert_same
 
-from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.settings import DatasetSettings, Material
-from sionna_partial.training.link_table import COLUMNS, LinkTable
-from sionna_partial.training.shards import (
+from sionna_partial.datasets.link_table import COLUMNS, LinkTable
+from sionna_partial.datasets.shards import (
     FORMAT,
     read_dataset,
     read_shard,
@@ -25,6 +23,8 @@ from sionna_partial.training.shards import (
     shard_path,
     write_shard,
 )
+from sionna_partial.errors import OutputError, PredictorError
+from sionna_partial.settings import DatasetSettings, Material
 
 PLAIN = {"shape": [2, 3], "resolution_m": 0.5, "origin_m": [0, 0], "wall_height_m": 3.0, "interior_cells": None}
 NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}

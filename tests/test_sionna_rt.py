@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from extruded import ROOM, extrude
 
-from sionna_partial.tracing.scene import write_scene
+from sionna_partial.scene.scene import write_scene
 from sionna_partial.tracing.sionna_rt import MITSUBA_VARIANT, load_sionna, open_scene
 
 WITH_VARIANT = """

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.diffraction import find_wedges
+from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.scene import SHAPES, SceneGeometry, build_scene, write_scene
+from sionna_partial.tracing.plan.candidates import Candidates
+from sionna_partial.tracing.plan.diffraction import find_wedges
 from sionna_partial.tracing.solver import SceneSolver, _to_device
 
 TX = np.array([1.07, 1.93, 1.2])

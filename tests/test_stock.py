@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.scene.scene import SHAPES, build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.scene import SHAPES, build_scene, write_scene
 from sionna_partial.tracing.sionna_rt import load_sionna
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.stock import listed_before, stock_paths

@@ -12,10 +12,10 @@ from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
-from sionna_partial.learning.features import link_features
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import link_features
+from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.scene import export_scene
 from sionna_partial.tracing.sionna_rt import load_sionna
 from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
 

@@ -12,9 +12,9 @@ from test_trace import _grid, _half_seen_room, _room
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.scene import SHAPES, SceneGeometry, write_scene
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.trace import TracedLinks, trace_links
 

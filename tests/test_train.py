@@ -7,13 +7,14 @@ import pytest
 from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET
 
+from sionna_partial import training as train
 from sionna_partial.errors import OutputError, PredictorError, SettingsError
-from sionna_partial.learning.predictor import Predictor
+from sionna_partial.evaluation.baselines import Baselines
+from sionna_partial.evaluation.evaluate import evaluate
+from sionna_partial.evaluation.metrics import measure
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.training.baselines import Baselines
-from sionna_partial.training.evaluate import evaluate
-from sionna_partial.training.metrics import measure
-from sionna_partial.training.train import split_homes, train
+from sionna_partial.training import split_homes
 
 pytestmark = QUIET
 

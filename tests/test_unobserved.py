@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState
-from sionna_partial.learning.unobserved import line_shares, unobserved_lengths_m, walled_lengths_m
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.unobserved import line_shares, unobserved_lengths_m, walled_lengths_m
 
 FREE, WALL, UNKNOWN = (int(state) for state in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
 
@@ -110,7 +110,7 @@ def test_many_segments_are_measured_as_few(monkeypatch):
     """By several threads."""
     starts, ends = np.random.default_rng(2).uniform(-1.0, 11.0, (2, 100, 2))
     expected = line_shares(HALF.state, starts, ends)[:, CellState.UNKNOWN]
-    monkeypatch.setattr("sionna_partial.learning.unobserved._SEGMENTS_OF_CORE", 1)
+    monkeypatch.setattr("sionna_partial.prediction.unobserved._SEGMENTS_OF_CORE", 1)
     monkeypatch.setattr("os.sched_getaffinity", lambda _: range(3))
     assert line_shares(HALF.state, starts, ends)[:, CellState.UNKNOWN].tolist() == expected.tolist()
 

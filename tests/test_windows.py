@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState
-from sionna_partial.learning.link_context import REACHES_M, LinkContext
-from sionna_partial.learning.windows import (
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.windows import (
     CELLS_M,
     CHANNELS,
     WINDOW_CELLS,
@@ -17,7 +18,6 @@ from sionna_partial.learning.windows import (
     transmitter_places,
     transmitter_windows,
 )
-from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 CELL_M = CELLS_M[0]

@@ -16,10 +16,10 @@ from scipy.ndimage import binary_dilation
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import SCENE_FILES, atomic_write, output_path
-from sionna_partial.maps.mesh import MAX_TRIANGLES, mesh_arrays, mesh_of_arrays
-from sionna_partial.maps.mesh_files import MESH_SUFFIXES, read_mesh
-from sionna_partial.maps.mesh_map import MeshReading, mesh_map, raised
-from sionna_partial.maps.mesh_scene import read_exported_mesh, read_mitsuba_scene
+from sionna_partial.maps.mesh.cells import MeshReading, mesh_map, raised
+from sionna_partial.maps.mesh.files import MESH_SUFFIXES, read_mesh
+from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, mesh_arrays, mesh_of_arrays
+from sionna_partial.maps.mesh.mitsuba_xml import read_exported_mesh, read_mitsuba_scene
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, require_map
 from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
 from sionna_partial.settings import Material

@@ -11,7 +11,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps.mesh import SceneMesh
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000

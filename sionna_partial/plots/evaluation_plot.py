@@ -6,8 +6,8 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sionna_partial.evaluation.evaluate import Evaluation, Row
 from sionna_partial.settings import require
-from sionna_partial.training.evaluate import Evaluation, Row
 
 _PANELS = {
     "accuracy": "accuracy of the link state",

@@ -17,10 +17,10 @@ from PIL import Image
 
 from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.camera import view_corners_m
-from sionna_partial.maps.explore import Exploration
 from sionna_partial.plots.figures import BLUE, RED, YELLOW
 from sionna_partial.settings import require
+from sionna_partial.simulation.camera import view_corners_m
+from sionna_partial.simulation.explore import Exploration
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
 """How long an animation shows a frame, and its last one [ms]."""

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from sionna_partial.inverse.calibration import MaterialCalibration
+from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.plots.figures import BLUE, RED
 from sionna_partial.settings import Material
 from sionna_partial.tracing.slab import reflection_loss_db

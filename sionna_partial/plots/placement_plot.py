@@ -13,8 +13,8 @@ from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
-from sionna_partial.inverse.placement import TransmitterPlacement
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.plots.figures import BLUE, RED
 from sionna_partial.settings import require
 

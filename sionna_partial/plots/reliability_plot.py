@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from sionna_partial.datasets.link_table import stage_name
+from sionna_partial.evaluation.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration
 from sionna_partial.settings import require
-from sionna_partial.training.link_table import stage_name
-from sionna_partial.training.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration
 
 _COLOUR = "#004488"
 _IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}

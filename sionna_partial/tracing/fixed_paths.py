@@ -17,10 +17,10 @@ from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, require
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.contract import contract_remedy
 from sionna_partial.tracing.generator import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.plan.candidates import Candidates
 from sionna_partial.tracing.probe import fast_engine_works
 from sionna_partial.tracing.solver import SceneSolver, Variables, forward_passes
 from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary

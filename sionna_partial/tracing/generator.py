@@ -11,15 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.beams import trace_beams
-from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
-from sionna_partial.tracing.candidates import Candidates, Room, Wedges, specular_candidates
-from sionna_partial.tracing.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
-from sionna_partial.tracing.mesh_candidates import mesh_candidates
-from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.rays import shoot_rays
-from sionna_partial.tracing.scene import (
+from sionna_partial.scene.scene import (
     SHAPES,
     SceneGeometry,
     build_scene,
@@ -27,6 +19,14 @@ from sionna_partial.tracing.scene import (
     write_mesh_scene,
     write_scene,
 )
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.mesh.candidates import mesh_candidates
+from sionna_partial.tracing.mesh.rays import shoot_rays
+from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.plan.beams import trace_beams
+from sionna_partial.tracing.plan.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
+from sionna_partial.tracing.plan.candidates import Candidates, Room, Wedges, specular_candidates
+from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.solver import SceneSolver
 
 Found = tuple[Candidates, SolvedPaths, float, str]

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges, in_copies_of_scene
 from sionna_partial.tracing.chain import Chain
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.plan.candidates import EDGE, Candidates, Wedges, in_copies_of_scene
 from sionna_partial.tracing.sionna_rt import load_sionna, open_scene
 
 _ALIGNMENT_BYTES = 64

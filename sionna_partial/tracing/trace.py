@@ -17,11 +17,11 @@ from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
 from sionna_partial.tracing.generator import Finder, WrittenScene, bends_at, write_scene_of
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
 from sionna_partial.tracing.probe import fast_engine_works
-from sionna_partial.tracing.scene import scene_settings_of
 from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.stock import stock_paths
 

@@ -1,0 +1,1 @@
+"""Materials fitted to measured path gains."""

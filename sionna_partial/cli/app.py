@@ -1,0 +1,80 @@
+"""Command line: one subcommand for each arrow from a map to its coverage, and from homes to a predictor."""
+
+import logging
+import os
+import warnings
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from sionna_partial import __version__
+from sionna_partial.cli.inverse import calibrate, place
+from sionna_partial.cli.learning import dataset, evaluate, train
+from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
+from sionna_partial.cli.shell import TransmitterCommand
+from sionna_partial.errors import SionnaPartialError
+
+
+class _ErrorLineGroup(TyperGroup):
+    """Reports an error that is the user's to mend in one line, with exit code 2."""
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the subcommand."""
+        try:
+            return super().invoke(ctx)
+        except SionnaPartialError as error:
+            typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(2) from None
+
+
+class _WarningLine(logging.Handler):
+    """Writes warnings as one line each."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record to stderr as it is now."""
+        typer.echo(f"{record.levelname.lower()}: {record.getMessage()}", err=True)
+
+
+app = typer.Typer(
+    cls=_ErrorLineGroup,
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Run the command line (entry point `sionna-partial`)."""
+    app(prog_name="sionna-partial")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _prepare(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Predict radio coverage from a robot's partial map."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    logging.getLogger("sionna_partial").addHandler(_WarningLine(logging.WARNING))
+    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
+
+
+app.command(cls=TransmitterCommand)(predict)
+app.command()(export_scene)
+app.command()(explore)
+app.command()(dataset)
+app.command()(train)
+app.command()(evaluate)
+app.command()(calibrate)
+app.command()(place)
+app.command()(demo)
+app.command()(info)

@@ -1,0 +1,1 @@
+"""Links of many homes: built on a cluster, kept in shards, read."""

@@ -1,0 +1,347 @@
+"""Homes -> data set: a folder of shards, built by dask workers, at home or on a cluster; kill it and run it again."""
+
+import hashlib
+import json
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from distributed import Client, Future, KilledWorker, LocalCluster, wait
+
+from sionna_partial.datasets.home_process import (
+    HomeResult,
+    HomeTask,
+    allow_homes,
+    installed_versions,
+    run_home,
+    stop_homes,
+)
+from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
+from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER
+from sionna_partial.errors import BackendError, OutputError, SettingsError
+from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
+from sionna_partial.settings import DatasetSettings, require_number, require_whole, settings_or_default
+
+HomeProgress = Callable[[int, int, str], None]
+"""Called with the number of homes that are done, their number in all, and what has just happened."""
+
+LOOK_S = 1.0
+"""Time between two looks at the workers [s]: more may have come."""
+
+ANY_PORT = "127.0.0.1:0"
+"""Where dask's own pages are: its usual port may be taken."""
+
+CONNECT_S = 30.0
+"""Time to wait for a scheduler [s]."""
+
+
+@dataclass(frozen=True)
+class DatasetReport:
+    """What a run has done.
+
+    Parameters
+    ----------
+    folder : Path
+    built : tuple of str
+        Names of the homes that this run has built.
+    skipped : tuple of str
+        Names of the homes that were there.
+    failed : dict of str to str
+        Why homes are missing, by their names. The next run tries them again.
+    elapsed_s : float
+        Time that the run took [s].
+    """
+
+    folder: Path
+    built: tuple[str, ...]
+    skipped: tuple[str, ...]
+    failed: Mapping[str, str]
+    elapsed_s: float
+
+
+def build_dataset(
+    folder: str | os.PathLike[str],
+    homes: Iterable[Home],
+    settings: DatasetSettings | None = None,
+    *,
+    scheduler: str | None = None,
+    workers: int | None = None,
+    home_time_limit_s: float = 900.0,
+    progress: HomeProgress | None = None,
+) -> DatasetReport:
+    """Build a data set: the links of many homes, on all cores or on a dask cluster.
+
+    The folder gets `dataset.json` (settings, homes, versions), `shards/<home>.parquet` for each home, and
+    `failed/<home>.json` for each home that could not be made. Shards appear whole or not at all. A run that was ended,
+    in whatever way, is continued by the same call, which gives the bytes that an unbroken run would have given. Homes
+    may be added later. A map file that changes is not noticed: build from it in a new folder.
+
+    Every home is made in a process beside its worker, so that a home that raises, crashes or hangs is the only one to
+    fail. It is tried again where its process or worker died, which may be no fault of the home.
+
+    Parameters
+    ----------
+    folder : path-like
+        Folder of the data set. With a `scheduler`, all workers must see it under the same path: it must be on a file
+        system that they share. A worker that does not see it ends the run with an error.
+    homes : iterable of int, (int, str) or path-like
+        Seeds of `make_home`, pairs of a seed and a kind, and complete maps or folders of them (`home_sources`).
+    settings : DatasetSettings, optional
+    scheduler : str, optional
+        Address of a dask scheduler (tcp://host:8786), or path of a scheduler file. By default this machine works.
+    workers : int, optional
+        Number of homes that this machine makes at a time; by default one for each core it may use.
+    home_time_limit_s : float
+        Time that a home may take [s].
+    progress : callable, optional
+        Called as ``progress(homes_done, homes, message)``.
+
+    Returns
+    -------
+    DatasetReport
+
+    Raises
+    ------
+    SettingsError
+        For an argument out of range, or if the folder holds a data set of other settings, homes or versions.
+    MapError
+        If there is no home, or a path is not there.
+    OutputError
+        If the folder cannot be written, holds something else or is being written by another run, a worker cannot see
+        it, or a worker cannot make homes.
+    BackendError
+        If the scheduler cannot be reached.
+    """
+    start = time.monotonic()
+    settings = settings_or_default("settings", settings, DatasetSettings)
+    require_number("home_time_limit_s", home_time_limit_s, 0.0, 1e6, open_low=True)
+    if workers is not None:
+        require_whole("workers", workers, 1, 1000)
+        if scheduler is not None:
+            raise SettingsError(f"workers = {workers!r} is for this machine, and scheduler is given: leave one out.")
+    target, sources = Path(os.path.abspath(output_path(folder))), home_sources(homes)
+    with locked_folder(target):
+        tasks = _prepare(target, sources, settings, home_time_limit_s)
+        run = _Run(target, progress or (lambda done, total, message: None), len(tasks))
+        missing = [task for task in tasks if not run.skips(task)]
+        if missing:
+            at_once = min(workers or len(os.sched_getaffinity(0)), len(missing))
+            with _connected(scheduler, at_once) as client, client.as_current():
+                run.make(client, missing)
+    return DatasetReport(target, tuple(run.built), tuple(run.skipped), run.failed, time.monotonic() - start)
+
+
+class _Run:
+    """What has become of the homes so far."""
+
+    def __init__(self, folder: Path, progress: HomeProgress, homes: int) -> None:
+        self._folder, self._progress, self._homes = folder, progress, homes
+        self.built: list[str] = []
+        self.skipped: list[str] = []
+        self.failed: dict[str, str] = {}
+
+    def skips(self, task: HomeTask) -> bool:
+        """Whether a home is there."""
+        if task.is_done:
+            self.skipped.append(task.source.name)
+            self._forget_failure(task.source.name)
+        return task.is_done
+
+    def make(self, client: Client, tasks: list[HomeTask]) -> None:
+        """Make homes, as many at a time as there are workers: no home waits on a worker that another one may kill."""
+        self._report("starting the workers")
+        waiting, running = tasks[::-1], dict[Future, HomeTask]()
+        while waiting or running:
+            room = sum(_threads(client).values()) - len(running)
+            for _ in range(min(room, len(waiting))):
+                task = waiting.pop()
+                running[client.submit(run_home, task, pure=False)] = task
+            if not running:
+                self._report("waiting for a worker")
+                time.sleep(LOOK_S)
+                continue
+            for future in _finished(list(running)):
+                self._note(running.pop(future), _result(future))
+
+    def _note(self, task: HomeTask, result: HomeResult) -> None:
+        name = task.source.name
+        if result.outcome == "unusable":
+            raise OutputError(f"{result.error} The homes that are built stay: run it again.")
+        if result.outcome == "done":
+            self.built.append(name)
+            self._forget_failure(name)
+        else:
+            self.failed[name] = result.error
+            with atomic_write(_failure_path(self._folder, name), "w") as stream:
+                json.dump({"home": task.source.record, "error": result.error}, stream, indent=2)
+        self._report(f"{name} {'built' if result.outcome == 'done' else 'failed'}")
+
+    def _forget_failure(self, name: str) -> None:
+        _failure_path(self._folder, name).unlink(missing_ok=True)
+
+    def _report(self, message: str) -> None:
+        done = len(self.built) + len(self.skipped) + len(self.failed)
+        self._progress(done, self._homes, message)
+
+
+def _prepare(
+    folder: Path, sources: list[HomeSource], settings: DatasetSettings, home_time_limit_s: float
+) -> list[HomeTask]:
+    """Write or check the folder's `dataset.json`, remove what killed runs left, and return what is to be done."""
+    versions = installed_versions()
+    tasks = [HomeTask(str(folder), "", source, settings, versions, home_time_limit_s) for source in sources]
+    index = {
+        "versions": versions,
+        "settings": tasks[0].metadata["settings"],
+        "homes": [source.record for source in sources],
+    }
+    text = json.dumps(index, indent=2, sort_keys=True) + "\n"
+    _require_same(folder, json.loads(text))
+    for place in (folder, folder / SHARDS_FOLDER, folder / FAILED_FOLDER):
+        for left in place.glob(".tmp-*"):
+            shutil.rmtree(left, ignore_errors=True)
+    if not _has_text(folder / INDEX_FILE, text):
+        with atomic_write(folder / INDEX_FILE, "w") as stream:
+            stream.write(text)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return [HomeTask(str(folder), digest, source, settings, versions, home_time_limit_s) for source in sources]
+
+
+def _require_same(folder: Path, index: dict[str, object]) -> None:
+    """Refuse a folder with something else than an earlier run of the same settings, versions and homes."""
+    path = folder / INDEX_FILE
+    if not path.exists():
+        others = [entry.name for entry in folder.iterdir() if not _is_ours(entry)] if folder.is_dir() else []
+        if others:
+            raise OutputError(
+                f"folder = '{folder}' has other content than a data set ({others[0]}): choose a new or an empty folder."
+            )
+        return
+    try:
+        earlier = json.loads(path.read_text(encoding="utf-8"))
+        differences = list(_differences(earlier, index))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise OutputError(f"'{path}' is damaged ({error}): choose a new folder.") from error
+    if differences:
+        name, before, now = differences[0]
+        more = f" (and {len(differences) - 1} more)" if len(differences) > 1 else ""
+        raise SettingsError(
+            f"{name} was {before} when '{folder}' was begun, and is {now}{more}: take what it was, or a new folder."
+        )
+
+
+def _is_ours(entry: Path) -> bool:
+    """Whether an entry of a folder without `dataset.json` is what a killed run may have left."""
+    return entry.name == LOCK_FILE or entry.name.startswith(".tmp-")
+
+
+def _differences(earlier: dict[str, object], now: dict[str, object]) -> Iterator[tuple[str, str, str]]:
+    """Yield what differs, what it was, and what it is. Homes may have been added."""
+    for part in ("settings", "versions"):
+        before, after = dict(_leaves(earlier[part])), dict(_leaves(now[part]))
+        for name in sorted(before.keys() | after.keys()):
+            was, is_now = (json.dumps(values[name]) if name in values else "not there" for values in (before, after))
+            if was != is_now:
+                yield f"{part}.{name}", was, is_now
+    homes = {home["name"]: home for home in now["homes"]}  # type: ignore[attr-defined]
+    for home in earlier["homes"]:  # type: ignore[attr-defined]
+        other = homes.get(home["name"])
+        if other is None:
+            yield f"home {home['name']!r}", "in the list of homes", "not in it"
+        elif other != home:
+            was, is_now = (json.dumps(one.get("path", one.get("seed"))) for one in (home, other))
+            yield f"home {home['name']!r}", was, is_now
+
+
+def _leaves(tree: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """Names, such as trace.max_depth, and values of nested settings."""
+    if not isinstance(tree, dict):
+        yield name, tree
+        return
+    for key, value in tree.items():
+        yield from _leaves(value, f"{name}.{key}" if name else key)
+
+
+def _has_text(path: Path, text: str) -> bool:
+    return path.is_file() and path.read_text(encoding="utf-8") == text
+
+
+def _failure_path(folder: Path, name: str) -> Path:
+    return folder / FAILED_FOLDER / f"{name}.json"
+
+
+@contextmanager
+def _connected(scheduler: str | None, workers: int) -> Iterator[Client]:
+    """Start workers on this machine, or connect to a scheduler."""
+    if scheduler is not None:
+        with _remote_client(scheduler) as client:
+            yield client
+        return
+    allow_homes()
+    with (
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=False,  # homes have processes of their own
+            dashboard_address=ANY_PORT,
+            worker_dashboard_address=ANY_PORT,
+            memory_limit=0,
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        try:
+            yield client
+        finally:
+            stop_homes()
+
+
+def _remote_client(scheduler: str) -> Client:
+    by_file = scheduler.endswith(".json") or Path(scheduler).is_file()
+    where = {"scheduler_file": scheduler} if by_file else {"address": scheduler}
+    if by_file and not Path(scheduler).is_file():
+        raise BackendError(f"scheduler = {scheduler!r} is not there: give the file that dask scheduler writes.")
+    try:
+        return Client(**where, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise BackendError(
+            f"scheduler = {scheduler!r} does not answer ({error}): give the address that dask scheduler prints, such "
+            "as tcp://host:8786, or its scheduler file."
+        ) from error
+
+
+def _threads(client: Client) -> dict[str, int]:
+    """Return the number of homes that each worker makes at a time."""
+    try:
+        threads: dict[str, int] = client.nthreads()
+    except (OSError, RuntimeError) as error:
+        raise _lost(error) from error
+    return threads
+
+
+def _finished(running: list[Future]) -> list[Future]:
+    """Wait a while for homes that are done."""
+    with suppress(TimeoutError):
+        return list(wait(running, timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
+    return []
+
+
+def _result(future: Future) -> HomeResult:
+    if future.status == "finished":
+        result: HomeResult = future.result()
+        return result
+    if future.status != "error":
+        raise _lost(future.status)
+    error = future.exception()
+    if isinstance(error, KilledWorker):
+        return HomeResult("failed", "its workers died again and again, see their logs")
+    return HomeResult("failed", f"{type(error).__name__}: {error}")
+
+
+def _lost(reason: object) -> BackendError:
+    return BackendError(f"the scheduler is gone ({reason}): run it again, the homes that are built stay.")

@@ -1,0 +1,307 @@
+"""Homes of a data set, each made in a process beside the worker: one that crashes or hangs costs itself alone.
+
+A process serves one home after the other, so that libraries load and compile once. It ends when the worker does, or
+when it has had nothing to do for a while.
+"""
+
+import contextlib
+import faulthandler
+import hashlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import traceback
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Literal
+
+from sionna_partial.datasets.home_links import home_links, home_sensor
+from sionna_partial.datasets.home_sources import HomeSource
+from sionna_partial.datasets.shards import INDEX_FILE, shard_metadata, shard_path, write_shard
+from sionna_partial.errors import BackendError, OutputError, PredictorError, SionnaPartialError
+from sionna_partial.llvm import load_llvm
+from sionna_partial.settings import DatasetSettings
+
+ATTEMPTS = 3
+"""Number of processes that may die over a home. One may have been killed for no fault of the home."""
+
+IDLE_S = 60.0
+"""Time without a home after which a process ends [s]."""
+
+GRACE_S = 60.0
+"""Time that a process has beyond a home's limit to end by itself, and to start [s]."""
+
+TIMEOUT_LINE = "Timeout ("
+"""How the line begins that faulthandler writes before it ends a process that takes too long."""
+
+LAST_LINES = 20
+"""Number of lines of what a dead process wrote that are reported."""
+
+PACKAGES = ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "numpy", "numba", "scipy", "shapely", "pyarrow")
+"""Packages whose versions may change the bytes of a data set."""
+
+ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+
+_idle = threading.local()
+_alive: set["_HomeProcess"] = set()
+_stopped = threading.Event()
+
+
+@dataclass(frozen=True)
+class HomeTask:
+    """A home to be made, and where its shard goes.
+
+    Parameters
+    ----------
+    folder : str
+        Absolute path of the data set's folder.
+    index_sha256 : str
+        SHA-256 of the folder's `dataset.json`.
+    source : HomeSource
+    settings : DatasetSettings
+    versions : dict of str to str
+        Versions of `PACKAGES` that the data set is made with.
+    time_limit_s : float
+        Time that the home may take [s].
+    """
+
+    folder: str
+    index_sha256: str
+    source: HomeSource
+    settings: DatasetSettings
+    versions: dict[str, str]
+    time_limit_s: float
+
+    @property
+    def metadata(self) -> dict[str, object]:
+        """What the shard notes beside its links."""
+        plain = json.dumps(asdict(self.settings), default=lambda number: number.item())  # a number of NumPy's
+        settings = json.loads(plain)
+        sensor = asdict(home_sensor(self.source.name, self.settings))
+        return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the home's shard is there, whole, and of these settings."""
+        try:
+            notes = shard_metadata(shard_path(self.folder, self.source.name))
+        except PredictorError:
+            return False
+        return all(notes.get(name) == value for name, value in self.metadata.items())
+
+    def make(self) -> None:
+        """Make the home's links and write its shard."""
+        table = home_links(self.source.load(), self.source.name, self.settings)
+        write_shard(table, shard_path(self.folder, self.source.name), self.metadata)
+
+
+@dataclass(frozen=True)
+class HomeResult:
+    """What became of a home.
+
+    Parameters
+    ----------
+    outcome : {"done", "failed", "unusable"}
+        Unusable is a worker on which no home can be made.
+    error : str
+        What went wrong: in one line, and more below it.
+    """
+
+    outcome: Literal["done", "failed", "unusable"]
+    error: str = ""
+
+
+def installed_versions() -> dict[str, str]:
+    """Return the versions of `PACKAGES` that are installed."""
+    return {package: version(package) for package in PACKAGES}
+
+
+def run_home(task: HomeTask) -> HomeResult:
+    """Make a home in the process of this thread; the home's errors are returned, not raised."""
+    fault = _fault_of_worker(task)
+    if fault:
+        return HomeResult("unusable", fault)
+    if task.is_done:
+        return HomeResult("done")
+    words: list[str] = []
+    for _ in range(ATTEMPTS):
+        if _stopped.is_set():
+            return HomeResult("failed", "stopped")
+        result = _process_of_thread().make(task)
+        if isinstance(result, HomeResult):
+            return result
+        words = result
+        if any(line.startswith(TIMEOUT_LINE) for line in words):
+            limit = f"took longer than {task.time_limit_s:g} s, the time limit of a home"
+            return HomeResult("failed", "\n".join([limit, "It was at", *words]))
+    died = f"its process died {ATTEMPTS} times {words[-1]}"
+    return HomeResult("failed", "\n".join([died, "The last one wrote", *words]))
+
+
+def allow_homes() -> None:
+    """Let homes be made in this process's threads, after `stop_homes`."""
+    _stopped.clear()
+
+
+def stop_homes() -> None:
+    """Kill the processes of all threads; homes that are being made are given up."""
+    _stopped.set()
+    for process in list(_alive):
+        process.kill()
+        process.close()
+
+
+def serve(descriptor: int) -> None:
+    """Make homes for the worker at the other end of a pipe."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    faulthandler.enable()
+    threading.Thread(target=_end_with_worker, daemon=True).start()
+    link = Connection(descriptor)
+    fault = _fault_of_libraries()
+    with contextlib.suppress(EOFError):
+        while link.poll(IDLE_S):
+            task = link.recv()
+            faulthandler.dump_traceback_later(task.time_limit_s, exit=True)
+            result = HomeResult("unusable", fault) if fault else _made(task)
+            faulthandler.cancel_dump_traceback_later()
+            link.send(result)
+
+
+class _HomeProcess:
+    """A process that makes homes, seen from the worker."""
+
+    def __init__(self) -> None:
+        self._busy = threading.Lock()
+        self._link, far_end = Pipe()
+        self._notes = tempfile.TemporaryFile()  # noqa: SIM115
+        self._scratch = tempfile.TemporaryDirectory(prefix="sionna_partial_", ignore_cleanup_errors=True)
+        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": self._scratch.name}
+        with far_end:
+            descriptor = far_end.fileno()
+            code = f"from sionna_partial.datasets.home_process import serve; serve({descriptor})"
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-c", code],
+                stdin=subprocess.PIPE,
+                stdout=self._notes,
+                stderr=self._notes,
+                pass_fds=[descriptor],
+                env=os.environ | ONE_THREAD | own,
+            )
+        _alive.add(self)
+
+    @property
+    def is_alive(self) -> bool:
+        return self._process.poll() is None
+
+    def make(self, task: HomeTask) -> HomeResult | list[str]:
+        """Make a home; return the lines that the process wrote last if it died or took too long."""
+        with self._busy:
+            if self._link.closed:
+                return ["(stopped)"]
+            self._notes.seek(0)
+            self._notes.truncate()
+            in_time = True
+            with contextlib.suppress(EOFError, OSError):
+                self._link.send(task)
+                in_time = self._link.poll(task.time_limit_s + GRACE_S)
+                if in_time:
+                    result: HomeResult = self._link.recv()
+                    return result
+            self.kill()
+            words = self._last_words() if in_time else [f"{TIMEOUT_LINE}killed)"]
+            self._release()
+            return words
+
+    def kill(self) -> None:
+        """End the process, whatever it does."""
+        self._process.kill()
+        self._process.wait()
+        _alive.discard(self)
+
+    def close(self) -> None:
+        """Release what the dead process has left."""
+        with self._busy:
+            self._release()
+
+    def _release(self) -> None:
+        self._link.close()
+        self._notes.close()
+        self._scratch.cleanup()  # a killed process leaves its temporary files
+        if self._process.stdin:
+            self._process.stdin.close()
+
+    def _last_words(self) -> list[str]:
+        code = self._process.returncode
+        how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+        self._notes.seek(0)
+        lines = self._notes.read().decode(errors="replace").strip().splitlines()
+        late = [number for number, line in enumerate(lines) if line.startswith(TIMEOUT_LINE)]
+        told = lines[late[0] :][:LAST_LINES] if late else lines[-LAST_LINES:]
+        return [*told, f"({how})"]
+
+
+def _process_of_thread() -> _HomeProcess:
+    process: _HomeProcess | None = getattr(_idle, "process", None)
+    if process is None or not process.is_alive:
+        if process is not None:
+            process.kill()
+            process.close()
+        _idle.process = process = _HomeProcess()
+        if _stopped.is_set():  # while it started
+            process.kill()
+    return process
+
+
+def _fault_of_worker(task: HomeTask) -> str:
+    """Say why no home can be made here; nothing if it can."""
+    where = f"the worker on {socket.gethostname()}"
+    index = Path(task.folder) / INDEX_FILE
+    try:
+        digest = hashlib.sha256(index.read_bytes()).hexdigest()
+    except OSError as error:
+        reason = error.strerror
+        return f"{where} cannot read '{index}' ({reason}): give a folder on a file system that all workers share."
+    if digest != task.index_sha256:
+        return f"{where} sees another '{index}': give a folder on a file system that all workers share."
+    differing = {name: found for name, found in installed_versions().items() if task.versions[name] != found}
+    for name, found in differing.items():
+        return f"{where} has {name} {found}, the data set is made with {task.versions[name]}: install that version."
+    return ""
+
+
+def _made(task: HomeTask) -> HomeResult:
+    try:
+        task.make()
+    except (BackendError, OutputError) as error:
+        return HomeResult("unusable", str(error))
+    except SionnaPartialError as error:
+        return HomeResult("failed", str(error))
+    except Exception as error:
+        return HomeResult("failed", f"{type(error).__name__}: {error}\n{traceback.format_exc()}")
+    return HomeResult("done")
+
+
+def _fault_of_libraries() -> str:
+    """Let Dr.Jit start, with one thread; say why it cannot."""
+    try:
+        load_llvm()
+    except BackendError as error:
+        return str(error)
+    import drjit as dr
+
+    dr.set_thread_count(1)
+    return ""
+
+
+def _end_with_worker() -> None:
+    """Wait for the worker's end of a pipe to close, which it does when the worker dies."""
+    os.read(sys.stdin.fileno(), 1)
+    os._exit(1)

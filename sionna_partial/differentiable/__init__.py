@@ -1,0 +1,1 @@
+"""The prediction as TensorFlow functions of transmitter and walls."""

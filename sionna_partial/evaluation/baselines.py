@@ -1,0 +1,247 @@
+"""Simpler answers, to be set beside that of a predictor: each of them LinkFeatures -> LinkPrediction."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.errors import PredictorError
+from sionna_partial.files import atomic_write
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.settings import PredictorSettings
+
+MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
+
+OFFICES = ("mixed", "open")
+"""Indoor scenarios of 3GPP TR 38.901."""
+
+_INDOOR_STD_DB = {LinkState.LOS: 3.0, LinkState.NLOS: 8.03}
+
+
+@dataclass(frozen=True)
+class Majority:
+    """One answer for every link: how many training links were in each state, and their gains.
+
+    Parameters
+    ----------
+    shares, means_db, stds_db : (3,) tuples of float
+        By LinkState: share of the links, mean and standard deviation of their gain [dB]; a state without links has the
+        gain of an outage.
+    """
+
+    shares: tuple[float, ...]
+    means_db: tuple[float, ...]
+    stds_db: tuple[float, ...]
+
+    @classmethod
+    def fit(cls, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> "Majority":
+        """Count true link states (N,), and average true gains (N,) [dB]."""
+        groups = [gain_db[link_state == state] for state in LinkState]
+        known = [group if len(group) else np.array([GAIN_FLOOR_DB]) for group in groups]
+        return cls(
+            tuple(len(group) / len(gain_db) for group in groups),
+            tuple(float(group.mean()) for group in known),
+            tuple(float(group.std()) for group in known),
+        )
+
+    def predict(self, phi: LinkFeatures) -> LinkPrediction:
+        """Say the same of N links, whatever their features."""
+        rows = (self.shares, self.means_db, self.stds_db)
+        return LinkPrediction.of_parts(*(np.repeat(np.array(row)[:, None], len(phi), axis=1) for row in rows))
+
+
+@dataclass(frozen=True, eq=False)
+class Baselines:
+    """The baselines that are fitted to the training links of a predictor.
+
+    Parameters
+    ----------
+    majority : Majority
+    distance : Predictor
+        Fitted to links of which nothing but the distance is known.
+    """
+
+    majority: Majority
+    distance: Predictor
+
+    @classmethod
+    def fit(cls, links: LinkTable, settings: PredictorSettings) -> "Baselines":
+        """Fit to links whose receivers were drawn indoors.
+
+        Parameters
+        ----------
+        links : LinkTable
+        settings : PredictorSettings
+
+        Returns
+        -------
+        Baselines
+        """
+        blind = nothing_seen(links.phi, settings.frequency_hz)
+        homes = list(dict.fromkeys(map(str, links.home)))
+        distance = Predictor.fit(
+            blind, links.link_state, links.gain_db, homes=homes, settings=replace(settings, networks="paper")
+        )
+        return cls(Majority.fit(links.link_state, links.gain_db), distance)
+
+    def save(self, folder: Path) -> None:
+        """Write `majority.json`, `distance.keras` and its card into a folder."""
+        self.distance.save(folder / DISTANCE_FILE)
+        rows = zip(LinkState, self.majority.shares, self.majority.means_db, self.majority.stds_db, strict=True)
+        content = {
+            state.name: {"share": share, "gain_mean_db": mean_db, "gain_std_db": std_db}
+            for state, share, mean_db, std_db in rows
+        }
+        with atomic_write(folder / MAJORITY_FILE, "w") as stream:
+            stream.write(json.dumps(content, indent=2) + "\n")
+
+    @classmethod
+    def load(cls, folder: Path) -> "Baselines":
+        """Read what `save` wrote.
+
+        Parameters
+        ----------
+        folder : pathlib.Path
+
+        Returns
+        -------
+        Baselines
+
+        Raises
+        ------
+        PredictorError
+            If a file is missing or damaged.
+        """
+        path = folder / MAJORITY_FILE
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            cells = [content[state.name] for state in LinkState]
+            columns = (tuple(float(cell[name]) for cell in cells) for name in ("share", "gain_mean_db", "gain_std_db"))
+            majority = Majority(*columns)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise PredictorError(
+                f"path = '{path}' cannot be read ({error!r}): copy it again, or train the predictor beside it anew."
+            ) from error
+        return cls(majority, Predictor.load(folder / DISTANCE_FILE))
+
+
+def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
+    """Return the features of the same N links on an empty map, where the distance is all that is known.
+
+    Parameters
+    ----------
+    phi : LinkFeatures
+    frequency_hz : float
+        Carrier frequency [Hz].
+
+    Returns
+    -------
+    LinkFeatures
+    """
+    gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)
+    return LinkFeatures(np.full(len(phi), LinkState.LOS), phi.distance_m, phi.distance_m, gain_db)
+
+
+def indoor_los_probability(distance_m: NDArray[np.float64], office: str) -> NDArray[np.float64]:
+    """Return the LOS probability of 3GPP TR 38.901 V18.0.0, Table 7.4.2-1, "Indoor - Mixed/Open office".
+
+    Parameters
+    ----------
+    distance_m : (N,) float64 array
+        Horizontal distance [m].
+    office : {"mixed", "open"}
+
+    Returns
+    -------
+    (N,) float64 array
+    """
+    d = distance_m
+    if office == "mixed":
+        near, far = np.exp(-(d - 1.2) / 4.7), 0.32 * np.exp(-(d - 6.5) / 32.6)
+        return np.select([d <= 1.2, d < 6.5], [1.0, near], far)
+    near, far = np.exp(-(d - 5.0) / 70.8), 0.54 * np.exp(-(d - 49.0) / 211.7)
+    return np.select([d <= 5.0, d <= 49.0], [1.0, near], far)
+
+
+def indoor_gain_db(distance_m: NDArray[np.float64], frequency_hz: float) -> dict[LinkState, NDArray[np.float64]]:
+    """Return the path gain of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
+
+    Parameters
+    ----------
+    distance_m : (N,) float64 array
+        Distance in three dimensions [m]; the model is made for 1 to 150 m, and is extended to 1 cm here.
+    frequency_hz : float
+        Carrier frequency [Hz], 0.5 to 100 GHz in the model.
+
+    Returns
+    -------
+    dict of LinkState to (N,) float64 array
+        Negative path losses [dB], without shadow fading.
+    """
+    decades, frequency = np.log10(np.maximum(distance_m, 0.01)), np.log10(frequency_hz / 1e9)
+    los_db = 32.4 + 17.3 * decades + 20.0 * frequency
+    nlos_db = np.maximum(los_db, 38.3 * decades + 17.30 + 24.9 * frequency)
+    return {LinkState.LOS: -los_db, LinkState.NLOS: -nlos_db}
+
+
+def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkPrediction:
+    """Answer with the indoor model of 3GPP TR 38.901, which knows distances only, and no outage.
+
+    The gain is Gaussian with the shadow fading of Table 7.4.1-1: 3 dB in LOS, 8.03 dB in NLOS. Transmitter and receiver
+    are taken to be at the same height, so that the horizontal distance is the distance.
+
+    Parameters
+    ----------
+    phi : LinkFeatures
+        Of N links.
+    frequency_hz : float
+        Carrier frequency [Hz].
+    office : {"mixed", "open"}
+
+    Returns
+    -------
+    LinkPrediction
+    """
+    p_los, gains_db = indoor_los_probability(phi.distance_m, office), indoor_gain_db(phi.distance_m, frequency_hz)
+    floor, none = np.full(len(phi), GAIN_FLOOR_DB), np.zeros(len(phi))
+    means_db = {LinkState.OUTAGE: floor} | gains_db
+    return LinkPrediction.of_parts(
+        np.stack([none, p_los, 1.0 - p_los]),
+        np.stack([np.maximum(means_db[state], GAIN_FLOOR_DB) for state in LinkState]),
+        np.stack([np.full(len(phi), _INDOOR_STD_DB.get(state, 0.0)) for state in LinkState]),
+    )
+
+
+def answers(
+    baselines: Baselines, paper: Predictor | None, phi: LinkFeatures, frequency_hz: float
+) -> Mapping[str, LinkPrediction]:
+    """Let every baseline answer for N links.
+
+    Parameters
+    ----------
+    baselines : Baselines
+    paper : Predictor, optional
+        The paper's.
+    phi : LinkFeatures
+    frequency_hz : float
+        Carrier frequency [Hz].
+
+    Returns
+    -------
+    mapping of str to LinkPrediction
+        The paper's predictor first.
+    """
+    distance = baselines.distance
+    return ({} if paper is None else {"paper": paper.predict(phi)}) | {
+        "distance only": distance.predict(nothing_seen(phi, distance.settings.frequency_hz)),
+        "majority": baselines.majority.predict(phi),
+        "partial trace": LinkPrediction.of_trace(phi),
+        **{f"TR 38.901 {office} office": tr38901_indoor(phi, frequency_hz, office) for office in OFFICES},
+    }

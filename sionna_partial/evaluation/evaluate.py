@@ -1,0 +1,296 @@
+"""Judge a predictor beside simpler answers, on homes that it was trained on and on others: Predictor -> Evaluation."""
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like
+from sionna_partial.datasets.link_table import LinkTable, stage_name
+from sionna_partial.errors import PredictorError
+from sionna_partial.evaluation.baselines import MAJORITY_FILE, Baselines, answers
+from sionna_partial.evaluation.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.resources import PREDICTORS_FOLDER
+
+ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
+"""How many ends of a link are in observed cells."""
+
+WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
+"""The predictor where receivers may be outside: as if all were indoors, and with `LinkPrediction.anywhere`."""
+
+ALWAYS_OUTAGE = "always outage"
+"""What to beat where most receivers are outside."""
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Figures of merit of one answer on some links.
+
+    Parameters
+    ----------
+    homes : {"test", "train"}
+        Whether the predictor was trained on the homes of these links.
+    receivers : {"indoor", "anywhere"}
+        Whether receivers were drawn indoors, or from the whole map area.
+    stage : float
+        Steps that the robot has explored; below 1, the fraction that it was to observe.
+    ends_seen : {"all", "both", "one", "none"}
+        Which links: all, or those with so many ends in observed cells.
+    answer : str
+        "predictor" or a baseline.
+    metrics : Metrics
+    """
+
+    homes: str
+    receivers: str
+    stage: float
+    ends_seen: str
+    answer: str
+    metrics: Metrics
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A predictor minus a baseline on the same links: means over test homes, and their standard errors.
+
+    Parameters
+    ----------
+    receivers : {"indoor", "anywhere"}
+    stage : float
+    baseline : str
+    homes : int
+    accuracy, accuracy_error : float
+        Mean of the differences of the homes' accuracies, and its standard error over homes; nan for one home.
+    rmse_db, rmse_error_db : float
+        The same of the homes' root mean square gain errors [dB].
+    """
+
+    receivers: str
+    stage: float
+    baseline: str
+    homes: int
+    accuracy: float
+    accuracy_error: float
+    rmse_db: float
+    rmse_error_db: float
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What `evaluate` found.
+
+    Parameters
+    ----------
+    predictor, fingerprint : str
+        Name of the predictor, and SHA-256 of its file.
+    homes : mapping of str to tuple of str
+        Names of the "test" and "train" homes.
+    rows : tuple of Row
+    differences : tuple of Difference
+    calibrations : mapping of int to Calibration
+        Of the predictor on test homes, receivers indoors, by exploration steps.
+    notes : tuple of str
+        What to know when reading it.
+    """
+
+    predictor: str
+    fingerprint: str
+    homes: Mapping[str, tuple[str, ...]]
+    rows: tuple[Row, ...]
+    differences: tuple[Difference, ...]
+    calibrations: Mapping[float, Calibration]
+    notes: tuple[str, ...]
+
+    def select(self, **wanted: object) -> list[Row]:
+        """Return the rows whose fields have the wanted values, such as ``select(homes="test", stage=200)``."""
+        return [row for row in self.rows if all(getattr(row, name) == value for name, value in wanted.items())]
+
+
+def evaluate(
+    predictor: Predictor | str | Path | None,
+    dataset: Dataset,
+    *,
+    baselines: Baselines | None = None,
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Measure a predictor and its baselines on the links of a data set, stage by stage.
+
+    Homes that the predictor's card names are training homes, all others test homes. Where receivers are drawn from the
+    whole map area, the predictor is measured with and without its indoor model; a receiver in an observed cell is
+    indoors for certain.
+
+    Parameters
+    ----------
+    predictor : None, "map", "paper", path or Predictor
+    dataset : LinkTable, path, or sequence of paths
+        Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
+    baselines : Baselines, optional
+        Those fitted to other links; by default those in the folder of the predictor, else the shipped ones.
+    progress : callable, optional
+        Called as ``progress(share_done, message)``.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    PredictorError
+        If the data set or a predictor cannot be read; if the data set has no links, or was traced at another frequency
+        than the predictor's, or otherwise with diffraction; or if the predictor was trained on all of its homes.
+    """
+    model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+    links, traces = open_links(dataset)
+    remedy = "choose another predictor, or build a data set with such traces."
+    require_like(
+        traces, LinkTraces.of_settings(model.settings), f"predictor '{model.name}' was trained on links", remedy
+    )
+    homes = _homes(model, links)
+    contestants = _Contestants(model, baselines or Baselines.load(_baselines_folder(model)), _paper(model))
+    rows, differences, calibrations = [], [], {}
+    parts = list(itertools.product(homes, map(float, np.unique(links.stage))))
+    for index, (name, stage) in enumerate(parts):
+        if progress:
+            progress(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
+        both = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
+        for receivers, some, given in contestants.answers(both):
+            rows += list(_rows(name, receivers, stage, some, given))
+            if name == "test":
+                differences += list(_differences(receivers, stage, some, given))
+                if receivers == "indoor":
+                    calibrations[stage] = calibration(given["predictor"], some.link_state, some.gain_db)
+    notes = tuple(contestants.notes(homes["test"]))
+    return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
+
+
+def home_scores(answer: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Measure an answer on each home by itself.
+
+    Parameters
+    ----------
+    answer : LinkPrediction
+        For N links.
+    links : LinkTable
+        These links.
+
+    Returns
+    -------
+    accuracies, rmses_db : (H,) float64 arrays
+        Accuracy and root mean square gain error [dB] of each of the H homes, in the order of their names.
+    """
+    _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
+    right = np.bincount(home, answer.link_state == links.link_state)
+    squares = np.bincount(home, gain_errors_db(answer, links.link_state, links.gain_db) ** 2)
+    return right / count, np.sqrt(squares / count)
+
+
+def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
+    """Average over homes.
+
+    Parameters
+    ----------
+    values : (H,) float64 array
+        One of each home.
+
+    Returns
+    -------
+    mean, error : float
+        Their mean, and its standard error; nan for one home.
+    """
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return float(values.mean()), float(error)
+
+
+@dataclass(frozen=True, eq=False)
+class _Contestants:
+    """Those who answer: the predictor, the fitted baselines, and the paper's predictor unless it is out of place."""
+
+    predictor: Predictor
+    baselines: Baselines
+    paper: Predictor | None
+
+    def answers(self, links: LinkTable) -> Iterator[tuple[str, LinkTable, Mapping[str, LinkPrediction]]]:
+        """Yield "indoor" and "anywhere", the links of such receivers, and the answers for them.
+
+        The predictor is asked once: the transmitters of both are the same, and so are their windows.
+        """
+        given = self.predictor.predict(links.phi)
+        for receivers, answer in (("indoor", self._indoors), ("anywhere", self._anywhere)):
+            drawn = links.anywhere == (receivers == "anywhere")
+            if drawn.any():
+                some = links.take(drawn)
+                yield receivers, some, answer(some, given.take(drawn))
+
+    def _indoors(self, links: LinkTable, given: LinkPrediction) -> Mapping[str, LinkPrediction]:
+        """Answers where receivers are indoors."""
+        others = answers(self.baselines, self.paper, links.phi, self.predictor.settings.frequency_hz)
+        return {"predictor": given, **others}
+
+    def _anywhere(self, links: LinkTable, indoors: LinkPrediction) -> Mapping[str, LinkPrediction]:
+        """Answers where receivers may be outside, from the predictor's for receivers indoors."""
+        p_indoor = np.where(links.context.rx_seen, 1.0, self.predictor.predict_indoor(links.phi))
+        outage = indoors.anywhere(np.zeros(len(links)))
+        return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
+
+    def notes(self, test: tuple[str, ...]) -> Iterator[str]:
+        """Say which homes the others know."""
+        fitted = self.baselines.distance
+        those = "those" if set(fitted.homes) == set(self.predictor.homes) else "others than those"
+        yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
+        for name, model in (("The shipped paper's predictor", self.paper), ("Distance only", fitted)):
+            known = len(set(model.homes) & set(test)) if model else 0
+            if known:
+                yield f"{name} was trained on {known} of the {len(test)} test homes."
+
+
+def _homes(model: Predictor, links: LinkTable) -> dict[str, tuple[str, ...]]:
+    """Names of test and of training homes in the order of the data set."""
+    names = list(dict.fromkeys(map(str, links.home)))
+    trained = set(model.homes)
+    test, train = (tuple(name for name in names if (name in trained) == seen) for seen in (False, True))
+    if not test:
+        raise PredictorError(
+            f"predictor '{model.name}' was trained on all {len(train)} homes of the data set: "
+            "give a data set of other homes, such as other seeds, or train with test_share above 0."
+        )
+    return {"test": test} | ({"train": train} if train else {})
+
+
+def _baselines_folder(model: Predictor) -> Path:
+    beside = Path(model.name).parent
+    return beside if model.name.endswith(".keras") and (beside / MAJORITY_FILE).is_file() else PREDICTORS_FOLDER
+
+
+def _paper(model: Predictor) -> Predictor | None:
+    """Load the paper's predictor; None if it is the same, or differs in frequency or diffraction."""
+    paper = Predictor.load("paper")
+    here, there = (LinkTraces.of_settings(each.settings) for each in (model, paper))
+    return paper if here.is_like(there) and model.fingerprint != paper.fingerprint else None
+
+
+def _rows(
+    homes: str, receivers: str, stage: float, links: LinkTable, given: Mapping[str, LinkPrediction]
+) -> Iterator[Row]:
+    ends = links.context.tx_seen.astype(np.int64) + links.context.rx_seen
+    cells = {"all": np.ones(len(links), dtype=bool)} | {name: ends == count for name, count in ENDS_SEEN.items()}
+    for name, cell in cells.items():
+        state, gain_db = links.link_state[cell], links.gain_db[cell]
+        for answer, prediction in given.items():
+            yield Row(homes, receivers, stage, name, answer, measure(prediction.take(cell), state, gain_db))
+
+
+def _differences(
+    receivers: str, stage: float, links: LinkTable, given: Mapping[str, LinkPrediction]
+) -> Iterator[Difference]:
+    """Compare the first answer with each of the others."""
+    scores = {answer: home_scores(prediction, links) for answer, prediction in given.items()}
+    first, *others = scores
+    for baseline in others:
+        accuracy, rmse_db = (one - other for one, other in zip(scores[first], scores[baseline], strict=True))
+        yield Difference(receivers, stage, baseline, len(accuracy), *mean_and_error(accuracy), *mean_and_error(rmse_db))

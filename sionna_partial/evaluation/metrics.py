@@ -1,0 +1,228 @@
+"""How good a prediction is: LinkPrediction + what is true -> Metrics."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.prediction.predictor import LinkPrediction
+
+CONFIDENCE_BINS = 15
+"""Equal-width bins of the confidence in the calibration error."""
+
+PIT_BINS = 20
+"""Equal-width bins of the probability integral transform of the gain in `Calibration`."""
+
+INTERVAL = (0.05, 0.95)
+"""Levels of the central 90 % interval of the gain."""
+
+_NO_SPREAD_DB = 1e-6
+"""A standard deviation below this is rounding [dB]."""
+
+LEAST_PROBABILITY = 1e-4
+"""Of the true link state in a likelihood: a map with errors excludes true states now and then."""
+
+DEFINITIONS = {
+    "links": "number of links that were measured.",
+    "accuracy": "share of links whose likeliest link state is the true one.",
+    "rmse_db": "root mean square of predictive mean minus true path gain [dB]; an outage counts -150 dB on both sides.",
+    "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
+    "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
+    "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat], P as before; an outage has no "
+    "second term.",
+    "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
+    f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
+    "likeliest state.",
+    "coverage_90": "share of links whose true gain lies in the central 90 % interval, by the randomised probability "
+    "integral transform, spread evenly over the probability of an outage; 0.9 is right.",
+}
+"""What each of the `Metrics` means."""
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Figures of merit of one prediction of N links, as `DEFINITIONS` says; nan where one has no finite value.
+
+    That is so without links; for `rmse_linked_db` if all links are in outage; for `nll` if a gain is predicted without
+    spread; and for `coverage_90` of an answer without any spread.
+    """
+
+    links: int
+    accuracy: float
+    rmse_db: float
+    rmse_linked_db: float
+    nll_state: float
+    nll: float
+    calibration_error: float
+    coverage_90: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures by name, None for nan, which JSON does not have."""
+        return {name: None if math.isnan(value) else value for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability:
+    """How often the likeliest link state is true, by the confidence in it: arrays (`CONFIDENCE_BINS`,).
+
+    Parameters
+    ----------
+    links : int64 array
+        Number of links in each bin of the confidence.
+    confidence, accuracy : float64 arrays
+        Their mean confidence and their accuracy; 0 in an empty bin.
+    """
+
+    links: NDArray[np.int64]
+    confidence: NDArray[np.float64]
+    accuracy: NDArray[np.float64]
+
+    @property
+    def error(self) -> float:
+        """Expected calibration error; nan without links."""
+        total = self.links.sum()
+        return float((self.links * np.abs(self.accuracy - self.confidence)).sum() / total) if total else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Whether predicted probabilities are what they say.
+
+    Parameters
+    ----------
+    state : Reliability
+        Of the link state.
+    gain_pit : (PIT_BINS,) float64 array
+        Shares of the randomised probability integral transform of the true gains in bins of equal width; all equal
+        when calibrated.
+    """
+
+    state: Reliability
+    gain_pit: NDArray[np.float64]
+
+
+def measure(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Metrics:
+    """Compare a prediction of N links with what is true.
+
+    Parameters
+    ----------
+    answer : LinkPrediction
+    link_state : (N,) uint8 array of LinkState
+        True link states.
+    gain_db : (N,) float64 array
+        True omnidirectional path gains [dB]; in an outage they count as -150 dB.
+
+    Returns
+    -------
+    Metrics
+    """
+    outage = link_state == LinkState.OUTAGE
+    errors_db = gain_errors_db(answer, link_state, gain_db)
+    nll_state, nll = _negative_log_likelihoods(answer, link_state, gain_db)
+    low, high = pit_shares(answer, link_state, gain_db, np.array(INTERVAL))
+    return Metrics(
+        links=len(link_state),
+        accuracy=_mean(answer.link_state == link_state),
+        rmse_db=math.sqrt(_mean(errors_db**2)),
+        rmse_linked_db=math.sqrt(_mean(errors_db[~outage] ** 2)),
+        nll_state=nll_state,
+        nll=nll,
+        calibration_error=reliability(answer, link_state).error,
+        coverage_90=float(high - low) if (answer.gain_std_db > _NO_SPREAD_DB).any() else math.nan,
+    )
+
+
+def calibration(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Calibration:
+    """Measure the calibration of link state and gain; arguments as for `measure`."""
+    shares = pit_shares(answer, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
+    return Calibration(reliability(answer, link_state), np.diff(shares))
+
+
+def gain_errors_db(
+    answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB; arguments as for `measure`."""
+    return answer.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+
+
+def reliability(answer: LinkPrediction, link_state: NDArray[np.uint8]) -> Reliability:
+    """Compare confidence and accuracy of the link state, bin by bin; arguments as for `measure`."""
+    confidence = np.max([answer.p_outage, answer.p_los, answer.p_nlos], axis=0)
+    bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
+    links = np.bincount(bins, minlength=CONFIDENCE_BINS)
+    right = (answer.link_state == link_state).astype(np.float64)
+    sums = (np.bincount(bins, weights, minlength=CONFIDENCE_BINS) for weights in (confidence, right))
+    return Reliability(links, *(total / np.maximum(links, 1) for total in sums))
+
+
+def pit_shares(
+    answer: LinkPrediction,
+    link_state: NDArray[np.uint8],
+    gain_db: NDArray[np.float64],
+    levels: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return how much of the probability integral transforms of the true gains lies below some levels.
+
+    The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
+    that of an outage has, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
+    prediction returns the levels themselves.
+
+    Parameters
+    ----------
+    answer, link_state, gain_db
+        As for `measure`.
+    levels : (K,) float64 array
+        In [0, 1].
+
+    Returns
+    -------
+    (K,) float64 array
+        Shares of the links; nan without links.
+    """
+    if len(link_state) == 0:
+        return np.full(len(levels), np.nan)
+    below, upto = _gain_probabilities(answer, np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db))
+    width = np.maximum(upto - below, 1e-12)
+    return np.array([np.clip((level - below) / width, 0.0, 1.0).mean() for level in levels])
+
+
+def _gain_probabilities(
+    answer: LinkPrediction, gain_db: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Predicted probabilities (N,) of a smaller gain, and of a gain that is not greater."""
+    floor, none = np.full_like(gain_db, GAIN_FLOOR_DB), np.zeros_like(gain_db)
+    below, upto = none.copy(), none.copy()
+    for p, mean_db, std_db in (
+        (answer.p_outage, floor, none),
+        (answer.p_los, answer.gain_los_mean_db, answer.gain_los_std_db),
+        (answer.p_nlos, answer.gain_nlos_mean_db, answer.gain_nlos_std_db),
+    ):
+        offset_db = gain_db - mean_db
+        spread = ndtr(offset_db / np.where(std_db > 0.0, std_db, 1.0))
+        below += p * np.where(std_db > 0.0, spread, offset_db > 0.0)
+        upto += p * np.where(std_db > 0.0, spread, offset_db >= 0.0)
+    return below, upto
+
+
+def _negative_log_likelihoods(
+    answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
+) -> tuple[float, float]:
+    """Of the link state, and of link state and gain; nan where it is not finite."""
+    los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
+    p = np.select([los, outage], [answer.p_los, answer.p_outage], answer.p_nlos)
+    mean_db = np.where(los, answer.gain_los_mean_db, answer.gain_nlos_mean_db)
+    std_db = np.where(los, answer.gain_los_std_db, answer.gain_nlos_std_db)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        state = -np.log(np.maximum(p, LEAST_PROBABILITY))
+        gain = 0.5 * ((gain_db - mean_db) / std_db) ** 2 + np.log(std_db * math.sqrt(2.0 * math.pi))
+        means = _mean(state), _mean(state + np.where(outage, 0.0, gain))
+    nll_state, nll = (value if math.isfinite(value) else math.nan for value in means)
+    return nll_state, nll
+
+
+def _mean(values: NDArray[Any]) -> float:
+    return float(values.mean()) if len(values) else math.nan

@@ -1,1 +1,0 @@
-"""Back from predictions to what they depend on: materials and places."""

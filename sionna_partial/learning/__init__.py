@@ -1,1 +1,0 @@
-"""Traced links -> features -> predicted distributions."""

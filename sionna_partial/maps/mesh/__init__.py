@@ -1,0 +1,1 @@
+"""Scans, models and point clouds: read, cut, turned into cells."""

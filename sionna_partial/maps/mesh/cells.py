@@ -1,0 +1,284 @@
+"""SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and what has been observed of it."""
+
+import math
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError
+from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
+from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.planar import span_in_strip
+
+DEFAULT_BAND_M = (1.0, 1.8)
+"""Height above the lowest point of a mesh in which surfaces are walls [m]: above tables, below the lintels of doors."""
+
+DEFAULT_RESOLUTION_M = 0.05
+"""Edge of the cells of a mesh's map [m], as robots have them."""
+
+
+RIM_M = 0.3
+"""Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
+
+
+@dataclass(frozen=True)
+class MeshReading:
+    """How a mesh becomes a map; None is the default. See `load_map`."""
+
+    height_band_m: tuple[float, float] | None = None
+    observed: ArrayLike | PartialMap | None = None
+    resolution_m: float | None = None
+    up: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.up not in (None, "z", "y"):
+            raise MapError(f'up = {self.up!r} is not allowed: choose "z" or "y".')
+
+    def require_unused(self, path: Path, what: str) -> None:
+        """Raise a MapError if anything has been given, for a file that is no mesh.
+
+        Parameters
+        ----------
+        path : pathlib.Path
+        what : str
+            What the file is.
+        """
+        for field in fields(self):
+            if getattr(self, field.name) is not None:
+                raise MapError(f"{field.name} is for meshes alone, but path = '{path}' is {what}: leave it out.")
+
+
+def mesh_map(mesh: SceneMesh, reading: MeshReading, wall_height_m: float | None = None) -> PartialMap:
+    """Turn a mesh into a map.
+
+    Parameters
+    ----------
+    mesh : SceneMesh
+    reading : MeshReading
+    wall_height_m : float or None
+        Height above the lowest point of the mesh up to which radios may be [m], in place of its highest point.
+
+    Returns
+    -------
+    PartialMap
+        With the mesh cut to its known cells.
+
+    Raises
+    ------
+    MapError
+        For an argument out of range.
+    """
+    empty = _fitted_grid(mesh, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
+    low, high = _band(mesh, reading.height_band_m)
+    everything = -math.inf, math.inf
+    if reading.observed is None:
+        known = _cells_with_surfaces(mesh, empty, everything, upper=True)
+    else:
+        known = _observed_cells(empty, reading.observed)
+    state = np.full(empty.shape, CellState.UNKNOWN, dtype=np.uint8)
+    state[known] = CellState.FREE
+    state[_walls(mesh, empty, (low, high), known)] = CellState.WALL
+    state[_rims(state, empty.resolution_m)] = CellState.UNKNOWN
+    partial = replace(empty, state=state, mesh=mesh)
+    if wall_height_m is not None:
+        partial = raised(replace(partial, wall_height_m=wall_height_m))
+    return partial if reading.observed is None else cut_to_known(partial)
+
+
+def raised(partial: PartialMap) -> PartialMap:
+    """Let radios be as high above the lowest point of a map's mesh, if it has one, as the map's walls are.
+
+    Parameters
+    ----------
+    partial : PartialMap
+
+    Returns
+    -------
+    PartialMap
+    """
+    if partial.mesh is None:
+        return partial
+    low, _ = partial.height_range_m
+    return replace(partial, mesh=replace(partial.mesh, height_range_m=(low, low + partial.wall_height_m)))
+
+
+def cut_to_known(partial: PartialMap) -> PartialMap:
+    """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left.
+
+    Parameters
+    ----------
+    partial : PartialMap
+
+    Returns
+    -------
+    PartialMap
+    """
+    if partial.mesh is None:
+        return partial
+    return replace(partial, mesh=partial.mesh.within(_known_area(partial)))
+
+
+def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
+    """Find the cells (ny, nx) of narrow free areas beside unknown cells."""
+    free = np.pad(state == CellState.FREE, 1)
+    area, count = ndimage.label(free)
+    to_border_m = (ndimage.distance_transform_edt(free) - 0.5) * resolution_m
+    widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
+    beside = np.zeros(count + 1, dtype=bool)
+    beside[area[ndimage.binary_dilation(np.pad(state == CellState.UNKNOWN, 1))]] = True
+    rims: NDArray[np.bool_] = (free & ((widest_m < RIM_M) & beside)[area])[1:-1, 1:-1]
+    return rims
+
+
+def _known_area(partial: PartialMap) -> Any:
+    """Known cells as a shapely geometry in world x and y [m]."""
+    step = np.diff(np.pad(partial.state != CellState.UNKNOWN, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    (row, start), (_, end) = np.nonzero(step == 1), np.nonzero(step == -1)
+    cells = shapely.union_all(shapely.box(start, row, end, row + 1))
+    # The lattice lines are multiples of the resolution, so that walls on them are on the border exactly.
+    first = np.rint(np.array(partial.origin_m) / partial.resolution_m)
+    if np.allclose(first * partial.resolution_m, partial.origin_m, rtol=0, atol=1e-9):
+        return shapely.transform(cells, lambda corners: (corners + first) * partial.resolution_m)
+    return shapely.transform(cells, lambda corners: corners * partial.resolution_m + partial.origin_m)
+
+
+def _fitted_grid(mesh: SceneMesh, resolution_m: float) -> PartialMap:
+    """Map of unknown cells around a mesh, on multiples of the resolution, with a margin of a cell or more."""
+    one = PartialMap(np.full((1, 1), CellState.UNKNOWN), resolution_m)
+    cell = one.resolution_m
+    first = np.floor(mesh.bounds_m[0, :2] / cell).astype(int) - 1
+    nx, ny = (int(count) for count in np.floor(mesh.bounds_m[1, :2] / cell + BORDER_M / cell).astype(int) + 2 - first)
+    if nx * ny > MAX_CELLS:
+        raise MapError(
+            f"resolution_m = {cell:g} makes {ny} x {nx} cells of the mesh, more than {MAX_CELLS:,}: give "
+            f"{cell * math.sqrt(1.1 * nx * ny / MAX_CELLS):.2g} or more, check that the mesh is in metres, or cut it."
+        )
+    x, y = (float(value) for value in first * cell)
+    return PartialMap(np.full((ny, nx), CellState.UNKNOWN), cell, (x, y))
+
+
+def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, float]:
+    if given is None:
+        lowest = float(mesh.bounds_m[0, 2])
+        return lowest + DEFAULT_BAND_M[0], lowest + DEFAULT_BAND_M[1]
+    try:
+        low, high = (float(value) for value in given)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not -math.inf < low < high < math.inf:
+        raise MapError(f"height_band_m = {given!r} is not allowed: give (low, high), z in metres, low < high.")
+    lowest, highest = (float(value) for value in mesh.bounds_m[:, 2])
+    if high < lowest or low > highest:
+        raise MapError(f"height_band_m = {given!r} is outside the mesh, which spans z {lowest:g} to {highest:g} m.")
+    return low, high
+
+
+def _observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> NDArray[np.bool_]:
+    """Cells (ny, nx) whose centre is in the polygon, or in a known cell of the other map."""
+    (ny, nx), cell = empty.shape, empty.resolution_m
+    x = empty.origin_m[0] + cell * (np.arange(nx) + 0.5)
+    y = empty.origin_m[1] + cell * (np.arange(ny) + 0.5)
+    if isinstance(observed, PartialMap):
+        known = np.pad(observed.state != CellState.UNKNOWN, 1)
+        _, column = observed.cell_index(np.stack([x, np.zeros(nx)], axis=1))
+        row, _ = observed.cell_index(np.stack([np.zeros(ny), y], axis=1))
+        row, column = (np.clip(index + 1, 0, size - 1) for index, size in zip((row, column), known.shape, strict=True))
+        return known[np.ix_(row, column)]
+    polygon = _polygon(observed)
+    cells = np.stack([shapely.contains_xy(polygon, x, height) for height in y])
+    if not cells.any():
+        x0, y0, x1, y1 = empty.bounds_m
+        raise MapError(
+            f"observed holds no cell of the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m: give "
+            "corners in the world axes of the mesh, in metres."
+        )
+    return cells
+
+
+def _polygon(observed: ArrayLike) -> Any:
+    remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres, or a PartialMap."
+    try:
+        corners = np.asarray(observed, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MapError(f"observed is of type {type(observed).__name__}: {remedy}") from error
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
+        raise MapError(f"observed has shape {corners.shape} or values that are not finite: {remedy}")
+    polygon = shapely.Polygon(corners)
+    if not polygon.is_valid or not polygon.area:
+        raise MapError(f"observed is no polygon ({shapely.is_valid_reason(polygon)}): {remedy}")
+    shapely.prepare(polygon)
+    return polygon
+
+
+def _walls(
+    mesh: SceneMesh, empty: PartialMap, band_m: tuple[float, float], known: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Known cells (ny, nx) with a surface in the band.
+
+    Walls that run along lattice lines are in the cells above or to the right of them, or on the other side if those
+    are unknown.
+    """
+    upper = _cells_with_surfaces(mesh, empty, band_m, upper=True)
+    lower = _cells_with_surfaces(mesh, empty, band_m, upper=False)
+    lost = np.pad(upper & ~known, ((0, 1), (0, 1)))
+    beside = lost[1:, :-1] | lost[:-1, 1:] | lost[1:, 1:]
+    walls: NDArray[np.bool_] = known & (upper | (lower & beside))
+    return walls
+
+
+def _cells_with_surfaces(
+    mesh: SceneMesh, empty: PartialMap, band_m: tuple[float, float], *, upper: bool
+) -> NDArray[np.bool_]:
+    """Cells (ny, nx) in which the mesh has a surface between two heights; touching borders does not count."""
+    corners = mesh.corners_m
+    z = corners[..., 2]
+    low, high = band_m
+    corners = corners[(z.max(axis=1) > low + BORDER_M) & (z.min(axis=1) < high - BORDER_M)]
+    limits = (np.full(len(corners), limit) for limit in band_m)
+    polygons, sizes = clip_slab(corners, np.ascontiguousarray(corners[..., 2]), *limits)
+    flat = (polygons[..., :2] - empty.origin_m) / empty.resolution_m
+    cells = np.zeros(empty.shape, dtype=np.bool_)
+    _mark_cells(flat, sizes, cells, BORDER_M / empty.resolution_m, upper)
+    return cells
+
+
+@njit(cache=True)
+def _mark_cells(
+    polygons: NDArray[np.float64], sizes: NDArray[np.int64], cells: NDArray[np.bool_], margin: float, upper: bool
+) -> None:  # pragma: no cover - compiled
+    """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
+
+    What runs along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
+    """
+    ny, nx = cells.shape
+    for index in range(len(polygons)):
+        size = sizes[index]
+        if size == 0:
+            continue
+        corners = polygons[index, :size]
+        first, last = _reached(corners[:, 1].min(), corners[:, 1].max(), margin, upper)
+        for row in range(max(first, 0), min(last, ny - 1) + 1):
+            low = -np.inf if row == first else float(row)
+            high = np.inf if row == last else row + 1.0
+            left, right = span_in_strip(corners, low, high)
+            if left > right:
+                continue
+            start, end = _reached(left, right, margin, upper)
+            for column in range(max(start, 0), min(end, nx - 1) + 1):
+                cells[row, column] = True
+
+
+@njit(cache=True)
+def _reached(low: float, high: float, margin: float, upper: bool) -> tuple[int, int]:  # pragma: no cover - compiled
+    first, last = int(np.floor(low + margin)), int(np.ceil(high - margin)) - 1
+    if last < first:
+        return (first, first) if upper else (last, last)
+    return first, last

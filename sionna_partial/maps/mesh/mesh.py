@@ -1,0 +1,313 @@
+"""SceneMesh: the triangles of a scanned or modelled building, and what they are made of."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
+from sionna_partial.errors import MapError
+from sionna_partial.maps.mesh.cut import SEAM_M, close_seams, cut_triangles, merge_points
+from sionna_partial.settings import Material
+
+MAX_TRIANGLES = 5_000_000
+"""Largest number of triangles of a mesh: more should be cut or simplified first."""
+
+MAX_MATERIALS = 256
+"""Largest number of materials of a mesh: each triangle has one byte for its own."""
+
+MAX_COORDINATE_M = 1e8
+"""Largest coordinate of a mesh [m]: more is a unit error."""
+
+FLAT_M = 0.1
+"""Height below which a mesh is flat, so that radios stand on it, not between its ends [m]."""
+
+DEGENERATE_M = 1e-6
+"""Triangles lower than this over their longest edge have no direction, and are dropped [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneMesh:
+    """Triangles in world axes (x right, y up, z up), in metres. There may be none: nothing has been observed then.
+
+    Triangles are kept in the order of their materials, and vertices in the order in which triangles use them; both
+    are sorted that way when the mesh is built. Degenerate triangles and unused vertices are dropped.
+
+    Parameters
+    ----------
+    vertices_m : (V, 3) float64 array
+        Corners [m]; triangles that meet share them. Kept read-only.
+    triangles : (F, 3) int64 array
+        Indices into `vertices_m`, at most `MAX_TRIANGLES` triangles. Kept read-only.
+    material : (F,) uint8 array
+        Index into `materials` of every triangle. Kept read-only.
+    materials : tuple of Material or None
+        None is the material of SceneSettings.
+    height_range_m : (float, float) or None
+        Lowest and highest world z that a radio may have [m]. By default the ends of the mesh; of a flat mesh, 3 m
+        above it. What is cut from a mesh keeps its range.
+
+    Raises
+    ------
+    MapError
+        For arrays of other shapes, values that are not finite, or indices out of range.
+    """
+
+    vertices_m: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    material: NDArray[np.uint8]
+    materials: tuple[Material | None, ...] = (None,)
+    height_range_m: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        vertices = _vertices(self.vertices_m)
+        triangles = _indices("triangles", self.triangles, (3,), len(vertices), "vertices_m")
+        if len(triangles) > MAX_TRIANGLES:
+            raise MapError(
+                f"triangles has {len(triangles):,} rows, more than {MAX_TRIANGLES:,}: cut or simplify the mesh."
+            )
+        materials = _materials(self.materials)
+        material = _indices("material", self.material, (), len(materials), "materials")
+        if len(material) != len(triangles):
+            raise MapError(f"material has {len(material)} entries for {len(triangles)} triangles: give one for each.")
+        kept = np.nonzero(_is_wide(vertices[triangles]))[0]
+        kept = kept[np.argsort(material[kept], kind="stable")]
+        used, first, inverse = np.unique(triangles[kept], return_index=True, return_inverse=True)
+        order = np.argsort(first)
+        arrays: dict[str, NDArray[Any]] = {
+            "vertices_m": vertices[used[order]],
+            "triangles": np.argsort(order)[inverse].reshape(-1, 3).astype(np.int64),
+            "material": material[kept].astype(np.uint8),
+        }
+        for name, array in arrays.items():
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "materials", materials)
+        object.__setattr__(self, "height_range_m", _height_range(self.height_range_m, arrays["vertices_m"]))
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, SceneMesh):
+            return NotImplemented
+        return (
+            np.array_equal(self.vertices_m, other.vertices_m)
+            and np.array_equal(self.triangles, other.triangles)
+            and np.array_equal(self.material, other.material)
+            and self.materials == other.materials
+            and self.height_range_m == other.height_range_m
+        )
+
+    @property
+    def bounds_m(self) -> NDArray[np.float64]:
+        """Lowest and highest x, y, z (2, 3) [m]; NaN where there is no triangle."""
+        if not len(self.triangles):
+            return np.full((2, 3), np.nan)
+        return np.stack([self.vertices_m.min(axis=0), self.vertices_m.max(axis=0)])
+
+    @property
+    def corners_m(self) -> NDArray[np.float64]:
+        """Corners (F, 3, 3) of every triangle [m]."""
+        return self.vertices_m[self.triangles]
+
+    def used_materials(self, default: Material) -> set[Material]:
+        """Return the materials of its triangles, with `default` in place of None."""
+        return {self.materials[index] or default for index in np.unique(self.material)}
+
+    def within(self, area: Any) -> "SceneMesh":
+        """Cut the mesh at the border of an area seen from above.
+
+        Triangles in the area stay as they are, those across its border are cut there, and the others go. Walls on the
+        border stay. Triangles that shared edges still do; where a neighbour is cut in the middle of an edge, its edge
+        gets that vertex too. Cut points within `SEAM_M` of one another, or of a vertex, are one.
+
+        Parameters
+        ----------
+        area : shapely Polygon or MultiPolygon
+            World x and y [m].
+
+        Returns
+        -------
+        SceneMesh
+            Without triangles, where none reaches the area.
+        """
+        whole, pieces, source = cut_triangles(self.corners_m, area)
+        count = len(self.vertices_m)
+        vertices = np.concatenate([self.vertices_m, pieces.reshape(-1, 3)])
+        cut = merge_points(vertices, SEAM_M)[count:].reshape(-1, 3)
+        wide = _is_wide(vertices[cut])
+        source = np.concatenate([np.nonzero(whole)[0], source[wide]])
+        order = np.argsort(source, kind="stable")
+        triangles = np.concatenate([self.triangles[whole], cut[wide]])[order]
+        triangles, split = close_seams(vertices, triangles, count)
+        return replace(self, vertices_m=vertices, triangles=triangles, material=self.material[source[order][split]])
+
+
+def merged_mesh(
+    vertices_m: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    material: NDArray[np.integer],
+    materials: tuple[Material | None, ...],
+) -> SceneMesh:
+    """Build a mesh whose triangles share the vertices that they have in common.
+
+    Parameters
+    ----------
+    vertices_m : (V, 3) float64 array
+    triangles : (F, 3) int64 array
+    material : (F,) integer array
+    materials : tuple of Material or None
+        As in SceneMesh.
+
+    Returns
+    -------
+    SceneMesh
+
+    Raises
+    ------
+    MapError
+        As SceneMesh does.
+    """
+    mesh = SceneMesh(vertices_m, triangles, material.astype(np.uint8), materials)
+    return replace(mesh, triangles=merge_points(mesh.vertices_m)[mesh.triangles].astype(np.int64))
+
+
+def material_records(mesh: SceneMesh) -> list[dict[str, Any] | None]:
+    """Make plain data of the materials of a mesh.
+
+    Parameters
+    ----------
+    mesh : SceneMesh
+
+    Returns
+    -------
+    list of dict or None
+        For `materials_of_records`.
+    """
+    return [None if material is None else asdict(material) for material in mesh.materials]
+
+
+def materials_of_records(records: Iterable[Mapping[str, Any] | None]) -> tuple[Material | None, ...]:
+    """Make materials of what `material_records` gave.
+
+    Parameters
+    ----------
+    records : iterable of mapping or None
+
+    Returns
+    -------
+    tuple of Material or None
+    """
+    return tuple(None if record is None else Material(**record) for record in records)
+
+
+def mesh_arrays(mesh: SceneMesh) -> dict[str, Any]:
+    """Make named arrays of a mesh, to save them.
+
+    Parameters
+    ----------
+    mesh : SceneMesh
+
+    Returns
+    -------
+    dict
+        For `mesh_of_arrays`.
+    """
+    return {
+        "mesh_vertices_m": mesh.vertices_m,
+        "mesh_triangles": mesh.triangles,
+        "mesh_material": mesh.material,
+        "mesh_materials": json.dumps(material_records(mesh)),
+        "mesh_height_range_m": mesh.height_range_m,
+    }
+
+
+def mesh_of_arrays(content: Mapping[str, NDArray[Any]]) -> SceneMesh | None:
+    """Make a mesh of what `mesh_arrays` gave.
+
+    Parameters
+    ----------
+    content : mapping of str to array
+
+    Returns
+    -------
+    SceneMesh or None
+        None if the arrays hold no mesh.
+    """
+    if "mesh_triangles" not in content:
+        return None
+    low, high = content["mesh_height_range_m"].tolist()
+    return SceneMesh(
+        vertices_m=content["mesh_vertices_m"],
+        triangles=content["mesh_triangles"],
+        material=content["mesh_material"],
+        materials=materials_of_records(json.loads(str(content["mesh_materials"]))),
+        height_range_m=(low, high),
+    )
+
+
+def _vertices(values: ArrayLike) -> NDArray[np.float64]:
+    try:
+        vertices = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise MapError("vertices_m is not an array of numbers: give x, y, z in metres, (V, 3).") from error
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise MapError(f"vertices_m has shape {vertices.shape}: give x, y, z in metres, (V, 3).")
+    wrong = ~(np.abs(vertices) <= MAX_COORDINATE_M).all(axis=1)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        place = tuple(float(value) for value in vertices[index])
+        raise MapError(
+            f"vertices_m[{index}] = {place} is not allowed: give finite numbers of metres, at most "
+            f"{MAX_COORDINATE_M:g}; repair the mesh."
+        )
+    return vertices
+
+
+def _indices(name: str, values: ArrayLike, row: tuple[int, ...], count: int, target: str) -> NDArray[np.int64]:
+    """Return indices (F, *row) into `count` items, or raise a MapError."""
+    indices = np.array(values)
+    wanted = "(F, 3)" if row else "(F,)"
+    if indices.ndim != 1 + len(row) or indices.shape[1:] != row or indices.dtype.kind not in "iu":
+        raise MapError(f"{name} is {indices.dtype} of shape {indices.shape}: give integers {wanted}.")
+    wrong = (indices < 0) | (indices >= count)
+    if wrong.any():
+        raise MapError(
+            f"{name} holds the index {indices[wrong][0]}, but {target} has {count} entries: give 0 to {count - 1}; "
+            "repair the mesh."
+        )
+    return indices.astype(np.int64)
+
+
+def _materials(values: tuple[Material | None, ...]) -> tuple[Material | None, ...]:
+    materials = tuple(values)
+    if not all(material is None or isinstance(material, Material) for material in materials):
+        raise MapError(f"materials = {values!r} is not allowed: give Material(...) or None for each.")
+    if len(materials) > MAX_MATERIALS:
+        raise MapError(
+            f"materials has {len(materials)} entries, more than {MAX_MATERIALS}: give like ones the same material."
+        )
+    return materials
+
+
+def _is_wide(corners_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Triangles (F, 3, 3) that are not degenerate."""
+    edges = np.roll(corners_m, -1, axis=1) - corners_m
+    longest = np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
+    doubled_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return doubled_area > DEGENERATE_M * longest
+
+
+def _height_range(given: tuple[float, float] | None, vertices_m: NDArray[np.float64]) -> tuple[float, float]:
+    if given is None:
+        z = vertices_m[:, 2] if len(vertices_m) else np.zeros(1)
+        low, high = float(z.min()), float(z.max())
+        return low, high if high - low >= FLAT_M else low + DEFAULT_WALL_HEIGHT_M
+    try:
+        low, high = (float(value) for value in given)
+    except (TypeError, ValueError):
+        low, high = np.nan, np.nan
+    if not -MAX_COORDINATE_M <= low < high <= MAX_COORDINATE_M:
+        raise MapError(f"height_range_m = {given!r} is not allowed: give (low, high) in metres, low < high.")
+    return low, high

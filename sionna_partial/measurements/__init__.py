@@ -1,0 +1,1 @@
+"""Measured path gains."""

@@ -1,0 +1,316 @@
+"""The networks of the paper's predictor, as Keras 3 models: architecture and evaluation.
+
+All of them stand side by side in one functional model. Its inputs are the features of `FEATURES` in their own units,
+each (N, 1); its outputs, by name, are P(link state) given each partial link state (N, 3), mean and log-variance of the
+gain for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are
+scaled and clamped to the range of the training links inside the networks, so that nothing is extrapolated but an anchor
+known to physics: the gain of the partial trace, or that of free space.
+"""
+
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.llvm import load_llvm
+from sionna_partial.prediction.features import LinkFeatures
+
+if TYPE_CHECKING:
+    import keras
+
+FEATURES = ("distance_m", "unobserved_distance_m", "gain_db")
+"""Numeric features in the order of the inputs; the partial link state chooses among the networks."""
+
+STD_RANGE_DB = (0.3, 40.0)
+"""Range of the standard deviation that a gain network can give [dB]."""
+
+NEAREST_M = 0.01
+"""Distance below which the gain of free space rises no more [m]."""
+
+_LINKS_AT_ONCE = 65_536
+_LARGEST = 1e30
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class GainNetwork:
+    """One row of the paper's table: a network for the gain, given link state and partial link state.
+
+    Parameters
+    ----------
+    name : str
+    link_state : LinkState
+        The link state given which the gain is predicted.
+    partial_states : tuple of LinkState
+        Partial link states that the network serves.
+    inputs : tuple of str
+        Of `FEATURES`.
+    hidden_units : int
+        Of each of the two hidden layers.
+    prior_offset_db, prior_std_db : float
+        Mean and standard deviation of gain minus anchor where there are no links to learn from [dB].
+    """
+
+    name: str
+    link_state: LinkState
+    partial_states: tuple[LinkState, ...]
+    inputs: tuple[str, ...]
+    hidden_units: int
+    prior_offset_db: float
+    prior_std_db: float
+
+    @property
+    def anchored_to_trace(self) -> bool:
+        """Whether the mean is an offset from the gain of the partial trace; else from the gain of free space."""
+        return self.partial_states == (LinkState.LOS,) and "gain_db" in self.inputs
+
+    def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float64]:
+        """Return the gain (N,) from which the network gives the offset [dB]."""
+        return phi.gain_db if self.anchored_to_trace else free_space_gain_db(phi.distance_m, frequency_hz)
+
+
+_NOT_LOS = (LinkState.NLOS, LinkState.OUTAGE)
+
+GAIN_NETWORKS = (
+    GainNetwork("gain_los_given_los", LinkState.LOS, (LinkState.LOS,), FEATURES, 20, 0.0, 6.0),
+    GainNetwork("gain_los_given_nlos_outage", LinkState.LOS, _NOT_LOS, ("distance_m",), 10, 0.0, 6.0),
+    GainNetwork("gain_nlos_given_nlos_outage", LinkState.NLOS, _NOT_LOS, FEATURES, 20, -20.0, 15.0),
+    GainNetwork("gain_nlos_given_los", LinkState.NLOS, (LinkState.LOS,), ("distance_m",), 10, -20.0, 15.0),
+)
+"""The gain networks of the paper (tab:path_loss_network). An outage has the gain -150 dB and needs none."""
+
+STATE_NETWORKS = {state: f"state_given_{state.name.lower()}" for state in LinkState}
+"""One multinomial logistic classifier of the link state for each partial link state (paper, Section III-D)."""
+
+STATE_INPUTS = ("distance_m", "unobserved_distance_m")
+
+INDOOR_NETWORKS = {state: f"indoor_given_{state.name.lower()}" for state in LinkState}
+"""One logistic classifier P(indoor) for each partial link state (paper, "Indoor-Outdoor Estimation")."""
+
+INDOOR_INPUTS = ("unobserved_distance_m",)
+
+OUTPUT_WIDTHS = {
+    **dict.fromkeys(STATE_NETWORKS.values(), len(LinkState)),
+    **{row.name: 2 for row in GAIN_NETWORKS},
+    **dict.fromkeys(INDOOR_NETWORKS.values(), 1),
+}
+"""Number of values for each link of every network, by name."""
+
+
+def import_keras() -> ModuleType:
+    """Import Keras, after the libLLVM that has to come before TensorFlow."""
+    load_llvm()
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "0")
+    import keras
+
+    return keras
+
+
+def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
+    """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
+    return _gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
+
+
+def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
+    """Build a logistic classifier that gives the same probabilities everywhere until it is trained.
+
+    Parameters
+    ----------
+    name : str
+    inputs : tuple of str
+        Of `FEATURES`.
+    ranges : mapping of str to (low, high)
+        Range to which each input is clamped and scaled.
+    bias : (K,) array-like
+        First logits: K classes by softmax, or one event by sigmoid where K is 1.
+
+    Returns
+    -------
+    keras.Model
+    """
+    keras = import_keras()
+    count = np.size(bias)
+    places, scaled = _scaled_inputs(inputs, ranges)
+    activation = "softmax" if count > 1 else "sigmoid"
+    dense = layer(keras, "Dense", "probability", count, activation=activation, kernel_initializer="zeros")
+    network = keras.Model(places, dense(scaled), name=name)
+    dense.bias.assign(np.asarray(bias, dtype=np.float32))
+    return network
+
+
+def gain_network(
+    row: GainNetwork, ranges: Ranges, offset_db: float, std_db: float, frequency_hz: float, seed: int
+) -> "keras.Model":
+    """Build a gain network that says one offset and spread everywhere until it is trained.
+
+    Parameters
+    ----------
+    row : GainNetwork
+    ranges : mapping of str to (low, high)
+        Range to which each input is clamped and scaled.
+    offset_db, std_db : float
+        First offset from the anchor, and first standard deviation [dB].
+    frequency_hz : float
+        Carrier frequency of the anchor [Hz].
+    seed : int
+        Of the first weights of the hidden layers.
+
+    Returns
+    -------
+    keras.Model
+        Its output is mean [dB] and natural logarithm of the variance [dB^2], (N, 2).
+    """
+    keras = import_keras()
+    places, hidden = _scaled_inputs(row.inputs, ranges)
+    for number in (1, 2):
+        start = keras.initializers.GlorotUniform(seed=seed + number)
+        units, name = row.hidden_units, f"hidden_{number}"
+        hidden = layer(keras, "Dense", name, units, activation="relu", kernel_initializer=start)(hidden)
+    shape = layer(keras, "Dense", "mean_shape", 1, kernel_initializer="zeros")(hidden)
+    offset = layer(keras, "Rescaling", "offset_db", std_db, offset_db)(shape)
+    mean = layer(keras, "Add", "mean_db")([_anchor(keras, row, places, frequency_hz), offset])
+    low, high = (2.0 * math.log(std) for std in STD_RANGE_DB)
+    share = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
+    spread = layer(keras, "Dense", "spread_shape", 1, activation="sigmoid", kernel_initializer="zeros")
+    log_variance = layer(keras, "Rescaling", "log_variance", high - low, low)(spread(hidden))
+    spread.bias.assign([math.log(share / (1.0 - share))])
+    return keras.Model(places, layer(keras, "Concatenate", "gain")([mean, log_variance]), name=row.name)
+
+
+def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
+    """Put networks side by side in one model: those of `OUTPUT_WIDTHS`, and any others, which share no inputs."""
+    keras = import_keras()
+    inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in FEATURES}
+    outputs = {name: networks[name]({key: inputs[key] for key in networks[name].input}) for name in OUTPUT_WIDTHS}
+    for name in sorted(networks.keys() - outputs.keys()):
+        place = own_input(name)
+        inputs[place] = keras.Input(networks[name].input_shape[1:], name=place, dtype="float32")
+        outputs[name] = networks[name](inputs[place])
+    return keras.Model(inputs, outputs, name="predictor")
+
+
+def own_input(name: str) -> str:
+    """Return the name of the input of a network that shares its input with no other."""
+    return f"input_of_{name}"
+
+
+def parts(model: "keras.Model") -> dict[str, "keras.Model"]:
+    """Return the networks that `assemble` put together."""
+    return {name: model.get_layer(name) for name in model.output}
+
+
+def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict[str, NDArray[np.float32]]:
+    """Return features as the inputs (N, 1) of a network."""
+    columns = {name: np.clip(getattr(phi, name), -_LARGEST, _LARGEST) for name in names}
+    return {name: column.astype(np.float32)[:, None] for name, column in columns.items()}
+
+
+def distribution_by_paper(
+    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: NDArray[np.uint8]
+) -> tuple[Any, Any, Any]:
+    """Let the paper's networks answer for N links.
+
+    Parameters
+    ----------
+    networks : mapping of str to keras.Model
+        By name.
+    inputs : mapping of str to (N, 1) float32 tensors
+        Of `FEATURES`.
+    link_state : (N,) uint8 array of LinkState
+        On the partial map.
+
+    Returns
+    -------
+    probabilities, means_db, stds_db : (3, N) float64 tensors
+        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+    """
+    import tensorflow as tf
+
+    def outputs(name: str) -> Any:
+        network = networks[name]
+        return tf.cast(network({key: inputs[key] for key in network.input}, training=False), tf.float64)
+
+    states = tf.stack([outputs(STATE_NETWORKS[state]) for state in LinkState])
+    probabilities = tf.gather_nd(states, np.stack([link_state, np.arange(len(link_state))], axis=1))
+    outage = tf.fill([len(link_state)], tf.constant(GAIN_FLOOR_DB, tf.float64))
+    means_db, stds_db = [outage] * len(LinkState), [tf.zeros_like(outage)] * len(LinkState)
+    for row in GAIN_NETWORKS:
+        served, (mean_db, log_variance) = np.isin(link_state, row.partial_states), tf.unstack(outputs(row.name), axis=1)
+        means_db[row.link_state] = tf.where(served, tf.maximum(mean_db, GAIN_FLOOR_DB), means_db[row.link_state])
+        stds_db[row.link_state] = tf.where(served, tf.exp(0.5 * log_variance), stds_db[row.link_state])
+    total = tf.reduce_sum(probabilities, axis=1, keepdims=True)
+    return tf.transpose(probabilities / total), tf.stack(means_db), tf.stack(stds_db)
+
+
+def evaluate_paper(
+    networks: Mapping[str, "keras.Model"], phi: LinkFeatures
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Evaluate `distribution_by_paper` on the features of N links, to arrays."""
+    blocks = [distribution_by_paper(networks, network_inputs(block), block.link_state) for block in _blocks(phi)]
+    probabilities, means_db, stds_db = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
+    return probabilities, means_db, stds_db
+
+
+def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> NDArray[np.float64]:
+    """Return P(indoor) (N,) by the network that serves the partial link state of each link."""
+    p_indoor = np.zeros(len(phi))
+    for state, name in INDOOR_NETWORKS.items():
+        served = phi.link_state == state
+        blocks = [networks[name](network_inputs(block, INDOOR_INPUTS)) for block in _blocks(phi.take(served))]
+        p_indoor[served] = np.concatenate(blocks)[:, 0]
+    return p_indoor
+
+
+def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
+    """Cut features into blocks that bound the memory; there is at least one."""
+    for start in range(0, max(1, len(phi)), _LINKS_AT_ONCE):
+        yield phi.take(slice(start, start + _LINKS_AT_ONCE))
+
+
+def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
+    """Return the range [low, high] to which each network of the paper clamps and scales its inputs, by feature."""
+    ranges = {}
+    for name in OUTPUT_WIDTHS:
+        network = model.get_layer(name)
+        scaling = network.get_layer("scaled").get_config()
+        names = [key for key in FEATURES if key in network.input]
+        spans = zip(names, scaling["scale"], scaling["offset"], strict=True)
+        ranges[name] = {key: [-offset / scale, (1.0 - offset) / scale] for key, scale, offset in spans}
+    return ranges
+
+
+def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, Any], Any]:
+    """Return inputs by name, and the tensor (N, len(names)) of them, scaled to [0, 1] and clamped."""
+    keras = import_keras()
+    places = {name: keras.Input((1,), name=name, dtype="float32") for name in names}
+    columns = list(places.values())
+    joined = layer(keras, "Concatenate", "joined")(columns) if len(columns) > 1 else columns[0]
+    scale = [1.0 / (ranges[name][1] - ranges[name][0]) for name in names]
+    offset = [-ranges[name][0] * factor for name, factor in zip(names, scale, strict=True)]
+    scaled = layer(keras, "Rescaling", "scaled", scale, offset)(joined)
+    return places, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
+
+
+def _anchor(keras: ModuleType, row: GainNetwork, places: Mapping[str, Any], frequency_hz: float) -> Any:
+    """Return the tensor (N, 1) of the gain from which the network gives the offset [dB]."""
+    if row.anchored_to_trace:
+        return places["gain_db"]
+    decades = keras.ops.log10(keras.ops.maximum(places["distance_m"], NEAREST_M))
+    return layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
+
+
+def _gain_at_1m_db(frequency_hz: float) -> float:
+    return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
+
+
+def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:
+    """Return a stock layer in single precision, whatever the user's global policy is."""
+    return getattr(keras.layers, kind)(*arguments, name=name, dtype="float32", **options)

@@ -1,0 +1,383 @@
+"""Predictor: LinkFeatures -> LinkPrediction, by the paper's networks or by ones that see where links run."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.errors import PredictorError, SettingsError
+from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states
+from sionna_partial.prediction.map_fitting import fit_context_networks
+from sionna_partial.prediction.map_networks import LINK_NETWORK, evaluate_context_networks
+from sionna_partial.prediction.paper_fitting import fit_indoor_networks, fit_networks
+from sionna_partial.prediction.paper_networks import (
+    assemble,
+    evaluate_indoor,
+    evaluate_paper,
+    import_keras,
+    network_ranges,
+    parts,
+)
+from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.settings import PredictorSettings
+from sionna_partial.tracing.trace import Progress
+
+if TYPE_CHECKING:
+    import keras
+
+SHIPPED = ("map", "paper")
+"""Their names; the first is the default."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPrediction:
+    """Predictive distribution of link state and path gain of N links; every array is (N,) float64.
+
+    `Predictor.predict` makes it for receivers that are indoors, `anywhere` for receivers that may be outside.
+
+    Parameters
+    ----------
+    p_los, p_nlos, p_outage : arrays
+        Probabilities of the link states; they sum to 1.
+    gain_mean_db, gain_std_db : arrays
+        Mean and standard deviation of the whole distribution, an outage counting -150 dB [dB].
+    gain_los_mean_db, gain_los_std_db, gain_nlos_mean_db, gain_nlos_std_db : arrays
+        The same given line of sight, and given paths without it [dB].
+    """
+
+    p_los: NDArray[np.float64]
+    p_nlos: NDArray[np.float64]
+    p_outage: NDArray[np.float64]
+    gain_mean_db: NDArray[np.float64]
+    gain_std_db: NDArray[np.float64]
+    gain_los_mean_db: NDArray[np.float64]
+    gain_los_std_db: NDArray[np.float64]
+    gain_nlos_mean_db: NDArray[np.float64]
+    gain_nlos_std_db: NDArray[np.float64]
+
+    @property
+    def link_state(self) -> NDArray[np.uint8]:
+        """Likeliest LinkState (N,)."""
+        return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
+
+    @classmethod
+    def of_parts(
+        cls, probabilities: NDArray[np.float64], means_db: NDArray[np.float64], stds_db: NDArray[np.float64]
+    ) -> "LinkPrediction":
+        """Put the distribution together by the laws of total expectation and variance.
+
+        Parameters
+        ----------
+        probabilities, means_db, stds_db : (3, N) arrays
+            Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+
+        Returns
+        -------
+        LinkPrediction
+        """
+        mean = np.maximum((probabilities * means_db).sum(axis=0), GAIN_FLOOR_DB)
+        variance = (probabilities * (stds_db**2 + (means_db - mean) ** 2)).sum(axis=0)
+        return cls(
+            p_los=probabilities[LinkState.LOS],
+            p_nlos=probabilities[LinkState.NLOS],
+            p_outage=probabilities[LinkState.OUTAGE],
+            gain_mean_db=mean,
+            gain_std_db=np.sqrt(variance),
+            gain_los_mean_db=means_db[LinkState.LOS],
+            gain_los_std_db=stds_db[LinkState.LOS],
+            gain_nlos_mean_db=means_db[LinkState.NLOS],
+            gain_nlos_std_db=stds_db[LinkState.NLOS],
+        )
+
+    @classmethod
+    def of_trace(cls, phi: LinkFeatures) -> "LinkPrediction":
+        """Take the trace itself for the answer, as on a complete map (paper, eq. 9): no uncertainty is left.
+
+        The components of link states that a link is not in have its traced gain, too.
+        """
+        probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
+        return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
+
+    def take(self, index: NDArray[np.generic] | slice) -> "LinkPrediction":
+        """Return the links that an index array, a mask (N,) or a slice selects."""
+        return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
+
+    def where(self, taken: NDArray[np.bool_], other: "LinkPrediction") -> "LinkPrediction":
+        """Return `other` for the links of a mask (N,), and this distribution for the rest."""
+        columns = (column.name for column in fields(self))
+        return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
+
+    def anywhere(self, p_indoor: ArrayLike) -> "LinkPrediction":
+        """Return the distribution for receivers that may be outside, where every link is in outage.
+
+        By total probability (paper, "Indoor-Outdoor Estimation"), the probabilities of LOS and NLOS are those of a
+        receiver indoors times `p_indoor`, the rest is outage; mean and spread of the gain follow.
+
+        Parameters
+        ----------
+        p_indoor : (N,) array-like
+            Probability that each receiver is indoors.
+
+        Returns
+        -------
+        LinkPrediction
+
+        Raises
+        ------
+        PredictorError
+            For another shape, or a value outside [0, 1].
+        """
+        share = link_numbers("p_indoor", p_indoor, len(self.p_los))
+        wrong = (share < 0.0) | (share > 1.0)
+        if wrong.any():
+            index = int(np.argmax(wrong))
+            raise PredictorError(f"p_indoor[{index}] = {share[index]:g} is not allowed: it lies between 0 and 1.")
+        floor = np.full_like(share, GAIN_FLOOR_DB)
+        return LinkPrediction.of_parts(
+            np.stack([share * self.p_outage + (1.0 - share), share * self.p_los, share * self.p_nlos]),
+            np.stack([floor, self.gain_los_mean_db, self.gain_nlos_mean_db]),
+            np.stack([np.zeros_like(share), self.gain_los_std_db, self.gain_nlos_std_db]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """A predictor of link state and path gain, made by `fit` or `load`.
+
+    That of the paper (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on
+    distance and unobserved distance for each partial link state; the gain given the link state is Gaussian, its mean
+    and log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved
+    distance for each partial link state; it is 1 until `fit_indoor`, as the paper has every receiver indoors.
+
+    With settings other than "paper", networks beside these see what each path crosses, and the map around the
+    transmitter (`context_networks`). They answer for features with a context; the trace itself does where the map is
+    complete. For features without one the paper's networks answer, fitted to the same links.
+
+    Parameters
+    ----------
+    model : keras.Model
+        All networks side by side.
+    archive : bytes
+        The model as a `.keras` file.
+    settings : PredictorSettings
+        Of the training.
+    homes : tuple of str
+        Names of the homes that it was trained on.
+    links : mapping of str to int
+        Number of training links by "true state given partial state".
+    metrics : mapping
+        What was measured on homes it was not trained on.
+    versions : mapping of str to str
+        Of the packages that trained it.
+    name : str
+        "fitted", a shipped name, or the file's path.
+    """
+
+    model: "keras.Model"
+    archive: bytes = field(repr=False)
+    settings: PredictorSettings
+    homes: tuple[str, ...] = ()
+    links: Mapping[str, int] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    name: str = "fitted"
+
+    @property
+    def fingerprint(self) -> str:
+        """SHA-256 of the `.keras` file, in hexadecimal."""
+        return digest(self.archive)
+
+    @classmethod
+    def fit(
+        cls,
+        features: LinkFeatures,
+        link_state: ArrayLike,
+        gain_db: ArrayLike,
+        *,
+        homes: Sequence[str] = (),
+        settings: PredictorSettings | None = None,
+        progress: Progress | None = None,
+    ) -> "Predictor":
+        """Train on links of known truth; the same links and settings give the same weights.
+
+        Link states are learned by cross-entropy; the gain by the paper's networks by Gaussian likelihood, and by those
+        beside them by the continuous ranked probability score.
+
+        Parameters
+        ----------
+        features : LinkFeatures
+            Of N links on partial maps.
+        link_state : (N,) array-like of LinkState
+            Link state on the complete map.
+        gain_db : (N,) array-like
+            Omnidirectional path gain on the complete map [dB].
+        homes : sequence of str
+            Where the links come from, to be recorded.
+        settings : PredictorSettings, optional
+            The paper's networks by default.
+        progress : callable, optional
+            Called as ``progress(share_done, message)``.
+
+        Returns
+        -------
+        Predictor
+
+        Raises
+        ------
+        PredictorError
+            For no links, arrays of other shapes or values, or a training that diverges.
+        """
+        settings = settings or PredictorSettings()
+        _require_features(features)
+        if len(features) == 0:
+            raise PredictorError("features has no links: give at least one.")
+        states = link_states("link_state", link_state, len(features))
+        gains_db = np.maximum(link_numbers("gain_db", gain_db, len(features)), GAIN_FLOOR_DB)
+        context_networks = {}
+        if settings.networks != "paper":
+            _require_context(features)
+            context_networks = fit_context_networks(features, states, gains_db, settings, progress=progress)
+        model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
+        links = {
+            f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
+            for partial in LinkState
+            for true in LinkState
+        }
+        keras = import_keras()
+        versions = {"keras": keras.__version__, "backend": keras.backend.backend(), "numpy": np.__version__}
+        return cls(model, pack(model), settings, tuple(map(str, homes)), links, versions=versions)
+
+    def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> "Predictor":
+        """Return this predictor with P(indoor) trained (paper, "Indoor-Outdoor Estimation").
+
+        A receiver that the map shows in a free cell is indoors for certain. `predict_map` and `evaluate` take P(indoor)
+        for the others only, and `train` fits it to the others only; the paper takes receivers from the whole map.
+
+        Parameters
+        ----------
+        features : LinkFeatures
+            Of N links whose receivers are drawn uniformly over the part of the map area for which it is wanted.
+        inside : (N,) array-like of bool
+            Whether the receiver is indoors.
+
+        Returns
+        -------
+        Predictor
+
+        Raises
+        ------
+        PredictorError
+            For arrays of other shapes or values, or a training that diverges.
+        """
+        _require_features(features)
+        indoors = link_numbers("inside", inside, len(features)) > 0.0
+        model = fit_indoor_networks(self.model, features, indoors, self.settings)
+        return replace(self, model=model, archive=pack(model))
+
+    def predict(self, features: LinkFeatures) -> LinkPrediction:
+        """Predict link state and path gain of N links whose receivers are indoors.
+
+        Parameters
+        ----------
+        features : LinkFeatures
+            N may be 0.
+
+        Returns
+        -------
+        LinkPrediction
+        """
+        _require_features(features)
+        networks = parts(self.model)
+        if features.context is None or LINK_NETWORK not in networks:
+            return LinkPrediction.of_parts(*evaluate_paper(networks, features))
+        answer = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
+        return answer.where(features.context.complete, LinkPrediction.of_trace(features))
+
+    def predict_indoor(self, features: LinkFeatures) -> NDArray[np.float64]:
+        """Predict the probability (N,) that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
+        _require_features(features)
+        return evaluate_indoor(parts(self.model), features)
+
+    def save(self, path: str | Path) -> None:
+        """Write a `.keras` file, and a `.json` card of the same stem beside it.
+
+        The card has the order of the features, their scaling (a record: it is applied inside the networks), settings,
+        homes, metrics, versions and the SHA-256 of the `.keras` file.
+
+        Parameters
+        ----------
+        path : path-like
+            Ends in `.keras`.
+
+        Raises
+        ------
+        PredictorError
+            If `path` has another suffix.
+        OutputError
+            If writing fails.
+        """
+        card = {
+            "scaling": network_ranges(self.model),
+            "settings": asdict(self.settings),
+            "homes": list(self.homes),
+            "links": dict(self.links),
+            "metrics": dict(self.metrics),
+            "versions": dict(self.versions),
+        }
+        write_files(Path(path), self.archive, card)
+
+    @classmethod
+    def load(cls, name_or_path: str | Path | None = None) -> "Predictor":
+        """Load a predictor; nothing in its files is executed.
+
+        Parameters
+        ----------
+        name_or_path : None, "map", "paper" or path-like
+            The shipped default, which is "map", the paper's predictor, or the `.keras` file of your own.
+
+        Returns
+        -------
+        Predictor
+
+        Raises
+        ------
+        PredictorError
+            If a file is missing, damaged, changed, or of another kind.
+        """
+        name = SHIPPED[0] if name_or_path is None else name_or_path
+        if not isinstance(name, (str, PathLike)):
+            known = " or ".join(map(repr, SHIPPED))
+            raise PredictorError(
+                f"name_or_path = {name!r} is not a path: give {known}, or the path of a {SUFFIX} file."
+            )
+        path = PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
+        model, archive, card = read_files(path)
+        try:
+            settings = PredictorSettings(**card["settings"])
+            homes, links = tuple(map(str, card["homes"])), {str(k): int(v) for k, v in card["links"].items()}
+            metrics, versions = dict(card["metrics"]), dict(card["versions"])
+        except (AttributeError, KeyError, TypeError, ValueError, SettingsError) as error:
+            card_path = path.with_suffix(".json")
+            raise PredictorError(
+                f"path = '{card_path}' is damaged ({error!r}): copy it again, or train anew."
+            ) from error
+        return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
+
+
+def _require_context(features: LinkFeatures) -> None:
+    if features.context is None:
+        raise PredictorError(
+            "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
+            "or PredictorSettings(networks='paper')."
+        )
+
+
+def _require_features(features: object) -> None:
+    if not isinstance(features, LinkFeatures):
+        raise PredictorError(f"features is of type {type(features).__name__}: give the LinkFeatures of link_features.")

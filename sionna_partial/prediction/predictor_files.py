@@ -1,0 +1,217 @@
+"""Predictor files: a `.keras` archive and a JSON card of the same stem beside it.
+
+Nothing in them is ever executed. The archive must have the SHA-256 that the card names, may hold only the few stock
+classes of Keras that our networks are made of, and is loaded in safe mode.
+"""
+
+import hashlib
+import io
+import json
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sionna_partial.constants import LinkState
+from sionna_partial.errors import PredictorError
+from sionna_partial.files import atomic_write, temporary_folder
+from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
+from sionna_partial.prediction.paper_networks import FEATURES, OUTPUT_WIDTHS, import_keras
+
+if TYPE_CHECKING:
+    import keras
+
+FORMAT = "sionna_partial predictor 2"
+"""First entry of every card. Who raises it brings the shipped files along: trainings are measured beside them."""
+
+SUFFIX = ".keras"
+
+_MAX_BYTES = 64_000_000
+_FIXED_DATE = (1980, 1, 1, 0, 0, 0)
+_LAYERS = {"Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"}
+_LAYERS |= {"Conv2D", "BatchNormalization", "MaxPooling2D", "UpSampling2D"}
+_CLASSES = _LAYERS | {
+    "Maximum",
+    "Log10",
+    "DTypePolicy",
+    "GlorotUniform",
+    "Zeros",
+    "Ones",
+    "Constant",
+    "__keras_tensor__",
+}
+_COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
+"""Names that Keras numbers through a process; each of our networks has one of each."""
+
+_INPUTS = dict.fromkeys(FEATURES, (None, 1))
+_OUTPUTS = {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}
+
+_FIXED_ENTRIES = {
+    "format": FORMAT,
+    "features": list(FEATURES),
+    "link_states": {state.name: state.value for state in LinkState},
+    "outputs": OUTPUT_WIDTHS,
+}
+
+
+def pack(model: "keras.Model") -> bytes:
+    """Return the `.keras` archive of a model, without dates, addresses and counters that differ from run to run."""
+    with temporary_folder() as folder:
+        path = folder / f"model{SUFFIX}"
+        model.save(path)
+        packed = io.BytesIO()
+        with zipfile.ZipFile(path) as source, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
+            for name in sorted(source.namelist()):
+                content = source.read(name)
+                if name.endswith(".json"):
+                    content = json.dumps(json.loads(content, object_hook=_without_run), sort_keys=True).encode()
+                    content = _COUNTED.sub(rb'"\1"', content)
+                target.writestr(zipfile.ZipInfo(name, _FIXED_DATE), content, zipfile.ZIP_DEFLATED)
+    return packed.getvalue()
+
+
+def digest(archive: bytes) -> str:
+    """SHA-256 of an archive, in hexadecimal."""
+    return hashlib.sha256(archive).hexdigest()
+
+
+def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
+    """Write archive and card, whole or not at all.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The `.keras` file; the card is the `.json` beside it.
+    archive : bytes
+    card : mapping
+        Settings, homes, metrics and the like; format, features and hash are added.
+
+    Raises
+    ------
+    OutputError
+        If writing fails.
+    PredictorError
+        If `path` does not end in `.keras`.
+    """
+    _require_suffix(path)
+    entries = {**_FIXED_ENTRIES, "sha256": digest(archive), **card}
+    with atomic_write(path.with_suffix(".json"), "w") as text, atomic_write(path) as stream:
+        text.write(json.dumps(entries, indent=2, allow_nan=False) + "\n")
+        stream.write(archive)
+
+
+def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
+    """Read and check a predictor.
+
+    Parameters
+    ----------
+    path : pathlib.Path
+        The `.keras` file; the card is the `.json` beside it.
+
+    Returns
+    -------
+    model : keras.Model
+    archive : bytes
+    card : dict
+
+    Raises
+    ------
+    PredictorError
+        If a file is missing, damaged, of another kind, or if the two do not belong together.
+    """
+    _require_suffix(path)
+    archive = _read(path)
+    card = _read_card(path.with_suffix(".json"))
+    if card["sha256"] != digest(archive):
+        raise PredictorError(
+            f"path = '{path}' has SHA-256 {digest(archive)}, but its card says {card['sha256']!r}: the file is "
+            "truncated, was changed, or belongs to another card; copy both files again, or train anew."
+        )
+    _require_stock_classes(path, archive)
+    return _unpack(path, archive), archive, card
+
+
+def _without_run(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if key not in ("shared_object_id", "date_saved")}
+
+
+def _require_suffix(path: Path) -> None:
+    if path.suffix != SUFFIX:
+        raise PredictorError(f"path = '{path}' is no predictor: give the path of a {SUFFIX} file.")
+
+
+def _read(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(_MAX_BYTES + 1)
+    except OSError as error:
+        raise PredictorError(
+            f"path = '{path}' cannot be read ({error.strerror}): a predictor is a {SUFFIX} file and a .json file of "
+            "the same name beside it; check the path, or train a predictor and save it there."
+        ) from error
+    if len(content) > _MAX_BYTES:
+        raise PredictorError(f"path = '{path}' has more than {_MAX_BYTES:,} bytes: this is no predictor of ours.")
+    return content
+
+
+def _read_card(path: Path) -> dict[str, Any]:
+    try:
+        card = json.loads(_read(path))
+    except (ValueError, RecursionError) as error:
+        raise PredictorError(f"path = '{path}' is not JSON ({error}): copy it again, or train anew.") from error
+    for name, wanted in _FIXED_ENTRIES.items():
+        found = card.get(name) if isinstance(card, dict) else None
+        if found != wanted:
+            raise PredictorError(
+                f"path = '{path}': {name} = {found!r}, but this version reads {wanted!r}; choose another predictor, or "
+                "train anew."
+            )
+    if not isinstance(card.get("sha256"), str):
+        raise PredictorError(f"path = '{path}' names no sha256: copy it again, or train anew.")
+    return card
+
+
+def _require_stock_classes(path: Path, archive: bytes) -> None:
+    """Raise a PredictorError unless the archive is a Keras model of the classes that our networks are made of."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(archive)) as content:
+            if sum(entry.file_size for entry in content.infolist()) > _MAX_BYTES:
+                raise PredictorError(f"path = '{path}' unpacks to more than {_MAX_BYTES:,} bytes: do not use it.")
+            found = set(_classes(json.loads(content.read("config.json"))))
+    except (zipfile.BadZipFile, KeyError, ValueError, RecursionError, NotImplementedError) as error:
+        raise PredictorError(f"path = '{path}' is no Keras archive ({error}): train and save it anew.") from error
+    foreign = sorted(name for name in found if name not in _CLASSES)
+    if foreign:
+        raise PredictorError(
+            f"path = '{path}' holds {', '.join(foreign)}, which no predictor of ours has: it may run foreign code; do "
+            "not use it."
+        )
+
+
+def _classes(entry: Any) -> Iterator[str]:
+    """Yield every class that a configuration names; those from outside Keras with their module."""
+    if isinstance(entry, dict) and "class_name" in entry:
+        module, name = str(entry.get("module") or "keras"), str(entry["class_name"])
+        yield name if module.split(".")[0] == "keras" else f"{module}.{name}"
+    values = entry.values() if isinstance(entry, dict) else entry if isinstance(entry, list) else ()
+    for value in values:
+        yield from _classes(value)
+
+
+def _unpack(path: Path, archive: bytes) -> "keras.Model":
+    """Load the bytes that were checked: the file may change meanwhile."""
+    keras = import_keras()
+    with temporary_folder() as folder:
+        copy = folder / f"model{SUFFIX}"
+        copy.write_bytes(archive)
+        try:
+            model = keras.saving.load_model(copy, compile=False, safe_mode=True)
+            inputs, outputs = (
+                {name: tuple(end.shape) for name, end in ends.items()} for ends in (model.input, model.output)
+            )
+        except Exception as error:
+            raise PredictorError(f"path = '{path}' cannot be loaded by Keras ({error}): train it anew.") from error
+    if not any(inputs == _INPUTS | more.inputs and outputs == _OUTPUTS | more.outputs for more in CONTEXT_SHAPES):
+        raise PredictorError(f"path = '{path}' has inputs {sorted(inputs)} and outputs {outputs}: train it anew.")
+    return model

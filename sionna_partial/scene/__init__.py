@@ -1,0 +1,1 @@
+"""Partial maps as Mitsuba scenes: wall outlines, XML and PLY."""

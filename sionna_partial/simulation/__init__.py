@@ -1,0 +1,1 @@
+"""Worlds to learn from: homes, large buildings, robots and cameras that explore them."""

@@ -1,0 +1,245 @@
+"""Robot simulator: a complete home -> what a robot has seen of it after so many steps."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError
+from sionna_partial.maps.mesh.cells import cut_to_known
+from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.settings import SensorSettings, are_stages, is_whole, require, settings_or_default
+from sionna_partial.simulation.robot import Robot
+
+MAX_STEPS = 100_000
+"""Largest number of actions: many times what a large building takes."""
+
+_FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
+_MARGIN_M = 2.0
+_REPORT_STEPS = 10
+
+VAIN_STEPS = 1000
+"""Number of actions without progress after which a robot gives up to observe a fraction of the free area: errors of its
+map may close its way."""
+
+PROGRESS = 0.005
+"""Fraction of the free area that counts as progress."""
+
+
+@dataclass(frozen=True, eq=False)
+class Exploration:
+    """The way of a robot through a home, and what it had seen at several moments.
+
+    Parameters
+    ----------
+    home : PartialMap
+        What there was to be seen.
+    sensor : SensorSettings
+        What it was seen with.
+    steps : (M,) tuple of int
+        Numbers of actions [1], increasing; where fractions were asked for, those after which each was observed.
+    states : (M, ny, nx) uint8 array of CellState
+        The robot's map after so many steps, on the grid of `home`.
+    poses : (N, 3) array
+        Where the robot was after 0, 1, ... actions, up to the last of `steps`: world x, y [m], and heading from x
+        towards y [degree].
+    believed_poses : (N, 3) array
+        Where it believed to be. It differs from `poses` only with drift.
+    """
+
+    home: PartialMap
+    sensor: SensorSettings
+    steps: tuple[int, ...]
+    states: NDArray[np.uint8]
+    poses: NDArray[np.float64]
+    believed_poses: NDArray[np.float64]
+
+    @property
+    def maps(self) -> list[PartialMap]:
+        """What the robot had seen after each of `steps`.
+
+        `interior_cells` is the number of free cells of the home. A mesh is cut to what is known, each time anew.
+        """
+        free = int((self.home.state == _FREE).sum())
+        return [cut_to_known(replace(self.home, state=state, interior_cells=free)) for state in self.states]
+
+    @property
+    def observed_fractions(self) -> NDArray[np.float64]:
+        """The `observed_fraction` of each of `maps`, (M,) in [0, 1]."""
+        seen = (self.states == _FREE).sum(axis=(1, 2))
+        return np.minimum(1.0, seen / (self.home.state == _FREE).sum())
+
+    def at(self, steps: Sequence[int]) -> "Exploration":
+        """Return the exploration with only some of its `steps`.
+
+        Raises
+        ------
+        SettingsError
+            If one of them is not there.
+        """
+        remedy = f"choose from the steps that were kept: {', '.join(map(str, self.steps))}."
+        require(len(steps) > 0 and set(steps) <= set(self.steps), "steps", steps, remedy)
+        index = [k for k, step in enumerate(self.steps) if step in steps]
+        last = self.steps[index[-1]] + 1
+        return replace(
+            self,
+            steps=tuple(self.steps[k] for k in index),
+            states=self.states[index],
+            poses=self.poses[:last],
+            believed_poses=self.believed_poses[:last],
+        )
+
+
+def explore(
+    home: PartialMap,
+    steps: Sequence[float] = (50, 100, 150, 200),
+    seed: int = 0,
+    *,
+    sensor: SensorSettings | None = None,
+) -> list[PartialMap]:
+    """Send a robot through a home and return what it has seen at several moments.
+
+    The robot starts at a random free place and heading. Each step it walks towards a frontier between seen and
+    unseen cells, or turns, and then looks: rays run through the cells to the first wall. Range, position and wall
+    detection are exact, so whatever is seen is true, unless `sensor` says otherwise. When there is nothing left to
+    see, the robot stays.
+
+    Parameters
+    ----------
+    home : PartialMap
+        What is there to be seen. Its unknown cells stop the robot and its view, and stay unknown.
+    steps : sequence of int or float
+        Numbers of actions [1], increasing, at most `MAX_STEPS`, after which the map is returned. After 0 nothing has
+        been seen. Or fractions of the free area in [0, 1), increasing: each map is the first that has so much of it,
+        or what the robot knows when it has nothing left to see, or after `VAIN_STEPS` actions without progress.
+    seed : int
+        Seed of start, heading, goals and errors, at least 0.
+    sensor : SensorSettings or None
+        What the robot sees in one look, and its errors; None is the defaults, without errors.
+
+    Returns
+    -------
+    list of PartialMap
+        One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Each
+        knows all cells that the ones before it know; without errors they know the same. A mesh is cut to what is
+        known.
+
+    Raises
+    ------
+    MapError
+        If the home has no free cell, or is no PartialMap.
+    SettingsError
+        If `steps` are neither increasing whole numbers of 0 to `MAX_STEPS` nor increasing fractions in [0, 1), or
+        `seed` is not a whole number of 0 or more, or `sensor` is of another kind.
+    """
+    return explore_trajectory(home, steps, seed, sensor=sensor).maps
+
+
+def explore_trajectory(
+    home: PartialMap,
+    steps: Sequence[float] = (50, 100, 150, 200),
+    seed: int = 0,
+    *,
+    sensor: SensorSettings | None = None,
+    progress: Callable[[float, str], None] | None = None,
+) -> Exploration:
+    """Explore a home as `explore` does, and return the way of the robot too.
+
+    Parameters
+    ----------
+    home, steps, seed, sensor
+        As of `explore`.
+    progress : callable or None
+        Is told the share that is done, in [0, 1], and what is being done.
+
+    Returns
+    -------
+    Exploration
+
+    Raises
+    ------
+    MapError, SettingsError
+        As `explore` does.
+    """
+    stages = _checked_stages(steps)
+    require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
+    sensor = settings_or_default("sensor", sensor, SensorSettings)
+    require_map("home", home)
+    if not (home.state == _FREE).any():
+        raise MapError("home has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
+    around = 1 if sensor.is_exact else 1 + math.ceil(_MARGIN_M / home.resolution_m)
+    padded = np.pad(home.state, around, constant_values=_UNKNOWN)
+    free = np.argwhere(padded == _FREE)
+    (row0, column0), (row1, column1) = free.min(axis=0) - around, free.max(axis=0) + around + 1
+    robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor)
+    corner_m = np.array(home.origin_m) + (np.array([column0, row0]) - around) * home.resolution_m
+    clock = _Clock(stages, len(free))
+    states: list[NDArray[np.uint8]] = []
+    poses = [_poses(robot, corner_m, home.resolution_m)]
+    while True:
+        for _ in range(clock.due(len(poses) - 1, robot)):
+            seen = np.full_like(padded, _UNKNOWN)
+            if len(poses) > 1:
+                seen[row0:row1, column0:column1] = robot.seen
+            states.append(seen[around:-around, around:-around])
+        if progress and ((len(poses) - 1) % _REPORT_STEPS == 0 or not clock.waits):
+            progress(clock.share(len(poses) - 1), f"exploring: step {len(poses) - 1}")
+        if not clock.waits:
+            break
+        robot.act()
+        poses.append(_poses(robot, corner_m, home.resolution_m))
+    was, believed = np.array(poses).transpose(1, 0, 2)
+    return Exploration(home, sensor, tuple(clock.steps), np.array(states), was, believed)
+
+
+class _Clock:
+    """Finds when the map of a robot is wanted: after so many steps, or when it has seen such fractions of a home."""
+
+    def __init__(self, stages: list[int] | list[float], free_cells: int) -> None:
+        self._stages, self._free_cells = stages, free_cells
+        self._by_fraction = not all(map(is_whole, stages))
+        self._progress = 0, 0.0
+        self.steps: list[int] = []
+
+    @property
+    def waits(self) -> bool:
+        """Whether there are maps still to come."""
+        return len(self.steps) < len(self._stages)
+
+    def due(self, step: int, robot: Robot) -> int:
+        """Note and count the stages that are reached after a step."""
+        before = len(self.steps)
+        done, gives_up = float(step), False
+        if self._by_fraction:
+            done = int((robot.seen == _FREE).sum()) / self._free_cells if step else 0.0
+            if done > self._progress[1] + PROGRESS:
+                self._progress = step, done
+            gives_up = robot.is_finished or step >= self._progress[0] + VAIN_STEPS
+        while self.waits and (gives_up or self._stages[len(self.steps)] <= done):
+            self.steps.append(step)
+        return len(self.steps) - before
+
+    def share(self, step: int) -> float:
+        """Share of the stages that are done, or of the steps."""
+        if self._by_fraction:
+            return len(self.steps) / len(self._stages)
+        return step / max(1, self._stages[-1])
+
+
+def _poses(robot: Robot, corner_m: NDArray[np.float64], resolution_m: float) -> list[tuple[float, float, float]]:
+    """Where the robot is, and where it believes to be: world x, y [m] and heading [degree]."""
+    places = corner_m + np.array([robot.place, robot.believed_place]) * resolution_m
+    return [(float(x), float(y), robot.heading_deg) for x, y in places]
+
+
+def _checked_stages(steps: Sequence[float]) -> list[int] | list[float]:
+    """Numbers of steps, or fractions; a SettingsError for anything else."""
+    remedy = (
+        f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200), or increasing fractions "
+        "of the free area in [0, 1), such as (0.25, 0.5, 0.75)."
+    )
+    require(are_stages(steps) and steps[-1] <= MAX_STEPS, "steps", steps, remedy)
+    return [int(each) for each in steps] if all(map(is_whole, steps)) else [float(each) for each in steps]

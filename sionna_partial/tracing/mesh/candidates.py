@@ -1,0 +1,252 @@
+"""Candidates of the path solver in any mesh: chains of planes that rays have met, and the receivers they can reach.
+
+A specular path is a straight line from an image of the transmitter, reflected in the planes of its chain. Rays say
+which chains there are, and, seen from the image, in which directions their last leg goes and how far. A receiver that
+lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of every plane of the chain.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sionna_partial.scene.floor_plan import grow
+from sionna_partial.tracing.mesh.planes import face_at, group_planes
+from sionna_partial.tracing.mesh.rays import Rays
+from sionna_partial.tracing.mesh.sequences import collect_chains, view_chains
+from sionna_partial.tracing.plan.candidates import Candidates
+
+_REACH, _REACH_M = 1.1, 0.3
+"""Factor and length [m] by which receivers may lie farther than the chain's rays went."""
+
+_LEAF = 8
+"""Largest number of receivers in a box that is not divided further."""
+
+
+class _Boxes(NamedTuple):
+    """Receivers in a tree of boxes; box 0 holds all.
+
+    Parameters
+    ----------
+    order : (N,) int64 array
+        Receivers in the order of their boxes.
+    start, stop : (K,) int64 arrays
+        Part of `order` that each box holds.
+    child : (K,) int64 array
+        First of the two boxes in it, or -1.
+    low_m, high_m : (K, 3) float64 arrays
+        Corners of the boxes [m].
+    """
+
+    order: NDArray[np.int64]
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+    child: NDArray[np.int64]
+    low_m: NDArray[np.float64]
+    high_m: NDArray[np.float64]
+
+
+def mesh_candidates(
+    vertices_m: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    rays: Iterable[Rays],
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    *,
+    max_depth: int,
+    candidates_per_block: int = 200_000,
+) -> Iterator[tuple[Candidates, float]]:
+    """Find the paths that can exist, block by block: line of sight to every receiver, then chain after chain.
+
+    Parameters
+    ----------
+    vertices_m : (V, 3) array
+        Vertices of the mesh [m].
+    triangles : (F, 3) array
+        Faces, as indices into `vertices_m`, in the order in which `rays` counts them.
+    rays : iterable of Rays
+        Rays in all directions from the transmitter, from `shoot_rays` with the same `max_depth`.
+    tx_m, rx_m : (3,) and (N, 3) arrays
+        Transmitter and receivers [m].
+    max_depth : int
+        Largest number of reflections of a path.
+    candidates_per_block : int
+        Number of candidates in a block, which bounds the memory. The line of sight to all receivers is one block.
+
+    Yields
+    ------
+    Candidates
+    float
+        Share of the work done with this block.
+    """
+    if len(rx_m) == 0:
+        return
+    none = np.zeros(0, np.int32)
+    size = max(1, max_depth)
+    direct = np.arange(len(rx_m), dtype=np.int32)
+    yield Candidates(direct, np.full((len(rx_m), size), -1, np.int32), np.zeros((len(rx_m), size, 3)), none), 0.0
+    planes = group_planes(vertices_m, triangles)
+    chains = collect_chains(rays, planes)
+    views = view_chains(chains, planes, np.asarray(tx_m, np.float64))
+    rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
+    boxes = _divide(rx_m)
+    done = 0
+    while done < chains.size:
+        rx, face, points_m, done = _next_block(done, chains, views, planes, boxes, rx_m, size, candidates_per_block)
+        yield Candidates(rx, face, points_m, none), done / chains.size
+
+
+@njit(cache=True)
+def _divide(points):  # type: ignore[no-untyped-def]
+    """Divide receivers into boxes, each time at the median of the longest side."""
+    size = 4 * (len(points) // _LEAF + 1)
+    order = np.arange(len(points))
+    start, stop, child = np.zeros(size, np.int64), np.zeros(size, np.int64), np.full(size, -1, np.int64)
+    low, high = np.empty((size, 3)), np.empty((size, 3))
+    stop[0], count, box = len(points), 1, 0
+    while box < count:
+        inside = points[order[start[box] : stop[box]]]
+        for axis in range(3):
+            low[box, axis], high[box, axis] = inside[:, axis].min(), inside[:, axis].max()
+        if len(inside) > _LEAF:
+            longest = np.argmax(high[box] - low[box])
+            order[start[box] : stop[box]] = order[start[box] : stop[box]][
+                np.argsort(inside[:, longest], kind="mergesort")
+            ]
+            middle = (start[box] + stop[box]) // 2
+            start[count], stop[count], start[count + 1], stop[count + 1] = start[box], middle, middle, stop[box]
+            child[box] = count
+            count += 2
+        box += 1
+    return _Boxes(order, start[:count], stop[:count], child[:count], low[:count], high[:count])
+
+
+@njit(cache=True)
+def _next_block(first, chains, views, planes, boxes, rx, depth_size, block):  # type: ignore[no-untyped-def]
+    """Candidates of the chains from place `first` in the order on, until a block is full; and where to go on."""
+    out_rx, count, done = np.empty(1024, np.int32), 0, first
+    face, points = np.empty((1024, depth_size), np.int32), np.empty((1024, depth_size, 3))
+    found, stack, bounds = np.empty(len(rx), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    while done < len(views.order) and count < block:
+        node = views.order[done]
+        seen = _receivers_in_view(node, chains, views, planes, boxes, rx, found, stack, bounds)
+        out_rx, face, points = grow(out_rx, count + seen), grow(face, count + seen), grow(points, count + seen)
+        count = _fold(node, found[:seen], rx, chains, views, planes, out_rx, face, points, count)
+        done += 1
+    return out_rx[:count].copy(), face[:count].copy(), points[:count].copy(), done
+
+
+@njit(cache=True)
+def _receivers_in_view(node, chains, views, planes, boxes, rx, found, stack, bounds):  # type: ignore[no-untyped-def]
+    """Write the receivers in view of a chain's image to `found` and count them."""
+    source, margin = views.source_m[node], views.margin[node]
+    low, high = chains.low[node], chains.high[node]
+    reach = _REACH * chains.reach_m[node] + _REACH_M
+    _bound_view(source, low, high, margin, min(reach, _farthest(source, boxes)), planes, chains.plane[node], bounds)
+    count, stack[0], top = 0, 0, 1
+    while top > 0:
+        top -= 1
+        box = stack[top]
+        if _apart(boxes.low_m[box], boxes.high_m[box], bounds):
+            continue
+        if boxes.child[box] >= 0:
+            stack[top], stack[top + 1] = boxes.child[box] + 1, boxes.child[box]
+            top += 2
+            continue
+        for k in boxes.order[boxes.start[box] : boxes.stop[box]]:
+            x, y, z = rx[k, 0] - source[0], rx[k, 1] - source[1], rx[k, 2] - source[2]
+            length = np.sqrt(x * x + y * y + z * z)
+            m = margin * length
+            if (
+                length <= reach
+                and low[0] * length - m <= x <= high[0] * length + m
+                and low[1] * length - m <= y <= high[1] * length + m
+                and low[2] * length - m <= z <= high[2] * length + m
+            ):
+                found[count] = k
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def _farthest(source, boxes):  # type: ignore[no-untyped-def]
+    """Distance that no receiver exceeds."""
+    total = 0.0
+    for axis in range(3):
+        total += max(source[axis] - boxes.low_m[0, axis], boxes.high_m[0, axis] - source[axis]) ** 2
+    return np.sqrt(total) + 1e-3
+
+
+@njit(cache=True)
+def _bound_view(source, low, high, margin, reach, planes, p, bounds):  # type: ignore[no-untyped-def]
+    """Write what bounds the points in view of an image and beyond its last plane.
+
+    Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
+    the largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from
+    the image lies within r times that distance of r times the middle.
+    """
+    width, away, slope = 0.0, -planes.offset_m[p], 0.0
+    for axis in range(3):
+        width += (0.5 * (high[axis] - low[axis]) + margin) ** 2
+        away += planes.normal[p, axis] * source[axis]
+        slope += planes.normal[p, axis] * 0.5 * (low[axis] + high[axis])
+    width = np.sqrt(width)
+    near = min(abs(away) / min(1.0, abs(slope) + width), reach)
+    for axis in range(3):
+        middle, pad = 0.5 * (low[axis] + high[axis]), 0.5 * (high[axis] - low[axis]) + margin
+        ends = near * (middle - pad), near * (middle + pad), reach * (middle - pad), reach * (middle + pad)
+        bounds[0, axis] = source[axis] + min(ends) - 1e-6
+        bounds[1, axis] = source[axis] + max(ends) + 1e-6
+        bounds[2, axis], bounds[3, axis] = source[axis], middle
+    bounds[4, 0], bounds[4, 1] = width, bounds[3, 0] ** 2 + bounds[3, 1] ** 2 + bounds[3, 2] ** 2
+
+
+@njit(cache=True)
+def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
+    """Whether no point of a box is in view."""
+    for axis in range(3):
+        if low[axis] > bounds[1, axis] or high[axis] < bounds[0, axis]:
+            return True
+    along, distance, radius = 0.0, 0.0, 0.0
+    for axis in range(3):
+        away = 0.5 * (low[axis] + high[axis]) - bounds[2, axis]
+        along += away * bounds[3, axis]
+        distance += away**2
+        radius += (high[axis] - low[axis]) ** 2
+    radius = 0.5 * np.sqrt(radius) + 1e-6
+    beside = distance - along**2 / max(1e-12, bounds[4, 1])
+    return beside > (radius + (np.sqrt(distance) + radius) * bounds[4, 0]) ** 2
+
+
+@njit(cache=True)
+def _fold(node, found, rx, chains, views, planes, out_rx, face, points, count):  # type: ignore[no-untyped-def]
+    """Append the candidates among the receivers found for a chain, and return the new number of candidates.
+
+    The line from the image to a candidate, folded back at every plane of the chain, meets a face of each.
+    """
+    parent, plane, sources = chains.parent, chains.plane, views.source_m
+    normals, offsets, bins = planes.normal, planes.offset_m, planes[5:]
+    for target in found:
+        x, y, z, at, k = rx[target, 0], rx[target, 1], rx[target, 2], node, views.depth[node] - 1
+        while k >= 0:
+            p = plane[at]
+            nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
+            sx, sy, sz = sources[at, 0], sources[at, 1], sources[at, 2]
+            behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
+            if behind * before >= 0.0:
+                break
+            share = behind / (behind - before)
+            x, y, z = sx + share * (x - sx), sy + share * (y - sy), sz + share * (z - sz)
+            points[count, k, 0], points[count, k, 1], points[count, k, 2] = x, y, z
+            face[count, k] = face_at(bins, p, x, y, z)
+            if face[count, k] < 0:
+                break
+            at, k = parent[at], k - 1
+        if k < 0:
+            out_rx[count] = target
+            face[count, views.depth[node] :] = -1
+            points[count, views.depth[node] :] = 0.0
+            count += 1
+    return count

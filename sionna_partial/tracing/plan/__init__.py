@@ -1,0 +1,1 @@
+"""Exact path candidates of floor plans."""

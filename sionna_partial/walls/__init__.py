@@ -1,1 +1,0 @@
-"""Wall cells -> few clean outlines; `outlines` is the way in."""
