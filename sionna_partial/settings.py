@@ -1,12 +1,15 @@
 """One frozen dataclass of settings for each stage, checked when it is built."""
 
-import itertools
-import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
-from numbers import Integral, Real
-from typing import Literal, TypeVar, get_args
+from typing import Annotated, Literal, get_args
 
+from sionna_partial.checks import Checked, Within
+from sionna_partial.checks import are_stages as are_stages
+from sionna_partial.checks import is_whole as is_whole
+from sionna_partial.checks import require as require
+from sionna_partial.checks import require_number as require_number
+from sionna_partial.checks import require_whole as require_whole
+from sionna_partial.checks import settings_or_default as settings_or_default
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
@@ -14,7 +17,6 @@ from sionna_partial.constants import (
     DRYWALL_PERMITTIVITY,
     WALL_THICKNESS_M,
 )
-from sionna_partial.errors import SettingsError
 
 ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
     "vacuum": ((0.001, 100.0),),
@@ -52,53 +54,17 @@ NetworkKind = Literal["paper", "paths", "map"]
 """What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
 
 Objective = Literal["coverage", "percentile"]
-"""What a transmitter is placed for: the mean predicted coverage, or the gain of the worst tenth of the places."""
+"""What a transmitter is placed for: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
 
-_Settings = TypeVar("_Settings")
-
-
-def require(condition: bool, name: str, value: object, remedy: str) -> None:
-    """Raise a SettingsError that names the setting, its value and the remedy unless `condition` holds."""
-    if not condition:
-        raise SettingsError(f"{name} = {value!r} is not allowed: {remedy}")
-
-
-def require_number(name: str, value: object, low: float, high: float, *, open_low: bool = False) -> None:
-    """Raise a SettingsError unless `value` is a finite number in [low, high], or (low, high] with `open_low`."""
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
-    inside = (low < number if open_low else low <= number) and number <= high
-    require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].")
-
-
-def is_whole(value: object) -> bool:
-    """Whether `value` is a whole number of 0 or more."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 0
-
-
-def require_whole(name: str, value: object, low: int, high: int) -> None:
-    """Raise a SettingsError unless `value` is a whole number in [low, high]."""
-    inside = isinstance(value, Integral) and not isinstance(value, bool) and low <= int(value) <= high
-    require(inside, name, value, f"give a whole number in [{low}, {high}].")
-
-
-def are_stages(value: object) -> bool:
-    """Whether `value` has increasing whole numbers (of steps), or increasing fractions in [0, 1), one at least."""
-    stages = list(value) if isinstance(value, Iterable) else []
-    numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
-    rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
-    return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))
-
-
-def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:
-    """Return `value`, or the default settings for None; raise a SettingsError if it is of another kind."""
-    if value is None:
-        return kind()
-    require(isinstance(value, kind), name, value, f"give {kind.__name__}(...), or None for the default.")
-    return value
+Frequency = Annotated[float, Within(*FREQUENCIES_HZ)]
+Fraction = Annotated[float, Within(0.0, 1.0)]
+Height = Annotated[float, Within(0.0, 1000.0, open_low=True)]
+Seed = Annotated[int, Within(0, 2**31 - 1)]
+Count = Annotated[int, Within(1, 1_000_000)]
 
 
 @dataclass(frozen=True)
-class Material:
+class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
     Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one with constant permittivity and
@@ -119,17 +85,23 @@ class Material:
     ------
     SettingsError
         For a value out of range or an unknown ITU name.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.Material(itu="concrete").itu
+    'concrete'
+    >>> sp.Material(4.0, conductivity_s_m=0.05, thickness_m=0.2).relative_permittivity
+    4.0
     """
 
-    relative_permittivity: float = DRYWALL_PERMITTIVITY
-    conductivity_s_m: float = DRYWALL_CONDUCTIVITY_S_M
-    thickness_m: float = WALL_THICKNESS_M
+    relative_permittivity: Annotated[float, Within(1.0, 1e6)] = DRYWALL_PERMITTIVITY
+    conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
+    thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
 
     def __post_init__(self) -> None:
-        require_number("relative_permittivity", self.relative_permittivity, 1.0, 1e6)
-        require_number("conductivity_s_m", self.conductivity_s_m, 0.0, 1e9)
-        require_number("thickness_m", self.thickness_m, 0.0, 10.0, open_low=True)
+        super().__post_init__()
         for name in ("relative_permittivity", "conductivity_s_m", "thickness_m"):
             object.__setattr__(self, name, float(getattr(self, name)))  # files hold no numbers of NumPy
         known = ", ".join(ITU_BANDS_GHZ)
@@ -143,16 +115,12 @@ class Material:
         bands = ITU_BANDS_GHZ[self.itu]
         covered = any(low <= frequency_hz / 1e9 <= high for low, high in bands)
         spans = " or ".join(f"{low:g}-{high:g} GHz" for low, high in bands)
-        require(
-            covered,
-            "frequency_hz",
-            frequency_hz,
-            f"ITU material {self.itu!r} is defined for {spans}; choose a frequency there or a custom Material.",
-        )
+        remedy = f"ITU material {self.itu!r} is defined for {spans}; choose a frequency there or a custom Material."
+        require(covered, "frequency_hz", frequency_hz, remedy)
 
 
 @dataclass(frozen=True)
-class SceneSettings:
+class SceneSettings(Checked):
     """How a map becomes a scene. Of a map with a mesh, only the material counts.
 
     Parameters
@@ -161,8 +129,7 @@ class SceneSettings:
         Material of walls, floor and ceiling, or of those parts of a mesh that name none.
     outline_tolerance_cells : float
         Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps
-        whose walls range noise made thick and rough, and again twice as much where a face turns to and fro at least
-        once in 10 cells.
+        whose walls are thick and rough because of range noise, and twice as much again along ragged faces.
     bridge_gap_m : float
         Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
         closed, and 0.11 m.
@@ -178,28 +145,24 @@ class SceneSettings:
     ------
     SettingsError
         For a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.SceneSettings(material=sp.Material(itu="brick"), ceiling=False).floor_extent
+    'observed'
     """
 
     material: Material = field(default_factory=Material)
-    outline_tolerance_cells: float = 0.5
-    bridge_gap_m: float = 0.5
+    outline_tolerance_cells: Annotated[float, Within(0.0, 2.0)] = 0.5
+    bridge_gap_m: Annotated[float, Within(0.0, 1.0)] = 0.5
     floor_extent: Literal["observed", "map", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
 
-    def __post_init__(self) -> None:
-        require(isinstance(self.material, Material), "material", self.material, "give a Material.")
-        require_number("outline_tolerance_cells", self.outline_tolerance_cells, 0.0, 2.0)
-        require_number("bridge_gap_m", self.bridge_gap_m, 0.0, 1.0)
-        extents = ("observed", "map", "none")
-        require(self.floor_extent in extents, "floor_extent", self.floor_extent, f"choose one of {extents}.")
-        require(isinstance(self.ceiling, bool), "ceiling", self.ceiling, "give True or False.")
-        kinds = ("lines", "cells")
-        require(self.outline in kinds, "outline", self.outline, f"choose one of {kinds}.")
-
 
 @dataclass(frozen=True)
-class TraceSettings:
+class TraceSettings(Checked):
     """What the ray tracer computes.
 
     Parameters
@@ -213,7 +176,7 @@ class TraceSettings:
         beams, as line of sight and specular reflections are; on meshes by shooting rays, which is slow. None is True
         on floor plans and False on meshes.
     diffraction_walls : int
-        Largest number of walls of a floor plan that mirror a path before its diffraction, and after it: 0, 1 or 2.
+        Largest number of reflections at walls of a floor plan before the diffraction, and after it: 0, 1 or 2.
     open_ends : bool
         Whether a wall of a floor plan diffracts also where it ends because observation did.
     power_tolerance_db : float
@@ -231,38 +194,29 @@ class TraceSettings:
     ------
     SettingsError
         For a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.TraceSettings(frequency_hz=60e9, max_depth=3, diffraction=False).max_depth
+    3
     """
 
-    frequency_hz: float = CARRIER_FREQUENCY_HZ
-    max_depth: int = 6
+    frequency_hz: Frequency = CARRIER_FREQUENCY_HZ
+    max_depth: Annotated[int, Within(0, 10)] = 6
     diffraction: bool | None = None
-    diffraction_walls: int = 2
+    diffraction_walls: Annotated[int, Within(0, 2)] = 2
     open_ends: bool = False
-    power_tolerance_db: float = 0.1
+    power_tolerance_db: Annotated[float, Within(0.0, 1.0)] = 0.1
     refraction: bool = False
     diffuse_reflection: bool = False
-    samples_per_tx: int = 1_000_000
-    seed: int = 42
-
-    def __post_init__(self) -> None:
-        require_number("frequency_hz", self.frequency_hz, *FREQUENCIES_HZ)
-        for name, low, high in (
-            ("max_depth", 0, 10),
-            ("diffraction_walls", 0, 2),
-            ("samples_per_tx", 1, 100_000_000),
-            ("seed", 0, 2**31 - 1),
-        ):
-            require_whole(name, getattr(self, name), low, high)
-        require_number("power_tolerance_db", self.power_tolerance_db, 0.0, 1.0)
-        for name in ("diffraction", "open_ends", "refraction", "diffuse_reflection"):
-            value = getattr(self, name)
-            unset = name == "diffraction" and value is None
-            require(unset or isinstance(value, bool), name, value, "give True or False.")
+    samples_per_tx: Annotated[int, Within(1, 100_000_000)] = 1_000_000
+    seed: Seed = 42
 
 
 @dataclass(frozen=True)
-class SensorSettings:
-    """What the exploring robot sees in one look, and its errors; without them all that it maps is true.
+class SensorSettings(Checked):
+    """What the exploring robot sees from one pose, and its errors; by default it makes none.
 
     Parameters
     ----------
@@ -270,50 +224,50 @@ class SensorSettings:
         Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It blurs walls:
         the map weighs the readings of each cell, as an occupancy grid does.
     drift_m_per_m : float
-        Growth of the robot's error about its own place per metre of way [1], at most 1, in a direction that is drawn
-        once. What is seen later lies beside where it is, and walls that are seen again may appear twice.
-    missed_wall_share : float
-        Share of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces.
-        Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
+        Odometry drift per metre travelled [1], at most 1, in a direction that is drawn once. What is seen later is
+        mapped off its true position, and walls that are seen again may appear twice.
+    missed_wall_fraction : float
+        Fraction of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces
+        do. Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
     field_of_view_deg : float
-        Horizontal angle [degree], in (0, 360], around where the robot is heading. The default is the camera of Active
+        Horizontal angle [degree], in (0, 360], centred on the heading of the robot. The default is the camera of Active
         Neural SLAM (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
     range_m : float
-        How far it sees [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
+        Largest range [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
 
     Raises
     ------
     SettingsError
         For a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.SensorSettings(range_noise_m=0.02, field_of_view_deg=360.0, range_m=8.0).is_exact
+    False
     """
 
-    range_noise_m: float = 0.0
-    drift_m_per_m: float = 0.0
-    missed_wall_share: float = 0.0
-    field_of_view_deg: float = 90.0
-    range_m: float = 3.2
-
-    def __post_init__(self) -> None:
-        for name in ("range_noise_m", "drift_m_per_m", "missed_wall_share"):
-            require_number(name, getattr(self, name), 0.0, 1.0)
-        require_number("field_of_view_deg", self.field_of_view_deg, 0.0, 360.0, open_low=True)
-        require_number("range_m", self.range_m, 0.0, 100.0, open_low=True)
+    range_noise_m: Annotated[float, Within(0.0, 1.0)] = 0.0
+    drift_m_per_m: Annotated[float, Within(0.0, 1.0)] = 0.0
+    missed_wall_fraction: Fraction = 0.0
+    field_of_view_deg: Annotated[float, Within(0.0, 360.0, open_low=True)] = 90.0
+    range_m: Annotated[float, Within(0.0, 100.0, open_low=True)] = 3.2
 
     @property
     def is_exact(self) -> bool:
         """Whether it makes no errors."""
-        return self.range_noise_m == self.drift_m_per_m == self.missed_wall_share == 0.0
+        return self.range_noise_m == self.drift_m_per_m == self.missed_wall_fraction == 0.0
 
 
 SHORT_LINK_M = 25.0
-"""Length that a short link has at most, on the floor plan [m]."""
+"""Largest length of a short link, on the floor plan [m]."""
 
 MIXED_SENSORS = {
     "range_m": (3.0, 30.0),
     "field_of_view_deg": (60.0, 120.0),
     "range_noise_m": (0.0, 0.05),
     "drift_m_per_m": (0.0, 0.02),
-    "missed_wall_share": (0.0, 0.1),
+    "missed_wall_fraction": (0.0, 0.1),
 }
 """Ranges of the sensors of a data set with `sensor="mixed"`.
 
@@ -323,7 +277,7 @@ than large (the square of a uniform number).
 
 
 @dataclass(frozen=True)
-class DatasetSettings:
+class DatasetSettings(Checked):
     """Which links of a home a data set has.
 
     Parameters
@@ -338,17 +292,17 @@ class DatasetSettings:
         Steps that the robot has explored, increasing; or, all in [0, 1), fractions of the home's free area that it has
         observed, which mean the same in buildings of all sizes.
     seed : int
-        Seed of the places and of the robot, together with the home's name.
+        Seed of the positions and of the robot, together with the home's name.
     tx_height_m, rx_height_m : float
         Heights of transmitters and receivers above the map's z = 0 [m].
     margin_m : float
-        How far the map area reaches beyond the known cells of the complete home [m]. Maps are cut and extended to it.
+        Width of the map area beyond the known cells of the complete home [m]. Maps are cut and extended to it.
     sensor : SensorSettings or "mixed"
         What the exploring robot sees, and its errors; "mixed" draws it for each home from `MIXED_SENSORS`, by `seed`
         and the home's name: one home in three has a camera of 60 to 120 degrees, the others a lidar that turns.
     short_link_fraction : float
         Fraction of the receivers of each transmitter that are drawn within `SHORT_LINK_M` of it [1]. In large
-        buildings most links between places that are drawn uniformly are long, and in outage.
+        buildings most links between uniformly drawn positions are long, and in outage.
     scene : SceneSettings
         How maps become scenes.
     trace : TraceSettings
@@ -358,60 +312,56 @@ class DatasetSettings:
     ------
     SettingsError
         For a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> settings = sp.DatasetSettings(links_per_home=100, stages=(0, 0.25, 0.5), sensor="mixed")
+    >>> settings.trace.frequency_hz
+    28000000000.0
     """
 
-    links_per_home: int = 400
-    transmitters_per_home: int = 4
+    links_per_home: Count = 400
+    transmitters_per_home: Annotated[int, Within(1, 1000)] = 4
     stages: tuple[int, ...] | tuple[float, ...] = (0, 50, 100, 150, 200)
-    seed: int = 0
-    tx_height_m: float = DEFAULT_HEIGHT_M
-    rx_height_m: float = DEFAULT_HEIGHT_M
-    margin_m: float = 3.0
+    seed: Seed = 0
+    tx_height_m: Height = DEFAULT_HEIGHT_M
+    rx_height_m: Height = DEFAULT_HEIGHT_M
+    margin_m: Annotated[float, Within(0.0, 1000.0)] = 3.0
     sensor: SensorSettings | Literal["mixed"] = field(default_factory=SensorSettings)
-    short_link_fraction: float = 0.0
+    short_link_fraction: Fraction = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("transmitters_per_home", 1, 1000),
-            ("links_per_home", 1, 1_000_000),
-            ("seed", 0, 2**31 - 1),
-        ):
-            require_whole(name, getattr(self, name), low, high)
+        super().__post_init__()
         enough = self.links_per_home >= self.transmitters_per_home
         remedy = f"give at least {self.transmitters_per_home}, one for each of the transmitters_per_home."
         require(enough, "links_per_home", self.links_per_home, remedy)
         remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
         require(isinstance(self.stages, tuple) and are_stages(self.stages), "stages", self.stages, remedy)
-        for name in ("tx_height_m", "rx_height_m"):
-            require_number(name, getattr(self, name), 0.0, 1000.0, open_low=True)
-        require_number("margin_m", self.margin_m, 0.0, 1000.0)
         mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
         remedy = "give SensorSettings(...), or 'mixed'."
         require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
-        require_number("short_link_fraction", self.short_link_fraction, 0.0, 1.0)
-        require(isinstance(self.scene, SceneSettings), "scene", self.scene, "give SceneSettings(...).")
-        require(isinstance(self.trace, TraceSettings), "trace", self.trace, "give TraceSettings(...).")
         self.scene.material.require_frequency(self.trace.frequency_hz)
 
 
 @dataclass(frozen=True)
-class PredictorSettings:
+class PredictorSettings(Checked):
     """How a predictor is trained.
 
     Parameters
     ----------
     networks : {"paper", "paths", "map"}
-        "paper" has the networks of the paper alone. "paths" has one beside them that sees what each path crosses, "map"
-        two, of which one sees the map around the transmitter; both need features with a context, as `link_features`
-        gives them.
+        "paper" has the networks of the paper alone. "paths" adds one that sees what each path crosses, "map" adds two,
+        of which one sees the map around the transmitter; both need features with a context, as `link_features`
+        returns them.
     frequency_hz : float
         Carrier frequency of the links [Hz]; it sets the gain of free space.
     diffraction : bool
         Whether the links were traced with diffraction.
     passes : int
-        How many times the networks beside those of the paper see each transmitter on each map.
+        Number of passes of the added networks over the training links.
     steps : int
         Gradient steps of each of the paper's networks.
     batch_size : int
@@ -419,8 +369,8 @@ class PredictorSettings:
     learning_rate : float
         Of Adam at the first such step; it falls to 0 along a cosine.
     minimum_links : int
-        A network of the paper with fewer links is not trained: it says mean and spread of those it has and of prior
-        knowledge.
+        A network of the paper with fewer links is not trained: it returns mean and standard deviation of those it has
+        and of prior knowledge.
     seed : int
         Of first weights and batches.
 
@@ -431,21 +381,11 @@ class PredictorSettings:
     """
 
     networks: NetworkKind = "paper"
-    frequency_hz: float = CARRIER_FREQUENCY_HZ
+    frequency_hz: Frequency = CARRIER_FREQUENCY_HZ
     diffraction: bool = True
-    passes: int = 10
-    steps: int = 4000
-    batch_size: int = 1024
-    learning_rate: float = 0.01
-    minimum_links: int = 100
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        kinds = get_args(NetworkKind)
-        require(self.networks in kinds, "networks", self.networks, f"choose one of {kinds}.")
-        require_number("frequency_hz", self.frequency_hz, *FREQUENCIES_HZ)
-        require(isinstance(self.diffraction, bool), "diffraction", self.diffraction, "give True or False.")
-        require_number("learning_rate", self.learning_rate, 0.0, 1.0, open_low=True)
-        for name in ("passes", "steps", "batch_size", "minimum_links"):
-            require_whole(name, getattr(self, name), 1, 1_000_000)
-        require_whole("seed", self.seed, 0, 1_000_000_000)
+    passes: Count = 10
+    steps: Count = 4000
+    batch_size: Count = 1024
+    learning_rate: Annotated[float, Within(0.0, 1.0, open_low=True)] = 0.01
+    minimum_links: Count = 100
+    seed: Annotated[int, Within(0, 1_000_000_000)] = 0

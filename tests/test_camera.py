@@ -129,7 +129,7 @@ def test_many_noisy_looks_find_the_wall():
 
 def test_a_noticed_and_a_missed_wall():
     truth = corridor()
-    eye = camera(truth, SensorSettings(missed_wall_share=1.0))
+    eye = camera(truth, SensorSettings(missed_wall_fraction=1.0))
     eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
     assert (eye.seen != CellState.WALL).all()
     assert (eye.seen[3, 4:21] == CellState.FREE).all()
@@ -139,7 +139,7 @@ def test_a_noticed_and_a_missed_wall():
 def test_walls_are_missed_in_squares_and_in_the_share_asked_for():
     size = 200
     truth = np.zeros((size, size), dtype=np.uint8)
-    missed = camera(truth, SensorSettings(missed_wall_share=0.3))._missed
+    missed = camera(truth, SensorSettings(missed_wall_fraction=0.3))._missed
     assert missed.mean() == pytest.approx(0.3, abs=0.06)
     edge = round(MISSED_PATCH_M / 0.1)
     squares = missed.reshape(size // edge, edge, size // edge, edge)

@@ -308,7 +308,7 @@ class TestExplore:
     @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--missed-walls", "2"], "missed_wall_share = 2.0 is not allowed: give a number in [0, 1]."),
+            (["--missed-walls", "2"], "missed_wall_fraction = 2.0 is not allowed: give a number in [0, 1]."),
             (["--steps", "-4"], "steps = [-4] is not allowed: give increasing whole numbers of 0 to 100,000"),
         ],
     )

@@ -331,7 +331,7 @@ class TestSensor:
 
     def test_missed_walls_stay_unknown_and_hide_what_is_behind(self, home):
         for share in (0.3, 1.0):
-            (partial,) = explore(home, (60,), 3, sensor=SensorSettings(missed_wall_share=share))
+            (partial,) = explore(home, (60,), 3, sensor=SensorSettings(missed_wall_fraction=share))
             known = partial.state != CellState.UNKNOWN
             assert (partial.state[known] == home.state[known]).all()
             assert ((partial.state == CellState.WALL).sum() == 0) == (share == 1.0)

@@ -333,28 +333,13 @@ class TestLockedFolder:
         assert list(tree(tmp_path)) == [".lock"]
         with locked_folder(tmp_path):
             assert tree(tmp_path) == {".lock": f"process {os.getpid()} on {socket.gethostname()}".encode()}
-        assert tree(tmp_path) == {}
+        assert tree(tmp_path) == {".lock": b""}
 
     def test_folder_is_made_and_unlocked_after_an_error(self, tmp_path: Path) -> None:
         for _ in range(2):
             with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "new" / "deep"):
                 raise ZeroDivisionError
-        assert tree(tmp_path) == {"new": None, "new/deep": None}
-
-    def test_lock_that_its_holder_removes_in_between_is_taken_anew(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        lock, removed = fcntl.flock, list[Path]()
-
-        def remove_once(descriptor: int, operation: int) -> None:
-            if not removed:
-                removed.append(tmp_path / ".lock")
-                removed[0].unlink()
-            lock(descriptor, operation)
-
-        monkeypatch.setattr(fcntl, "flock", remove_once)
-        with locked_folder(tmp_path):
-            assert (tmp_path / ".lock").is_file()
+        assert tree(tmp_path) == {"new": None, "new/deep": None, "new/deep/.lock": b""}
 
     def test_file_system_without_locks(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def refuse(number: int) -> None:

@@ -75,7 +75,7 @@ RANGES = {
     (SceneSettings, "bridge_gap_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "drift_m_per_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
-    (SensorSettings, "missed_wall_share"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "missed_wall_fraction"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "field_of_view_deg"): ("(0, 360]", (1e-9, 90, 360.0), (0, -0.1, 360.1)),
     (SensorSettings, "range_m"): ("(0, 100]", (1e-9, 3.2, 100), (0, -0.1, 100.1)),
     (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28, 1e12), (0, -28e9, 28, 1.1e12)),
@@ -136,7 +136,7 @@ def test_switches(kind: type, name: str) -> None:
 
 
 def test_scene_choices() -> None:
-    with pytest.raises(SettingsError, match="material = 'drywall' is not allowed: give a Material"):
+    with pytest.raises(SettingsError, match="material = 'drywall' is not allowed: give Material(...)"):
         SceneSettings(material="drywall")  # type: ignore[arg-type]
     for extent in ("observed", "map", "none"):
         assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]

@@ -81,7 +81,7 @@ def dataset(
     range_m: RangeOption = SensorSettings.range_m,
     range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
     drift: DriftOption = SensorSettings.drift_m_per_m,
-    missed_walls: MissedWallsOption = SensorSettings.missed_wall_share,
+    missed_walls: MissedWallsOption = SensorSettings.missed_wall_fraction,
     mixed_sensors: Annotated[
         bool, typer.Option("--mixed-sensors", help="Draw a sensor for each home, in place of the five options above.")
     ] = False,

@@ -125,7 +125,7 @@ def explore(
     range_m: RangeOption = SensorSettings.range_m,
     range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
     drift: DriftOption = SensorSettings.drift_m_per_m,
-    missed_walls: MissedWallsOption = SensorSettings.missed_wall_share,
+    missed_walls: MissedWallsOption = SensorSettings.missed_wall_fraction,
     height_band: HeightBandOption = None,
     up: UpOption = None,
 ) -> None:

@@ -50,7 +50,7 @@ class Camera:
         self, truth: NDArray[np.uint8], resolution_m: float, sensor: SensorSettings, rng: np.random.Generator
     ) -> None:
         self._truth = np.ascontiguousarray(truth)
-        self._missed = _missed_walls(truth, resolution_m, sensor.missed_wall_share, rng)
+        self._missed = _missed_walls(truth, resolution_m, sensor.missed_wall_fraction, rng)
         self._reach = sensor.range_m / resolution_m
         self._view_deg = sensor.field_of_view_deg
         self._noise = sensor.range_noise_m / resolution_m
