@@ -55,6 +55,8 @@ def make_home(seed: int, kind: str | None = None) -> SimpleNamespace:
     """Do what the seed stands for; the process number goes into a file beside `sitecustomize`."""
     notes = Path(sys.modules["sitecustomize"].__file__ or "").parent
     (notes / f"process-{os.getpid()}").touch()
+    if (notes / "harmless").exists():
+        return SimpleNamespace()
     if seed == KILLS or (seed == KILLS_ONCE and not (notes / "killed").exists()):
         (notes / "killed").touch()
         print("last words", file=sys.stderr, flush=True)

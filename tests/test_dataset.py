@@ -107,7 +107,7 @@ class TestBuild:
         assert [home["name"] for home in index["homes"]] == [*NAMES]
         assert index["settings"]["stages"] == [0, 50]
         assert index["versions"].keys() == set(home_process.PACKAGES)
-        assert sorted(path.name for path in unbroken.iterdir()) == ["dataset.json", "shards"]
+        assert sorted(path.name for path in unbroken.iterdir()) == [".lock", "dataset.json", "shards"]
 
     def test_real_homes(self, tmp_path: Path) -> None:
         told: list[tuple[int, int, str]] = []
@@ -124,11 +124,10 @@ class TestBuild:
         assert told == [(0, 1, "starting the workers"), (1, 1, "make_home(2) built")]
         assert len(read_dataset(tmp_path / "set")) == 2 * 5 * 2
 
-    def test_second_run_makes_nothing(self, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(dataset, "_connected", None)
+    def test_second_run_makes_nothing(self, unbroken: Path) -> None:
         before = files(unbroken)
         report = build_dataset(unbroken, SEEDS, SETTINGS)
-        assert report.skipped == NAMES
+        assert (report.skipped, report.built) == (NAMES, ())
         assert files(unbroken) == before
 
     def test_what_is_missing_or_damaged_or_new_is_built(self, unbroken: Path, tmp_path: Path, notes: Path) -> None:
@@ -215,16 +214,13 @@ class TestPoisonedHomes:
         for word in words:
             assert word in noted["error"]
 
-    def test_they_are_tried_again_by_the_next_run(
-        self, poisoned: DatasetReport, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_they_are_tried_again_by_the_next_run(self, poisoned: DatasetReport, notes: Path) -> None:
         name = f"make_home({RAISES})"
         write_shard(fake_links(None, name, SETTINGS), shard_path(poisoned.folder, name), task(name, RAISES).metadata)
-        tried: list[HomeTask] = []
-        monkeypatch.setattr(dataset._Run, "make", lambda self, client, tasks: tried.extend(tasks))
-        build_dataset(poisoned.folder, POISONED, SETTINGS, workers=1)
-        assert [each.source.origin for each in tried] == [KILLS, HANGS]
-        assert not (poisoned.folder / "failed" / f"{name}.json").exists()
+        (notes / "harmless").touch()
+        report = build_dataset(poisoned.folder, POISONED, SETTINGS, workers=2)
+        assert set(report.built) == {f"make_home({seed})" for seed in (KILLS, HANGS)}
+        assert not list((poisoned.folder / "failed").iterdir())
 
     def test_full_disk_ends_the_run(self, tmp_path: Path, notes: Path) -> None:
         with pytest.raises(OutputError, match=r"the disk is full.* The homes that are built stay: run it again\."):
@@ -263,12 +259,11 @@ class TestRefused:
         with pytest.raises(SettingsError, match=r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'):
             build_dataset(unbroken, SEEDS, SETTINGS)
 
-    def test_home_from_another_file(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(dataset._Run, "make", lambda self, client, tasks: None)
-        for place in ("a", "b"):
-            (tmp_path / place / "villa").mkdir(parents=True)
-            (tmp_path / place / "villa" / "map.yaml").touch()
-        build_dataset(tmp_path / "set", [tmp_path / "a"], SETTINGS, workers=1)
+    def test_home_from_another_file(self, tmp_path: Path) -> None:
+        for folder in ("a", "b"):
+            (tmp_path / folder / "villa").mkdir(parents=True)
+            (tmp_path / folder / "villa" / "map.yaml").touch()
+        assert build_dataset(tmp_path / "set", [tmp_path / "a"], SETTINGS, workers=1).failed.keys() == {"villa"}
         with pytest.raises(SettingsError, match=r"home 'villa' was \".*a/villa/map\.yaml\" when .* is \".*b/villa/map"):
             build_dataset(tmp_path / "set", [tmp_path / "b"], SETTINGS, workers=1)
 

@@ -8,11 +8,13 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 
+from sionna_partial.checks import require_number, require_whole, settings_or_default
 from sionna_partial.datasets.home_process import (
     HomeResult,
     HomeTask,
@@ -25,16 +27,16 @@ from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
-from sionna_partial.settings import DatasetSettings, require_number, require_whole, settings_or_default
+from sionna_partial.settings import DatasetSettings
 
 HomeProgress = Callable[[int, int, str], None]
-"""Called with the number of homes that are done, their number in all, and what has just happened."""
+"""Called with the number of homes that are done, their number in all, and a message."""
 
-LOOK_S = 1.0
-"""Time between two looks at the workers [s]: more may have come."""
+POLL_S = 1.0
+"""Time between two checks of the workers [s]: more may have come."""
 
 ANY_PORT = "127.0.0.1:0"
-"""Where dask's own pages are: its usual port may be taken."""
+"""Address of dask's own pages: its usual port may be taken."""
 
 CONNECT_S = 30.0
 """Time to wait for a scheduler [s]."""
@@ -42,20 +44,7 @@ CONNECT_S = 30.0
 
 @dataclass(frozen=True)
 class DatasetReport:
-    """What a run has done.
-
-    Parameters
-    ----------
-    folder : Path
-    built : tuple of str
-        Names of the homes that this run has built.
-    skipped : tuple of str
-        Names of the homes that were there.
-    failed : dict of str to str
-        Why homes are missing, by their names. The next run tries them again.
-    elapsed_s : float
-        Time that the run took [s].
-    """
+    """What a run has done: names of the homes that it built and that were there, and why others failed."""
 
     folder: Path
     built: tuple[str, ...]
@@ -104,6 +93,7 @@ def build_dataset(
     Returns
     -------
     DatasetReport
+        `folder`, the names of `built` and `skipped` homes, `failed` (name to reason), and `elapsed_s`.
 
     Raises
     ------
@@ -116,6 +106,14 @@ def build_dataset(
         it, or a worker cannot make homes.
     BackendError
         If the scheduler cannot be reached.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> settings = sp.DatasetSettings(links_per_home=4, stages=(0, 5))
+    >>> report = sp.build_dataset("links", [7], settings, workers=1)
+    >>> report.built
+    ('make_home(7)',)
     """
     start = time.monotonic()
     settings = settings_or_default("settings", settings, DatasetSettings)
@@ -125,68 +123,58 @@ def build_dataset(
         if scheduler is not None:
             raise SettingsError(f"workers = {workers!r} is for this machine, and scheduler is given: leave one out.")
     target, sources = Path(os.path.abspath(output_path(folder))), home_sources(homes)
+    built: list[str] = []
+    failed: dict[str, str] = {}
     with locked_folder(target):
         tasks = _prepare(target, sources, settings, home_time_limit_s)
-        run = _Run(target, progress or (lambda done, total, message: None), len(tasks))
-        missing = [task for task in tasks if not run.skips(task)]
+        skipped = tuple(task.source.name for task in tasks if task.is_done)
+        missing = [task for task in tasks if task.source.name not in skipped]
+        for name in skipped:
+            _failure_path(target, name).unlink(missing_ok=True)
+
+        def report(message: str) -> None:
+            if progress:
+                progress(len(skipped) + len(built) + len(failed), len(tasks), message)
+
         if missing:
+            report("starting the workers")
             at_once = min(workers or len(os.sched_getaffinity(0)), len(missing))
             with _connected(scheduler, at_once) as client, client.as_current():
-                run.make(client, missing)
-    return DatasetReport(target, tuple(run.built), tuple(run.skipped), run.failed, time.monotonic() - start)
+                for task, result in _results(client, missing, report):
+                    name, note = task.source.name, _failure_path(target, task.source.name)
+                    if result.outcome == "unusable":
+                        raise OutputError(f"{result.error} The homes that are built stay: run it again.")
+                    if result.outcome == "done":
+                        built.append(name)
+                        note.unlink(missing_ok=True)
+                    else:
+                        failed[name] = result.error
+                        with atomic_write(note, "w") as stream:
+                            json.dump({"home": task.source.record, "error": result.error}, stream, indent=2)
+                    report(f"{name} {'built' if result.outcome == 'done' else 'failed'}")
+    return DatasetReport(target, tuple(built), skipped, failed, time.monotonic() - start)
 
 
-class _Run:
-    """What has become of the homes so far."""
-
-    def __init__(self, folder: Path, progress: HomeProgress, homes: int) -> None:
-        self._folder, self._progress, self._homes = folder, progress, homes
-        self.built: list[str] = []
-        self.skipped: list[str] = []
-        self.failed: dict[str, str] = {}
-
-    def skips(self, task: HomeTask) -> bool:
-        """Whether a home is there."""
-        if task.is_done:
-            self.skipped.append(task.source.name)
-            self._forget_failure(task.source.name)
-        return task.is_done
-
-    def make(self, client: Client, tasks: list[HomeTask]) -> None:
-        """Make homes, as many at a time as there are workers: no home waits on a worker that another one may kill."""
-        self._report("starting the workers")
-        waiting, running = tasks[::-1], dict[Future, HomeTask]()
-        while waiting or running:
-            room = sum(_threads(client).values()) - len(running)
-            for _ in range(min(room, len(waiting))):
-                task = waiting.pop()
-                running[client.submit(run_home, task, pure=False)] = task
-            if not running:
-                self._report("waiting for a worker")
-                time.sleep(LOOK_S)
-                continue
-            for future in _finished(list(running)):
-                self._note(running.pop(future), _result(future))
-
-    def _note(self, task: HomeTask, result: HomeResult) -> None:
-        name = task.source.name
-        if result.outcome == "unusable":
-            raise OutputError(f"{result.error} The homes that are built stay: run it again.")
-        if result.outcome == "done":
-            self.built.append(name)
-            self._forget_failure(name)
-        else:
-            self.failed[name] = result.error
-            with atomic_write(_failure_path(self._folder, name), "w") as stream:
-                json.dump({"home": task.source.record, "error": result.error}, stream, indent=2)
-        self._report(f"{name} {'built' if result.outcome == 'done' else 'failed'}")
-
-    def _forget_failure(self, name: str) -> None:
-        _failure_path(self._folder, name).unlink(missing_ok=True)
-
-    def _report(self, message: str) -> None:
-        done = len(self.built) + len(self.skipped) + len(self.failed)
-        self._progress(done, self._homes, message)
+def _results(
+    client: Client, tasks: list[HomeTask], report: Callable[[str], None]
+) -> Iterator[tuple[HomeTask, HomeResult]]:
+    """Make homes, as many at a time as there are workers: no home waits on a worker that another one may kill."""
+    waiting, running = tasks[::-1], dict[Future, HomeTask]()
+    while waiting or running:
+        try:
+            room = sum(client.nthreads().values()) - len(running)
+        except (OSError, RuntimeError) as error:
+            raise _lost(error) from error
+        for _ in range(min(room, len(waiting))):
+            task = waiting.pop()
+            running[client.submit(run_home, task, pure=False)] = task
+        if not running:
+            report("waiting for a worker")
+            time.sleep(POLL_S)
+            continue
+        with suppress(TimeoutError):
+            for future in wait(list(running), timeout=POLL_S, return_when="FIRST_COMPLETED").done:
+                yield running.pop(future), _result(future)
 
 
 def _prepare(
@@ -200,31 +188,31 @@ def _prepare(
         "settings": tasks[0].metadata["settings"],
         "homes": [source.record for source in sources],
     }
-    text = json.dumps(index, indent=2, sort_keys=True) + "\n"
+    path, text = folder / INDEX_FILE, json.dumps(index, indent=2, sort_keys=True) + "\n"
     _require_same(folder, json.loads(text))
-    for place in (folder, folder / SHARDS_FOLDER, folder / FAILED_FOLDER):
-        for left in place.glob(".tmp-*"):
+    for parent in (folder, folder / SHARDS_FOLDER, folder / FAILED_FOLDER):
+        for left in parent.glob(".tmp-*"):
             shutil.rmtree(left, ignore_errors=True)
-    if not _has_text(folder / INDEX_FILE, text):
-        with atomic_write(folder / INDEX_FILE, "w") as stream:
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        with atomic_write(path, "w") as stream:
             stream.write(text)
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return [HomeTask(str(folder), digest, source, settings, versions, home_time_limit_s) for source in sources]
+    return [replace(task, index_sha256=digest) for task in tasks]
 
 
-def _require_same(folder: Path, index: dict[str, object]) -> None:
+def _require_same(folder: Path, index: dict[str, Any]) -> None:
     """Refuse a folder with something else than an earlier run of the same settings, versions and homes."""
     path = folder / INDEX_FILE
     if not path.exists():
-        others = [entry.name for entry in folder.iterdir() if not _is_ours(entry)] if folder.is_dir() else []
+        names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
+        others = [name for name in names if name != LOCK_FILE and not name.startswith(".tmp-")]
         if others:
             raise OutputError(
                 f"folder = '{folder}' has other content than a data set ({others[0]}): choose a new or an empty folder."
             )
         return
     try:
-        earlier = json.loads(path.read_text(encoding="utf-8"))
-        differences = list(_differences(earlier, index))
+        differences = list(_differences(json.loads(path.read_text(encoding="utf-8")), index))
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise OutputError(f"'{path}' is damaged ({error}): choose a new folder.") from error
     if differences:
@@ -235,21 +223,16 @@ def _require_same(folder: Path, index: dict[str, object]) -> None:
         )
 
 
-def _is_ours(entry: Path) -> bool:
-    """Whether an entry of a folder without `dataset.json` is what a killed run may have left."""
-    return entry.name == LOCK_FILE or entry.name.startswith(".tmp-")
-
-
-def _differences(earlier: dict[str, object], now: dict[str, object]) -> Iterator[tuple[str, str, str]]:
+def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
     """Yield what differs, what it was, and what it is. Homes may have been added."""
     for part in ("settings", "versions"):
-        before, after = dict(_leaves(earlier[part])), dict(_leaves(now[part]))
+        before, after = (dict(_leaves(index[part], part)) for index in (earlier, now))
         for name in sorted(before.keys() | after.keys()):
             was, is_now = (json.dumps(values[name]) if name in values else "not there" for values in (before, after))
             if was != is_now:
-                yield f"{part}.{name}", was, is_now
-    homes = {home["name"]: home for home in now["homes"]}  # type: ignore[attr-defined]
-    for home in earlier["homes"]:  # type: ignore[attr-defined]
+                yield name, was, is_now
+    homes = {home["name"]: home for home in now["homes"]}
+    for home in earlier["homes"]:
         other = homes.get(home["name"])
         if other is None:
             yield f"home {home['name']!r}", "in the list of homes", "not in it"
@@ -258,17 +241,13 @@ def _differences(earlier: dict[str, object], now: dict[str, object]) -> Iterator
             yield f"home {home['name']!r}", was, is_now
 
 
-def _leaves(tree: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Names, such as trace.max_depth, and values of nested settings."""
+def _leaves(tree: object, name: str) -> Iterator[tuple[str, object]]:
+    """Names, such as settings.trace.max_depth, and values of nested settings."""
     if not isinstance(tree, dict):
         yield name, tree
         return
     for key, value in tree.items():
-        yield from _leaves(value, f"{name}.{key}" if name else key)
-
-
-def _has_text(path: Path, text: str) -> bool:
-    return path.is_file() and path.read_text(encoding="utf-8") == text
+        yield from _leaves(value, f"{name}.{key}")
 
 
 def _failure_path(folder: Path, name: str) -> Path:
@@ -313,22 +292,6 @@ def _remote_client(scheduler: str) -> Client:
             f"scheduler = {scheduler!r} does not answer ({error}): give the address that dask scheduler prints, such "
             "as tcp://host:8786, or its scheduler file."
         ) from error
-
-
-def _threads(client: Client) -> dict[str, int]:
-    """Return the number of homes that each worker makes at a time."""
-    try:
-        threads: dict[str, int] = client.nthreads()
-    except (OSError, RuntimeError) as error:
-        raise _lost(error) from error
-    return threads
-
-
-def _finished(running: list[Future]) -> list[Future]:
-    """Wait a while for homes that are done."""
-    with suppress(TimeoutError):
-        return list(wait(running, timeout=LOOK_S, return_when="FIRST_COMPLETED").done)
-    return []
 
 
 def _result(future: Future) -> HomeResult:

@@ -40,7 +40,7 @@ GRACE_S = 60.0
 """Time that a process has beyond a home's limit to end by itself, and to start [s]."""
 
 TIMEOUT_LINE = "Timeout ("
-"""How the line begins that faulthandler writes before it ends a process that takes too long."""
+"""Start of the line that faulthandler writes before it ends a process that takes too long."""
 
 LAST_LINES = 20
 """Number of lines of what a dead process wrote that are reported."""
@@ -50,28 +50,14 @@ PACKAGES = ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "numpy", "numba",
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
-_idle = threading.local()
+_idle: list["_HomeProcess"] = []
 _alive: set["_HomeProcess"] = set()
 _stopped = threading.Event()
 
 
 @dataclass(frozen=True)
 class HomeTask:
-    """A home to be made, and where its shard goes.
-
-    Parameters
-    ----------
-    folder : str
-        Absolute path of the data set's folder.
-    index_sha256 : str
-        SHA-256 of the folder's `dataset.json`.
-    source : HomeSource
-    settings : DatasetSettings
-    versions : dict of str to str
-        Versions of `PACKAGES` that the data set is made with.
-    time_limit_s : float
-        Time that the home may take [s].
-    """
+    """A home to be made, and the folder of its data set, whose `dataset.json` has the SHA-256 `index_sha256`."""
 
     folder: str
     index_sha256: str
@@ -84,9 +70,8 @@ class HomeTask:
     def metadata(self) -> dict[str, object]:
         """What the shard notes beside its links."""
         plain = json.dumps(asdict(self.settings), default=lambda number: number.item())  # a number of NumPy's
-        settings = json.loads(plain)
         sensor = asdict(home_sensor(self.source.name, self.settings))
-        return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
+        return {"home": self.source.record, "sensor": sensor, "settings": json.loads(plain), "versions": self.versions}
 
     @property
     def is_done(self) -> bool:
@@ -105,15 +90,7 @@ class HomeTask:
 
 @dataclass(frozen=True)
 class HomeResult:
-    """What became of a home.
-
-    Parameters
-    ----------
-    outcome : {"done", "failed", "unusable"}
-        Unusable is a worker on which no home can be made.
-    error : str
-        What went wrong: in one line, and more below it.
-    """
+    """Result of a home: "unusable" is a worker on which no home can be made; the error's first line is its summary."""
 
     outcome: Literal["done", "failed", "unusable"]
     error: str = ""
@@ -125,25 +102,28 @@ def installed_versions() -> dict[str, str]:
 
 
 def run_home(task: HomeTask) -> HomeResult:
-    """Make a home in the process of this thread; the home's errors are returned, not raised."""
+    """Make a home in a process of its own; the home's errors are returned, not raised."""
     fault = _fault_of_worker(task)
     if fault:
         return HomeResult("unusable", fault)
     if task.is_done:
         return HomeResult("done")
-    words: list[str] = []
+    lines: list[str] = []
     for _ in range(ATTEMPTS):
+        process = next((idle for idle in iter(_take_idle, None) if idle.is_alive), None) or _HomeProcess()
         if _stopped.is_set():
+            process.close()
             return HomeResult("failed", "stopped")
-        result = _process_of_thread().make(task)
+        result = process.make(task)
         if isinstance(result, HomeResult):
+            _idle.append(process)
             return result
-        words = result
-        if any(line.startswith(TIMEOUT_LINE) for line in words):
+        lines = result
+        if any(line.startswith(TIMEOUT_LINE) for line in lines):
             limit = f"took longer than {task.time_limit_s:g} s, the time limit of a home"
-            return HomeResult("failed", "\n".join([limit, "It was at", *words]))
-    died = f"its process died {ATTEMPTS} times {words[-1]}"
-    return HomeResult("failed", "\n".join([died, "The last one wrote", *words]))
+            return HomeResult("failed", "\n".join([limit, "It was at", *lines]))
+    died = f"its process died {ATTEMPTS} times {lines[-1]}"
+    return HomeResult("failed", "\n".join([died, "The last one wrote", *lines]))
 
 
 def allow_homes() -> None:
@@ -156,6 +136,7 @@ def stop_homes() -> None:
     _stopped.set()
     for process in list(_alive):
         process.kill()
+    while (process := _take_idle()) is not None:
         process.close()
 
 
@@ -179,9 +160,8 @@ class _HomeProcess:
     """A process that makes homes, seen from the worker."""
 
     def __init__(self) -> None:
-        self._busy = threading.Lock()
         self._link, far_end = Pipe()
-        self._notes = tempfile.TemporaryFile()  # noqa: SIM115
+        self._log = tempfile.TemporaryFile()  # noqa: SIM115
         self._scratch = tempfile.TemporaryDirectory(prefix="sionna_partial_", ignore_cleanup_errors=True)
         own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": self._scratch.name}
         with far_end:
@@ -190,8 +170,8 @@ class _HomeProcess:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", code],
                 stdin=subprocess.PIPE,
-                stdout=self._notes,
-                stderr=self._notes,
+                stdout=self._log,
+                stderr=self._log,
                 pass_fds=[descriptor],
                 env=os.environ | ONE_THREAD | own,
             )
@@ -199,81 +179,71 @@ class _HomeProcess:
 
     @property
     def is_alive(self) -> bool:
-        return self._process.poll() is None
+        """Whether it runs; what a dead one has left is released."""
+        if self._process.poll() is None:
+            return True
+        self.close()
+        return False
 
     def make(self, task: HomeTask) -> HomeResult | list[str]:
         """Make a home; return the lines that the process wrote last if it died or took too long."""
-        with self._busy:
-            if self._link.closed:
-                return ["(stopped)"]
-            self._notes.seek(0)
-            self._notes.truncate()
-            in_time = True
-            with contextlib.suppress(EOFError, OSError):
-                self._link.send(task)
-                in_time = self._link.poll(task.time_limit_s + GRACE_S)
-                if in_time:
-                    result: HomeResult = self._link.recv()
-                    return result
-            self.kill()
-            words = self._last_words() if in_time else [f"{TIMEOUT_LINE}killed)"]
-            self._release()
-            return words
+        self._log.seek(0)
+        self._log.truncate()
+        in_time = True
+        with contextlib.suppress(EOFError, OSError):
+            self._link.send(task)
+            in_time = self._link.poll(task.time_limit_s + GRACE_S)
+            if in_time:
+                result: HomeResult = self._link.recv()
+                return result
+        self.kill()
+        lines = self._last_lines() if in_time else [f"{TIMEOUT_LINE}killed)"]
+        self.close()
+        return lines
 
     def kill(self) -> None:
-        """End the process, whatever it does."""
         self._process.kill()
         self._process.wait()
         _alive.discard(self)
 
     def close(self) -> None:
-        """Release what the dead process has left."""
-        with self._busy:
-            self._release()
-
-    def _release(self) -> None:
+        """End the process and release what it leaves, its temporary files too."""
+        self.kill()
         self._link.close()
-        self._notes.close()
-        self._scratch.cleanup()  # a killed process leaves its temporary files
+        self._log.close()
+        self._scratch.cleanup()
         if self._process.stdin:
             self._process.stdin.close()
 
-    def _last_words(self) -> list[str]:
+    def _last_lines(self) -> list[str]:
         code = self._process.returncode
         how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        self._notes.seek(0)
-        lines = self._notes.read().decode(errors="replace").strip().splitlines()
+        self._log.seek(0)
+        lines = self._log.read().decode(errors="replace").strip().splitlines()
         late = [number for number, line in enumerate(lines) if line.startswith(TIMEOUT_LINE)]
-        told = lines[late[0] :][:LAST_LINES] if late else lines[-LAST_LINES:]
-        return [*told, f"({how})"]
+        return [*(lines[late[0] :][:LAST_LINES] if late else lines[-LAST_LINES:]), f"({how})"]
 
 
-def _process_of_thread() -> _HomeProcess:
-    process: _HomeProcess | None = getattr(_idle, "process", None)
-    if process is None or not process.is_alive:
-        if process is not None:
-            process.kill()
-            process.close()
-        _idle.process = process = _HomeProcess()
-        if _stopped.is_set():  # while it started
-            process.kill()
-    return process
+def _take_idle() -> _HomeProcess | None:
+    with contextlib.suppress(IndexError):
+        return _idle.pop()
+    return None
 
 
 def _fault_of_worker(task: HomeTask) -> str:
-    """Say why no home can be made here; nothing if it can."""
+    """Return why no home can be made here; nothing if it can."""
     where = f"the worker on {socket.gethostname()}"
     index = Path(task.folder) / INDEX_FILE
+    remedy = "give a folder on a file system that all workers share."
     try:
-        digest = hashlib.sha256(index.read_bytes()).hexdigest()
+        if hashlib.sha256(index.read_bytes()).hexdigest() != task.index_sha256:
+            return f"{where} sees another '{index}': {remedy}"
     except OSError as error:
-        reason = error.strerror
-        return f"{where} cannot read '{index}' ({reason}): give a folder on a file system that all workers share."
-    if digest != task.index_sha256:
-        return f"{where} sees another '{index}': give a folder on a file system that all workers share."
-    differing = {name: found for name, found in installed_versions().items() if task.versions[name] != found}
-    for name, found in differing.items():
-        return f"{where} has {name} {found}, the data set is made with {task.versions[name]}: install that version."
+        return f"{where} cannot read '{index}' ({error.strerror}): {remedy}"
+    for name, found in installed_versions().items():
+        if task.versions[name] != found:
+            wanted = task.versions[name]
+            return f"{where} has {name} {found}, the data set is made with {wanted}: install that version."
     return ""
 
 
@@ -290,7 +260,7 @@ def _made(task: HomeTask) -> HomeResult:
 
 
 def _fault_of_libraries() -> str:
-    """Let Dr.Jit start, with one thread; say why it cannot."""
+    """Let Dr.Jit start, with one thread; return why it cannot."""
     try:
         load_llvm()
     except BackendError as error:
