@@ -45,7 +45,7 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 		--kind floor --kind floor --kind hall --kind warehouse --short-links 0.5
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
-			--networks $$networks --passes 8 --test-share 0.1 --out build/predictor/$$networks; \
+			--networks $$networks --passes 8 --test-fraction 0.1 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/

@@ -7,64 +7,38 @@ from typing import Any
 
 import numpy as np
 
+from sionna_partial.checks import Progress, no_progress, require_number, settings_or_default
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like, settings_for
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import Baselines
-from sionna_partial.evaluation.evaluate import Evaluation, Progress, evaluate
+from sionna_partial.evaluation.evaluate import Evaluation, evaluate
 from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.settings import PredictorSettings, require_number, settings_or_default
+from sionna_partial.settings import PredictorSettings
 
 PREDICTOR_FILE, SPLIT_FILE = "predictor.keras", "split.json"
 
-TEST_SHARE = 0.3
+TEST_FRACTION = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingRun:
-    """What `train` made.
+    """Result of `train`: a predictor, baselines fitted to the same links, and the evaluation on test homes, if any.
 
-    Parameters
-    ----------
-    predictor : Predictor
-        Its card has what was measured on the test homes.
-    baselines : Baselines
-        Fitted to the same links.
-    train_homes, test_homes : tuple of str
-        Names of the homes, without any in common.
-    test_share : float
-        Share of the homes that was kept for testing.
-    evaluation : Evaluation or None
-        None if no homes were kept for testing.
+    The predictor's card has what was measured on the test homes.
     """
 
     predictor: Predictor
     baselines: Baselines
     train_homes: tuple[str, ...]
     test_homes: tuple[str, ...]
-    test_share: float
+    test_fraction: float
     evaluation: Evaluation | None
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write predictor, baselines, their cards and `split.json` into a folder, all or none.
-
-        Parameters
-        ----------
-        folder : path-like
-            Files of the same names are replaced.
-
-        Returns
-        -------
-        list of pathlib.Path
-            The files.
-
-        Raises
-        ------
-        OutputError
-            If writing fails; the folder is then as it was before.
-        """
+        """Write predictor, baselines, their cards and `split.json` into a folder, all or none; return the files."""
         split = {
-            "test_share": self.test_share,
+            "test_fraction": self.test_fraction,
             "seed": self.predictor.settings.seed,
             "train": list(self.train_homes),
             "test": list(self.test_homes),
@@ -78,47 +52,28 @@ class TrainingRun:
         return [Path(folder) / name for name in names]
 
 
-def split_homes(homes: list[str], test_share: float, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Split homes at random, so that no home has links on both sides.
+def split_homes(homes: list[str], test_fraction: float, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Split homes at random into sorted names of training and test homes, so that no home has links on both sides.
 
-    The names are sorted, then shuffled with the seed; the first of them, `test_share` of all but at least one and not
-    all, are test homes. The same names give the same split, in whatever order they come. A share of 0 keeps none.
-
-    Parameters
-    ----------
-    homes : list of str
-        Names, each once.
-    test_share : float
-        In [0, 1).
-    seed : int
-
-    Returns
-    -------
-    train, test : tuples of str
-        Sorted names.
-
-    Raises
-    ------
-    SettingsError
-        If `test_share` is out of range.
-    PredictorError
-        If there are too few homes to split.
+    The names are sorted, then shuffled with the seed; the first of them, `test_fraction` of all but at least one and
+    not all, are test homes. The same names give the same split, in whatever order they come. A fraction of 0 keeps
+    none.
     """
-    require_number("test_share", test_share, 0.0, 0.99)
-    if len(homes) < (2 if test_share else 1):
+    require_number("test_fraction", test_fraction, 0.0, 0.99)
+    if len(homes) < (2 if test_fraction else 1):
         number = "1 home" if len(homes) == 1 else f"{len(homes)} homes"
         raise PredictorError(
-            f"dataset has {number}: give at least 2 to train on some and test on others, or test_share = 0."
+            f"dataset has {number}: give at least 2 to train on some and test on others, or test_fraction = 0."
         )
     shuffled = np.random.default_rng(seed).permutation(sorted(homes))
-    count = min(max(round(test_share * len(homes)), 1), len(homes) - 1) if test_share else 0
+    count = min(max(round(test_fraction * len(homes)), 1), len(homes) - 1) if test_fraction else 0
     return tuple(sorted(map(str, shuffled[count:]))), tuple(sorted(map(str, shuffled[:count])))
 
 
 def train(
     dataset: Dataset,
     *,
-    test_share: float = TEST_SHARE,
+    test_fraction: float = TEST_FRACTION,
     settings: PredictorSettings | None = None,
     progress: Progress | None = None,
 ) -> TrainingRun:
@@ -132,32 +87,43 @@ def train(
     ----------
     dataset : LinkTable, path, or sequence of paths
         Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
-    test_share : float
-        Share of the homes that is kept for testing, in [0, 1).
+    test_fraction : float
+        Fraction of the homes that is kept for testing, in [0, 1).
     settings : PredictorSettings, optional
         Networks "map" by default. Frequency and diffraction must be those of the data set, and are by default; the seed
         splits the homes, too.
     progress : callable, optional
-        Called as ``progress(share_done, message)``.
+        Called as ``progress(fraction_done, message)``.
 
     Returns
     -------
     TrainingRun
+        With `predictor`, `baselines`, `train_homes`, `test_homes` and `evaluation`; `save(folder)` writes them.
 
     Raises
     ------
     SettingsError
-        For a share out of range.
+        For a fraction out of range.
     PredictorError
-        If the data set cannot be read, was traced otherwise than the settings say, or has too few homes or links; or if
+        If the data set cannot be read, was traced otherwise than in the settings, or has too few homes or links; or if
         the training diverges.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> settings = sp.DatasetSettings(links_per_home=4, stages=(0, 5))
+    >>> report = sp.build_dataset("links", [7], settings, workers=1)
+    >>> from sionna_partial.settings import PredictorSettings
+    >>> run = sp.train("links", test_fraction=0.0, settings=PredictorSettings("paper"))
+    >>> run.train_homes
+    ('make_home(7)',)
     """
     table, traces = open_links(dataset)
     settings = settings_or_default("settings", settings or settings_for(traces), PredictorSettings)
     remedy = "give PredictorSettings with the frequency and diffraction of the data set."
     require_like(traces, LinkTraces.of_settings(settings), "settings are for links", remedy)
-    report = progress or (lambda share, message: None)
-    train_homes, test_homes = split_homes(list(dict.fromkeys(map(str, table.home))), test_share, settings.seed)
+    report = progress or no_progress
+    train_homes, test_homes = split_homes(list(dict.fromkeys(map(str, table.home))), test_fraction, settings.seed)
     links = table.take(np.isin(table.home, train_homes))
     indoors, unsure = links.take(~links.anywhere), links.take(links.anywhere & ~links.context.rx_seen)
     report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
@@ -167,23 +133,23 @@ def train(
         indoors.gain_db,
         homes=train_homes,
         settings=settings,
-        progress=lambda share, message: report(0.6 * share, message),
+        progress=lambda done, message: report(0.6 * done, message),
     )
     predictor = predictor.fit_indoor(unsure.phi, unsure.inside)
     report(0.6, "training the baselines")
     baselines = Baselines.fit(indoors, settings)
-    run = TrainingRun(predictor, baselines, train_homes, test_homes, test_share, None)
+    run = TrainingRun(predictor, baselines, train_homes, test_homes, test_fraction, None)
     if not test_homes:
         return run
     tests = table.take(np.isin(table.home, test_homes))
     result = evaluate(
-        predictor, tests, baselines=baselines, progress=lambda share, message: report(0.7 + 0.3 * share, message)
+        predictor, tests, baselines=baselines, progress=lambda done, message: report(0.7 + 0.3 * done, message)
     )
     return replace(run, predictor=replace(predictor, metrics=_card_metrics(result)), evaluation=result)
 
 
 def _card_metrics(evaluation: Evaluation) -> dict[str, Any]:
-    """Return what the card says of test homes: figures by stage and answer, receivers indoors and anywhere.
+    """Return what the card has of test homes: figures by stage and predictor, receivers indoors and anywhere.
 
     The shipped paper's predictor is left out, lest a card depend on what was shipped when it was written.
     """

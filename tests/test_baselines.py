@@ -12,7 +12,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import (
     Baselines,
     Majority,
-    answers,
+    baseline_predictions,
     indoor_gain_db,
     indoor_los_probability,
     nothing_seen,
@@ -93,7 +93,7 @@ class TestBaselines:
     def test_shipped(self):
         shipped = Baselines.load(PREDICTORS_FOLDER)
         assert shipped.distance.homes == Predictor.load().homes
-        assert sum(shipped.majority.shares) == pytest.approx(1.0)
+        assert sum(shipped.majority.fractions) == pytest.approx(1.0)
 
 
 class TestNothingSeen:
@@ -168,7 +168,7 @@ class TestTr38901Indoor:
 class TestAnswers:
     def test_all_answer_for_all_links(self, fitted):
         phi = make_links(30)[0]
-        found = answers(fitted, fitted.distance, phi, 28e9)
+        found = baseline_predictions(fitted, fitted.distance, phi, 28e9)
         assert list(found) == [
             *("paper", "distance only", "majority", "partial trace"),
             *("TR 38.901 mixed office", "TR 38.901 open office"),
@@ -178,4 +178,4 @@ class TestAnswers:
             assert len(answer.p_los) == 30
 
     def test_without_the_papers(self, fitted):
-        assert "paper" not in answers(fitted, None, make_links(3)[0], 28e9)
+        assert "paper" not in baseline_predictions(fitted, None, make_links(3)[0], 28e9)

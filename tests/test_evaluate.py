@@ -234,7 +234,7 @@ class TestErrors:
         names = [f"home {index}" for index in range(4)]
         message = (
             "predictor 'fitted' was trained on all 4 homes of the data set: give a data set of other homes, such "
-            "as other seeds, or train with test_share above 0."
+            "as other seeds, or train with test_fraction above 0."
         )
         with pytest.raises(PredictorError, match=re.escape(message)):
             evaluate(trained_on(*names), table, baselines=fitted_baselines())

@@ -39,7 +39,7 @@ class TestTrain:
     @pytest.mark.parametrize("networks", ["paper", "map"])
     def test_what_it_writes_and_says(self, networks: str, dataset: Path, tmp_path: Path) -> None:
         out = tmp_path / "run"
-        options = ["--test-share", 0.5, "--networks", networks, "--passes", 2, "--seed", 3]
+        options = ["--test-fraction", 0.5, "--networks", networks, "--passes", 2, "--seed", 3]
         result = run("train", dataset, "--out", out, *options)
         assert result.exit_code == 0, result.output
         names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
@@ -51,7 +51,7 @@ class TestTrain:
         found = Predictor.load(out / "predictor.keras").settings
         assert (found.networks, found.passes, found.seed, found.frequency_hz) == (networks, 2, 3, 28e9)
         split = json.loads((out / "split.json").read_text())
-        assert (split["test_share"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
+        assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
 
     def test_defaults_and_the_frequency_of_the_data_set(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         folder = make_dataset(tmp_path, make_table(homes=1, links=5), frequency_hz=60e9, diffraction=False)
@@ -64,12 +64,12 @@ class TestTrain:
         monkeypatch.setattr("sionna_partial.training.train", train)
         run("train", folder, "--out", tmp_path / "run")
         assert seen["settings"] == PredictorSettings("map", frequency_hz=60e9, diffraction=False)
-        assert seen["test_share"] == 0.3
+        assert seen["test_fraction"] == 0.3
 
     @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--test-share", 1], "error: test_share = 1.0 is not allowed: give a number in [0, 0.99]."),
+            (["--test-fraction", 1], "error: test_fraction = 1.0 is not allowed: give a number in [0, 0.99]."),
             (["--passes", 0], "error: passes = 0 is not allowed: give a whole number in [1, 1000000]."),
             (["--seed", -1], "error: seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
         ],
@@ -120,7 +120,7 @@ class TestEvaluate:
         assert result.stderr.strip().endswith("error: path = 'nobody' is no predictor: give the path of a .keras file.")
 
     def test_trained_on_all_homes(self, dataset: Path, tmp_path: Path) -> None:
-        trained = run("train", dataset, "--out", tmp_path / "run", "--test-share", 0, "--networks", "paper")
+        trained = run("train", dataset, "--out", tmp_path / "run", "--test-fraction", 0, "--networks", "paper")
         assert "all homes were trained on: nothing was measured" in trained.stdout
         result = run("evaluate", dataset, "--predictor", tmp_path / "run/predictor.keras", "--out", tmp_path / "report")
         assert result.exit_code == 2

@@ -13,7 +13,7 @@ from sionna_partial.evaluation.metrics import (
     Metrics,
     calibration,
     measure,
-    pit_shares,
+    pit_fractions,
     reliability,
 )
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -129,21 +129,21 @@ class TestPitShares:
     LEVELS = np.linspace(0.0, 1.0, 11)
 
     def test_calibrated_answers_return_the_levels(self):
-        np.testing.assert_allclose(pit_shares(*drawn(100_000), self.LEVELS), self.LEVELS, atol=0.005)
+        np.testing.assert_allclose(pit_fractions(*drawn(100_000), self.LEVELS), self.LEVELS, atol=0.005)
 
     def test_an_outage_is_spread_over_its_probability(self):
         answer, state = prediction([0.4], [0.6], [0.0]), np.array([OUTAGE], dtype=np.uint8)
-        found = pit_shares(answer, state, np.array([-150.0]), np.array([0.1, 0.2, 0.4, 0.9]))
+        found = pit_fractions(answer, state, np.array([-150.0]), np.array([0.1, 0.2, 0.4, 0.9]))
         np.testing.assert_allclose(found, [0.25, 0.5, 1.0, 1.0], atol=1e-9)
 
     def test_a_gain_lies_where_its_quantile_is(self):
         answer, state = prediction([0.4], [0.6], [0.0]), np.array([LOS], dtype=np.uint8)
-        assert pit_shares(answer, state, np.array([-60.0]), np.array([0.699, 0.701])).tolist() == [0.0, 1.0]
+        assert pit_fractions(answer, state, np.array([-60.0]), np.array([0.699, 0.701])).tolist() == [0.0, 1.0]
 
     def test_a_gain_without_spread_is_an_atom(self):
         answer, state = prediction([0.0], [1.0], [0.0], los_db=(-60.0, 0.0)), np.array([LOS], dtype=np.uint8)
         for gain_db, share in ((-61.0, 1.0), (-60.0, 0.5), (-59.0, 0.0)):
-            assert pit_shares(answer, state, np.array([gain_db]), np.array([0.5])).tolist() == [share]
+            assert pit_fractions(answer, state, np.array([gain_db]), np.array([0.5])).tolist() == [share]
 
 
 class TestReliability:

@@ -136,7 +136,7 @@ def test_switches(kind: type, name: str) -> None:
 
 
 def test_scene_choices() -> None:
-    with pytest.raises(SettingsError, match="material = 'drywall' is not allowed: give Material(...)"):
+    with pytest.raises(SettingsError, match=r"material = 'drywall' is not allowed: give Material\(\.\.\.\)"):
         SceneSettings(material="drywall")  # type: ignore[arg-type]
     for extent in ("observed", "map", "none"):
         assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]

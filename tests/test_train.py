@@ -7,14 +7,13 @@ import pytest
 from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET
 
-from sionna_partial import training as train
 from sionna_partial.errors import OutputError, PredictorError, SettingsError
 from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.training import split_homes
+from sionna_partial.training import split_homes, train
 
 pytestmark = QUIET
 
@@ -31,7 +30,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def run(table):
-    return train(table, test_share=0.4, settings=QUICK)
+    return train(table, test_fraction=0.4, settings=QUICK)
 
 
 class TestSplitHomes:
@@ -56,13 +55,13 @@ class TestSplitHomes:
         ("homes", "share", "count"), [([], 0.3, "0 homes"), (["a"], 0.3, "1 home"), ([], 0.0, "0 homes")]
     )
     def test_too_few(self, homes, share, count):
-        message = f"dataset has {count}: give at least 2 to train on some and test on others, or test_share"
+        message = f"dataset has {count}: give at least 2 to train on some and test on others, or test_fraction"
         with pytest.raises(PredictorError, match=re.escape(message)):
             split_homes(homes, share, 0)
 
     @pytest.mark.parametrize("share", [-0.1, 1.0, np.nan, "a"])
     def test_bad_share(self, share):
-        with pytest.raises(SettingsError, match=r"test_share = .* is not allowed: give a number in \[0, 0.99\]"):
+        with pytest.raises(SettingsError, match=r"test_fraction = .* is not allowed: give a number in \[0, 0.99\]"):
             split_homes(HOMES, share, 0)
 
 
@@ -76,7 +75,7 @@ class TestTrain:
     def test_links_of_test_homes_are_not_learned(self, table):
         spoiled = np.isin(table.home, split_homes(sorted(set(table.home)), 0.4, 0)[1])
         other = dataclasses.replace(table, gain_db=np.where(spoiled, -77.0, table.gain_db))
-        one, again = (train(links, test_share=0.4, settings=UNTRAINED) for links in (table, other))
+        one, again = (train(links, test_fraction=0.4, settings=UNTRAINED) for links in (table, other))
         assert again.predictor.fingerprint == one.predictor.fingerprint
         assert again.baselines.distance.fingerprint == one.baselines.distance.fingerprint
         assert again.baselines.majority == one.baselines.majority
@@ -116,13 +115,13 @@ class TestTrain:
         assert any(message.startswith("step 0 of 1, loss ") for _, message in calls)
 
     def test_no_test_homes(self, table):
-        alone = train(table, test_share=0.0, settings=UNTRAINED)
+        alone = train(table, test_fraction=0.0, settings=UNTRAINED)
         assert alone.evaluation is None
         assert alone.test_homes == ()
         assert alone.predictor.metrics == {}
 
     def test_without_receivers_anywhere_all_are_indoors(self, table):
-        alone = train(table.take(~table.anywhere), test_share=0.0, settings=UNTRAINED)
+        alone = train(table.take(~table.anywhere), test_fraction=0.0, settings=UNTRAINED)
         assert alone.predictor.predict_indoor(table.phi).min() > 0.999
 
     def test_settings_of_a_data_set_are_its_own(self, table, tmp_path):
@@ -134,7 +133,7 @@ class TestTrain:
         with pytest.raises(PredictorError, match=re.escape(message)):
             train(folder, settings=UNTRAINED)
         settings = dataclasses.replace(UNTRAINED, frequency_hz=60e9, diffraction=False)
-        assert train(folder, test_share=0.0, settings=settings).predictor.settings == settings
+        assert train(folder, test_fraction=0.0, settings=settings).predictor.settings == settings
 
     def test_progress(self, table):
         calls = []
@@ -150,7 +149,7 @@ class TestTrain:
 class TestSave:
     def test_same_links_and_seed_give_the_same_bytes(self, table, tmp_path):
         files, again = (
-            train(table, test_share=0.4, settings=UNTRAINED).save(tmp_path / name) for name in ("one", "two")
+            train(table, test_fraction=0.4, settings=UNTRAINED).save(tmp_path / name) for name in ("one", "two")
         )
         assert [file.name for file in files] == [
             *("distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json")
@@ -170,7 +169,7 @@ class TestSave:
     def test_split_is_recorded(self, run, tmp_path):
         run.save(tmp_path)
         split = json.loads((tmp_path / "split.json").read_text())
-        assert split == {"test_share": 0.4, "seed": 0, "train": [*run.train_homes], "test": [*run.test_homes]}
+        assert split == {"test_fraction": 0.4, "seed": 0, "train": [*run.train_homes], "test": [*run.test_homes]}
 
     def test_nothing_half_written(self, run, tmp_path, monkeypatch):
         def fail(self, folder):

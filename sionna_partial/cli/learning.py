@@ -135,7 +135,7 @@ def dataset(
 def train(
     folders: DatasetsArgument,
     out: Annotated[Path, typer.Option(metavar="RUN", help="Folder for predictor and baselines.", show_default=False)],
-    test_share: Annotated[float, typer.Option(help="Share of the homes that is kept for testing.")] = 0.3,
+    test_fraction: Annotated[float, typer.Option(help="Fraction of the homes that is kept for testing.")] = 0.3,
     networks: Annotated[
         NetworkKind,
         typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around."),
@@ -160,7 +160,7 @@ def train(
 
         links, traces = open_links(folders)
         settings = settings_for(traces, networks=networks, passes=passes, seed=seed)
-        run = train_predictor(links, test_share=test_share, settings=settings, progress=report)
+        run = train_predictor(links, test_fraction=test_fraction, settings=settings, progress=report)
         files = run.save(out)
     typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")
     print_files(files)

@@ -1,4 +1,4 @@
-"""Links of a data set with what they were traced with, and the check that a predictor knows such links."""
+"""Links of data sets, how they were traced, and the check that a predictor was trained on such links."""
 
 import json
 import math
@@ -16,26 +16,18 @@ from sionna_partial.settings import NetworkKind, PredictorSettings
 
 @dataclass(frozen=True)
 class LinkTraces:
-    """How links were traced.
-
-    Parameters
-    ----------
-    frequency_hz : float
-        Carrier frequency [Hz].
-    diffraction : bool
-        Whether paths were diffracted, on plans, where that is the default.
-    """
+    """How links were traced: carrier frequency [Hz], and whether with diffraction on plans."""
 
     frequency_hz: float
     diffraction: bool
 
     @classmethod
     def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
-        """Return the traces that a predictor was, or shall be, trained on."""
+        """Return those of a predictor's settings."""
         return cls(settings.frequency_hz, settings.diffraction)
 
     def __str__(self) -> str:
-        """Say it in words."""
+        """Return them in words."""
         return f"at {self.frequency_hz / 1e9:g} GHz {'with' if self.diffraction else 'without'} diffraction"
 
     def is_like(self, other: "LinkTraces") -> bool:
@@ -49,30 +41,25 @@ Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
 
 
 def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
-    """Return the links of data sets, and how they were traced; None for a table, which does not say so.
+    """Return the links of data sets, and how they were traced: None for a table, which does not contain that.
 
-    Parameters
-    ----------
-    dataset : LinkTable, path-like, or sequence of path-like
-        Links, or folders that `sionna-partial dataset` wrote. A home may be in several of them, explored anew in each.
-
-    Returns
-    -------
-    LinkTable, LinkTraces or None
-
-    Raises
-    ------
-    PredictorError
-        If a folder holds no data set, or is damaged; if the links were traced differently, or homes of one name differ;
-        or if there is no link.
+    A home may be in several folders, explored anew in each.
     """
     if isinstance(dataset, LinkTable):
         links, traces = dataset, None
     else:
         folders = _folders(dataset)
         tables = [read_dataset(folder) for folder in folders]
-        traces = _one_kind(folders)
-        _require_same_homes(folders, tables)
+        traces = _read_traces(folders[0] / INDEX_FILE)
+        homes: dict[str, PartialMap] = {}
+        for folder, table in zip(folders, tables, strict=True):
+            remedy = "give data sets that were traced alike."
+            require_like(_read_traces(folder / INDEX_FILE), traces, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
+            for name, home in table.complete_maps.items():
+                if homes.setdefault(name, home) != home:
+                    raise PredictorError(
+                        f"'{folder}' has another home {name!r} than those before: give one of the two."
+                    )
         links = LinkTable.concatenate(tables)
     if links.anywhere.all():
         raise PredictorError("dataset has no links with receivers drawn indoors: build one that has homes and links.")
@@ -90,24 +77,6 @@ def _folders(dataset: str | PathLike[str] | Sequence[str | PathLike[str]]) -> li
     return [Path(each) for each in folders]
 
 
-def _one_kind(folders: Sequence[Path]) -> LinkTraces:
-    """Read how the links of data sets were traced."""
-    first, *others = (_read_traces(folder / INDEX_FILE) for folder in folders)
-    for folder, found in zip(folders[1:], others, strict=True):
-        remedy = "give data sets that were traced alike."
-        require_like(found, first, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
-    return first
-
-
-def _require_same_homes(folders: Sequence[Path], tables: Sequence[LinkTable]) -> None:
-    """Refuse two homes of one name."""
-    known: dict[str, PartialMap] = {}
-    for folder, table in zip(folders, tables, strict=True):
-        for name, home in table.complete_maps.items():
-            if known.setdefault(name, home) != home:
-                raise PredictorError(f"'{folder}' has another home {name!r} than those before: give one of the two.")
-
-
 def settings_for(
     traces: LinkTraces | None,
     *,
@@ -115,24 +84,7 @@ def settings_for(
     passes: int = PredictorSettings.passes,
     seed: int = PredictorSettings.seed,
 ) -> PredictorSettings:
-    """Return settings of a training on such links.
-
-    Parameters
-    ----------
-    traces : LinkTraces or None
-        None takes the defaults.
-    networks, passes, seed
-        As in PredictorSettings.
-
-    Returns
-    -------
-    PredictorSettings
-
-    Raises
-    ------
-    SettingsError
-        For a value out of range.
-    """
+    """Return settings of a training on such links; None takes the defaults."""
     known = traces or LinkTraces.of_settings(PredictorSettings())
     return PredictorSettings(networks, known.frequency_hz, known.diffraction, passes, seed=seed)
 
@@ -140,19 +92,7 @@ def settings_for(
 def require_like(
     found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
 ) -> None:
-    """Raise a PredictorError if the links of a data set were traced otherwise than `wanted`.
-
-    Parameters
-    ----------
-    found : LinkTraces or None
-        Of the data set; None is not known, and goes.
-    wanted : LinkTraces
-    whose : str
-        Who wants them, for the message.
-    remedy : str
-    dataset : str
-        What the message calls the data set.
-    """
+    """Raise a PredictorError if the links of a data set were traced otherwise than `whose` links; None passes."""
     if found is not None and not found.is_like(wanted):
         raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
 

@@ -26,21 +26,14 @@ FROM_BORDER_CELLS = 0.25
 _LIDAR_FRACTION = 2 / 3
 
 MAX_DRAWS = 1000
-"""Number of times that places which cannot be used are drawn again."""
+"""Number of times that positions which cannot be used are drawn again."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class _Places:
-    """Transmitters and receivers of a home.
-
-    Parameters
-    ----------
-    tx_m : list of T (3,) float64 arrays
-    rx_m : list of T (N, 3) float64 arrays
-    anywhere : list of T (N,) bool arrays
-    """
+class _Positions:
+    """T transmitters (3,) of a home, and for each its N receivers (N, 3), and whether they were drawn anywhere (N,)."""
 
     tx_m: list[NDArray[np.float64]]
     rx_m: list[NDArray[np.float64]]
@@ -48,50 +41,39 @@ class _Places:
 
 
 def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = None) -> LinkTable:
-    """Trace the links of a home on what a robot has seen of it at every stage, and on the whole of it.
+    """Trace the links of a complete home on what a robot has seen of it at every stage, and on the whole of it.
 
     Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
     cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,
-    `short_link_fraction` within `SHORT_LINK_M` of the transmitter. The map area is the bounding
-    box of the known cells and `margin_m` around it, whatever the size of the grid: a small home in a large empty grid
-    would have receivers outside and no others. None is where a robot with errors has mapped a wall, as no link can be
-    predicted there. No receiver is nearer than `NEAREST_M` to its transmitter.
+    `short_link_fraction` within `SHORT_LINK_M` of the transmitter. The map area is the bounding box of the known cells
+    and `margin_m` around it, whatever the size of the grid: a small home in a large empty grid would have receivers
+    outside and no others. None is where a robot with errors has mapped a wall, as no link can be predicted there. No
+    receiver is nearer than `NEAREST_M` to its transmitter.
 
     The truth of a receiver that is not in a free cell of the home is outage, by definition (paper, "Indoor-Outdoor
-    Estimation"); that of the others is their trace on the complete home. The places and the robot depend on `name` and
-    the settings, and not on other homes.
-
-    Parameters
-    ----------
-    home : PartialMap
-        A complete home. Where its free cells reach the border of the grid, walls are put around them.
-    name : str
-        Name of the home, from which its seed is made.
-    settings : DatasetSettings, optional
-
-    Returns
-    -------
-    LinkTable
-        Of 2 x `links_per_home` x number of stages links: stage by stage, in each transmitter by transmitter.
-
-    Raises
-    ------
-    MapError
-        If the home is not complete, or too small.
-    PositionError
-        If the heights are not between floor and ceiling.
+    Estimation"); that of the others is their trace on the complete home. Positions and robot depend on `name` and the
+    settings, and not on other homes. The table is ordered by stage, in each by transmitter.
     """
     require_map("home", home)
     settings = settings or DatasetSettings()
-    home = _closed(home, name)
-    area = map_area(home, settings.margin_m)
+    home = map_area(_closed(home, name), settings.margin_m)
     rng = np.random.default_rng(_home_seed(name, settings))
-    maps = explore(area, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=home_sensor(name, settings))
-    places = _draw_places(area, maps, name, settings, rng)
-    truth = _truth(area, places, settings)
-    seen = zip(settings.stages, maps, _features(maps, places, settings), strict=True)
+    maps = explore(home, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=home_sensor(name, settings))
+    positions = _draw_positions(home, maps, name, settings, rng)
+    inside, link_state, gain_db = _truth(home, positions, settings)
     return LinkTable.concatenate(
-        _stage_links(name, area, stage, partial, phi, places, truth) for stage, partial, phi in seen
+        LinkTable(
+            home=np.full(len(phi), name),
+            stage=np.full(len(phi), stage, dtype=np.float64),
+            phi=phi,
+            link_state=link_state,
+            gain_db=gain_db,
+            inside=inside,
+            anywhere=np.concatenate(positions.anywhere),
+            observed_fraction=np.full(len(phi), partial.observed_fraction),
+            complete_maps={name: home},
+        )
+        for stage, partial, phi in zip(settings.stages, maps, _features(maps, positions, settings), strict=True)
     )
 
 
@@ -112,18 +94,7 @@ def _closed(home: PartialMap, name: str) -> PartialMap:
 
 
 def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
-    """Return the sensor of the robot in a home: that of the settings, or one that is drawn for the home's name.
-
-    Parameters
-    ----------
-    name : str
-        Name of the home.
-    settings : DatasetSettings
-
-    Returns
-    -------
-    SensorSettings
-    """
+    """Return the sensor of the robot in a home: that of the settings, or one that is drawn for the home's name."""
     if isinstance(settings.sensor, SensorSettings):
         return settings.sensor
     rng = np.random.default_rng([1, *_home_seed(name, settings)])
@@ -140,20 +111,7 @@ def _home_seed(name: str, settings: DatasetSettings) -> list[int]:
 
 
 def map_area(home: PartialMap, margin_m: float) -> PartialMap:
-    """Cut a map, or extend it with unknown cells, to the bounding box of its known cells and a margin around it.
-
-    Parameters
-    ----------
-    home : PartialMap
-        With known cells.
-    margin_m : float
-        Width of the margin [m]; whole cells are taken, at least so many.
-
-    Returns
-    -------
-    PartialMap
-        With its cells where they were.
-    """
+    """Cut a map, or extend it with unknown cells, to the bounding box of its known cells and a margin around it."""
     known = np.argwhere(home.state != CellState.UNKNOWN)
     margin = math.ceil(margin_m / home.resolution_m - 1e-9)
     (row0, column0), (row1, column1) = known.min(axis=0), known.max(axis=0) + 1
@@ -163,21 +121,21 @@ def map_area(home: PartialMap, margin_m: float) -> PartialMap:
     return replace(home, state=state, origin_m=corner)
 
 
-def _draw_places(
+def _draw_positions(
     home: PartialMap, maps: list[PartialMap], name: str, settings: DatasetSettings, rng: np.random.Generator
-) -> _Places:
+) -> _Positions:
     """Draw the transmitters, and for each receivers in free cells, and in all cells that no map has as walls."""
     open_cells = np.logical_and.reduce([each.state != CellState.WALL for each in (home, *maps)])
     free = open_cells & (home.state == CellState.FREE)
-    count = settings.transmitters_per_home
+    links, count = settings.links_per_home, settings.transmitters_per_home
     tx_m = list(_points_in(free, count, home, settings.tx_height_m, rng))
-    receivers, drawn = [], []
+    receivers, anywhere = [], []
     for index, tx in enumerate(tx_m):
-        share = settings.links_per_home * (index + 1) // count - settings.links_per_home * index // count
-        parts = [_receivers(cells, share, home, name, tx, settings, rng) for cells in (free, open_cells)]
+        number = links * (index + 1) // count - links * index // count
+        parts = [_receivers(cells, number, home, name, tx, settings, rng) for cells in (free, open_cells)]
         receivers.append(np.concatenate(parts))
-        drawn.append(np.arange(2 * share) >= share)
-    return _Places(tx_m, receivers, drawn)
+        anywhere.append(np.arange(2 * number) >= number)
+    return _Positions(tx_m, receivers, anywhere)
 
 
 def _receivers(
@@ -190,25 +148,17 @@ def _receivers(
     rng: np.random.Generator,
 ) -> NDArray[np.float64]:
     """Draw receivers (count, 3) that are not at the transmitter [m]."""
-    short = round(settings.short_link_fraction * count)
-    rx_m = np.concatenate(
-        [
-            _points_in(cells, count - short, home, settings.rx_height_m, rng),
-            _points_in(cells & _within(home, tx_m, SHORT_LINK_M), short, home, settings.rx_height_m, rng),
-        ]
-    )
+    short, height_m = round(settings.short_link_fraction * count), settings.rx_height_m
+    x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
+    near_cells = np.hypot(x[None] - tx_m[0], y[:, None] - tx_m[1]) <= SHORT_LINK_M
+    drawn = [(cells, count - short), (cells & near_cells, short)]
+    rx_m = np.concatenate([_points_in(where, number, home, height_m, rng) for where, number in drawn])
     for _ in range(MAX_DRAWS):
         near = np.linalg.norm(rx_m - tx_m, axis=1) < NEAREST_M
         if not near.any():
             return rx_m
-        rx_m[near] = _points_in(cells, int(near.sum()), home, settings.rx_height_m, rng)
+        rx_m[near] = _points_in(cells, int(near.sum()), home, height_m, rng)
     raise MapError(f"home {name!r} is too small, all of it is within {NEAREST_M:g} m of a transmitter: leave it out.")
-
-
-def _within(home: PartialMap, place_m: NDArray[np.float64], distance_m: float) -> NDArray[np.bool_]:
-    """Cells (ny, nx) whose centres are so near to a place."""
-    x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
-    return np.hypot(x[None] - place_m[0], y[:, None] - place_m[1]) <= distance_m
 
 
 def _points_in(
@@ -218,17 +168,17 @@ def _points_in(
     rows, columns = np.nonzero(cells)
     index = rng.integers(len(rows), size=count)
     inner = rng.uniform(FROM_BORDER_CELLS, 1.0 - FROM_BORDER_CELLS, (count, 2))
-    places = np.stack([columns[index], rows[index]], axis=1) + inner
-    return np.column_stack([home.origin_m + places * home.resolution_m, np.full(count, height_m)])
+    points = np.stack([columns[index], rows[index]], axis=1) + inner
+    return np.column_stack([home.origin_m + points * home.resolution_m, np.full(count, height_m)])
 
 
 def _truth(
-    home: PartialMap, places: _Places, settings: DatasetSettings
+    home: PartialMap, positions: _Positions, settings: DatasetSettings
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.float64]]:
     """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
-    inside = [home.state_at(rx) == CellState.FREE for rx in places.rx_m]
-    indoors = [rx[where] for rx, where in zip(places.rx_m, inside, strict=True)]
-    links = trace_each(home, places.tx_m, indoors, settings=settings.trace, scene_settings=settings.scene)
+    inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
+    indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
+    links = trace_each(home, positions.tx_m, indoors, settings=settings.trace, scene_settings=settings.scene)
     where = np.concatenate(inside)
     link_state = np.full(len(where), LinkState.OUTAGE, dtype=np.uint8)
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
@@ -237,36 +187,14 @@ def _truth(
     return where, link_state, gain_db
 
 
-def _features(maps: list[PartialMap], places: _Places, settings: DatasetSettings) -> list[LinkFeatures]:
+def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSettings) -> list[LinkFeatures]:
     """Features on each map, of all transmitters. A robot that has seen all stays: its maps are traced once."""
     features: list[LinkFeatures] = []
     for index, partial in enumerate(maps):
         if index and partial == maps[index - 1]:
             features.append(features[-1])
             continue
-        links = trace_each(partial, places.tx_m, places.rx_m, settings=settings.trace, scene_settings=settings.scene)
+        tx_m, rx_m = positions.tx_m, positions.rx_m
+        links = trace_each(partial, tx_m, rx_m, settings=settings.trace, scene_settings=settings.scene)
         features.append(LinkFeatures.concatenate([link_features(partial, each) for each in links]))
     return features
-
-
-def _stage_links(
-    name: str,
-    home: PartialMap,
-    stage: float,
-    partial: PartialMap,
-    phi: LinkFeatures,
-    places: _Places,
-    truth: tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.float64]],
-) -> LinkTable:
-    inside, link_state, gain_db = truth
-    return LinkTable(
-        home=np.full(len(phi), name),
-        stage=np.full(len(phi), stage, dtype=np.float64),
-        phi=phi,
-        link_state=link_state,
-        gain_db=gain_db,
-        inside=inside,
-        anywhere=np.concatenate(places.anywhere),
-        observed_fraction=np.full(len(phi), partial.observed_fraction),
-        complete_maps={name: home},
-    )

@@ -19,22 +19,12 @@ MAP_SUFFIXES = (".yaml", ".yml", ".npz")
 """Files in a folder that are taken for maps."""
 
 COMMON_STEMS = ("map", "scene")
-"""Names of map files that say nothing of the home: it has the name of the folder."""
+"""Names of map files that do not name the home: it has the name of the folder."""
 
 
 @dataclass(frozen=True)
 class HomeSource:
-    """A home to build from.
-
-    Parameters
-    ----------
-    name : str
-        Name of the home; its shard has it too.
-    origin : int or str
-        Seed of `make_home`, or absolute path of a complete map.
-    kind : HomeKind or None
-        Kind that `make_home` makes.
-    """
+    """A home to build from: its name, seed of `make_home` or absolute path of a complete map, and kind."""
 
     name: str
     origin: int | str
@@ -42,7 +32,7 @@ class HomeSource:
 
     @property
     def record(self) -> dict[str, object]:
-        """What a data set notes about the home."""
+        """Entry of the home in a data set."""
         kind = {"kind": self.kind} if self.kind else {}
         return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin, **kind}
 
@@ -52,24 +42,9 @@ class HomeSource:
 
 
 def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
-    """Name the homes to build from.
+    """Name the homes to build from, in their order; those of a folder in the order of their names.
 
-    Parameters
-    ----------
-    homes : iterable of int or path-like
-        Seeds of `make_home`, or pairs of a seed and a kind (None: drawn); complete maps that `load_map` reads; folders
-        of such maps, directly or each in a folder with a `map.yaml` or `scene.xml`. A map has the name of its file, or
-        of its folder if the file is called map or scene.
-
-    Returns
-    -------
-    list of HomeSource
-        In the order of `homes`; those of a folder in the order of their names.
-
-    Raises
-    ------
-    MapError
-        If there is no home, or a path is not there or holds no map, or two homes have one name.
+    A map has the name of its file, or of its folder if the file is called map or scene.
     """
     sources: dict[str, HomeSource] = {}
     for home in homes:
@@ -103,34 +78,20 @@ def _sources(home: Home) -> Iterator[HomeSource]:
 
 
 def _maps_at(path: Path) -> Iterator[HomeSource]:
-    if path.is_file():
-        yield _of_file(path)
-        return
-    inner = [_of_folder(path)] if _is_home(path) else [_of_entry(entry) for entry in sorted(path.iterdir())]
-    found = [source for source in inner if source is not None]
-    if not found:
+    files = [path]
+    if path.is_dir():
+        entries = [path] if _scene_file(path) else sorted(path.iterdir())
+        maps = (_scene_file(each) if each.is_dir() else each for each in entries)
+        files = [each for each in maps if each and (each.name in SCENE_FILES or each.suffix.lower() in MAP_SUFFIXES)]
+    if not files:
         raise MapError(
             f"path = '{path}' holds no map: give a folder with maps ({', '.join(MAP_SUFFIXES)}), or with folders that "
             f"have a {' or '.join(SCENE_FILES)}."
         )
-    yield from found
+    for file in files:
+        yield HomeSource(file.parent.name if file.stem in COMMON_STEMS else file.stem, str(file))
 
 
-def _of_entry(entry: Path) -> HomeSource | None:
-    """Return the map that an entry of a folder of maps is; None for other files and folders."""
-    if entry.is_dir():
-        return _of_folder(entry) if _is_home(entry) else None
-    return _of_file(entry) if entry.suffix.lower() in MAP_SUFFIXES else None
-
-
-def _is_home(folder: Path) -> bool:
-    return any((folder / name).is_file() for name in SCENE_FILES)
-
-
-def _of_folder(folder: Path) -> HomeSource:
-    file = next(folder / name for name in SCENE_FILES if (folder / name).is_file())
-    return HomeSource(folder.name, str(file))
-
-
-def _of_file(file: Path) -> HomeSource:
-    return HomeSource(file.parent.name if file.stem in COMMON_STEMS else file.stem, str(file))
+def _scene_file(folder: Path) -> Path | None:
+    """Return the map in a folder of one home."""
+    return next((folder / name for name in SCENE_FILES if (folder / name).is_file()), None)

@@ -1,4 +1,4 @@
-"""Links of many homes at several stages of exploration, with what is true of them: what a predictor learns from."""
+"""Links of many homes at several stages of exploration, with their true state and gain."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -21,27 +21,19 @@ class LinkTable:
     home : (N,) str array
         Name of the home, such as "make_home(10003)".
     stage : (N,) float64 array
-        Steps that the robot has explored; a number below 1 is the fraction of the home's free area that it was to
-        observe.
+        Steps that the robot has explored; below 1, the fraction of the home's free area that it was to observe.
     phi : LinkFeatures
         Features of the trace on the partial map, with their context.
-    link_state : (N,) uint8 array of LinkState
-        Link state on the complete map; a receiver that is not inside is in outage (paper, "Indoor-Outdoor Estimation").
-    gain_db : (N,) float64 array
-        Omnidirectional path gain on the complete map [dB].
-    inside : (N,) bool array
-        Whether the receiver is in a free cell of the complete map.
-    anywhere : (N,) bool array
-        Whether the receiver was drawn from the whole map area rather than from the free cells of the complete map.
+    link_state, gain_db : (N,) arrays
+        LinkState and omnidirectional path gain [dB] on the complete map; a receiver that is not inside is in outage
+        (paper, "Indoor-Outdoor Estimation").
+    inside, anywhere : (N,) bool arrays
+        Whether the receiver is in a free cell of the complete map, and whether it was drawn from the whole map area
+        rather than from those.
     observed_fraction : (N,) float64 array
-        Share of the home's free area that the robot has seen.
+        Fraction of the home's free area that the robot has seen.
     complete_maps : mapping of str to PartialMap
         The complete homes by name.
-
-    Raises
-    ------
-    PredictorError
-        If the features have no context, or link states or gains are of another shape or no such numbers.
     """
 
     home: NDArray[np.str_]
@@ -66,7 +58,7 @@ class LinkTable:
 
     @property
     def context(self) -> LinkContext:
-        """Where the links run, and on which maps."""
+        """Positions of the links, and their maps."""
         assert self.phi.context is not None
         return self.phi.context
 
@@ -78,13 +70,7 @@ class LinkTable:
 
     @classmethod
     def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
-        """Return the links of all `parts`, one part after the other.
-
-        Raises
-        ------
-        PredictorError
-            If there is no part.
-        """
+        """Return the links of all `parts`, one part after the other."""
         tables = list(parts)
         if not tables:
             raise PredictorError("parts is empty: give at least one LinkTable.")
@@ -95,7 +81,7 @@ class LinkTable:
 
 
 def stage_name(stage: float) -> str:
-    """Return what tables and messages call a stage: "50 steps", or "25 % observed"."""
+    """Return the name of a stage: "50 steps", or "25 % observed"."""
     return f"{stage:g} steps" if stage >= 1 or stage == 0 else f"{100 * stage:g} % observed"
 
 

@@ -5,17 +5,16 @@ import io
 import json
 import os
 import zlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
-from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
@@ -24,45 +23,12 @@ from sionna_partial.prediction.link_context import REACHES_M, LinkContext
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
-"""What a data set's folder holds: its settings and homes, a shard for each home, a note for each home that failed."""
+"""Files and folders of a data set: settings and homes, a shard for each home, a note for each home that failed."""
 
 FORMAT = "sionna-partial links 2"
 """Name and version of the shards' format, in their metadata."""
 
 _PREFIX = "sionna_partial."
-
-
-@dataclass(frozen=True)
-class _Column:
-    """A column of a shard: its name and type in the file, and where it comes from."""
-
-    name: str
-    kind: pa.DataType
-    values: Callable[[LinkTable], NDArray[np.generic]]
-
-
-def _position(field: str, axis: int) -> _Column:
-    name = f"{field.removesuffix('_m')}_{'xyz'[axis]}_m"
-    return _Column(name, pa.float64(), lambda table: getattr(table.context, field)[:, axis])
-
-
-def _indirect_gain(index: int) -> _Column:
-    return _Column(_INDIRECT[index], pa.float64(), lambda table: table.context.indirect_gain_db[:, index])
-
-
-def _of_context(name: str, kind: pa.DataType) -> _Column:
-    return _Column(name, kind, lambda table: getattr(table.context, name))
-
-
-def _of_table(name: str, kind: pa.DataType) -> _Column:
-    return _Column(name, kind, lambda table: getattr(table, name))
-
-
-def _of_features(name: str, field: str, kind: pa.DataType) -> _Column:
-    return _Column(name, kind, lambda table: getattr(table.phi, field))
-
-
-_INDIRECT = [f"indirect_gain_reach_{reach:g}_m_db" for reach in REACHES_M]
 
 _FEATURES = {
     "partial_link_state": "link_state",
@@ -70,23 +36,35 @@ _FEATURES = {
     "unobserved_distance_m": "unobserved_distance_m",
     "distance_m": "distance_m",
 }
+_REACHES = [f"indirect_gain_reach_{reach:g}_m_db" for reach in REACHES_M]
 
-_COLUMNS = (
-    _of_table("home", pa.string()),
-    _of_table("stage", pa.float64()),
-    *(_position(field, axis) for field in ("tx_m", "rx_m") for axis in range(3)),
-    *(
-        _of_features(name, field, pa.uint8() if field == "link_state" else pa.float64())
-        for name, field in _FEATURES.items()
-    ),
-    *(_indirect_gain(index) for index in range(len(REACHES_M))),
-    _of_context("strongest_unobserved_m", pa.float64()),
-    _of_context("map_index", pa.int64()),
-    _of_table("link_state", pa.uint8()),
-    _of_table("gain_db", pa.float64()),
-    *(_of_table(name, pa.bool_()) for name in ("inside", "anywhere")),
-    _of_table("observed_fraction", pa.float64()),
+_TYPES = {
+    "home": pa.string(),
+    "map_index": pa.int64(),
+    **dict.fromkeys(("link_state", "partial_link_state"), pa.uint8()),
+    **dict.fromkeys(("inside", "anywhere"), pa.bool_()),
+}
+"""Types of the columns that do not hold real numbers."""
+
+_NAMES = (
+    *("home", "stage"),
+    *(f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"),
+    *(*_FEATURES, *_REACHES, "strongest_unobserved_m", "map_index"),
+    *("link_state", "gain_db", "inside", "anywhere", "observed_fraction"),
 )
+_FIELDS = [pa.field(name, _TYPES.get(name, pa.float64()), nullable=False) for name in _NAMES]
+
+
+def _columns(table: LinkTable) -> dict[str, Any]:
+    context = table.context
+    return {
+        **{name: getattr(table, name) for name in COLUMNS},
+        **{f"tx_{axis}_m": context.tx_m[:, index] for index, axis in enumerate("xyz")},
+        **{f"rx_{axis}_m": context.rx_m[:, index] for index, axis in enumerate("xyz")},
+        **{name: getattr(table.phi, field) for name, field in _FEATURES.items()},
+        **{name: context.indirect_gain_db[:, index] for index, name in enumerate(_REACHES)},
+        **{name: getattr(context, name) for name in ("strongest_unobserved_m", "map_index")},
+    }
 
 
 def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mapping[str, object]) -> None:
@@ -94,19 +72,8 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
 
     Columns are named as in `LinkTable`, with the unit behind the name; positions have a column for each axis
     (`tx_x_m`), and the link state and the gain of the partial trace are `partial_link_state` and `partial_gain_db`. The
-    maps are in the file's metadata; `map_index` says on which of them a link was traced.
-
-    Parameters
-    ----------
-    table : LinkTable
-    path : path-like
-    metadata : mapping of str to what JSON can hold
-        Kept in the file's metadata, each value as JSON under `sionna_partial.` and its name.
-
-    Raises
-    ------
-    OutputError
-        If writing fails; no half a file is left.
+    maps are in the file's metadata, as is `metadata`, as JSON under `sionna_partial.` and its name; `map_index` is the
+    index of the map on which a link was traced.
     """
     maps = {
         "partial": [_packed(each) for each in table.context.maps],
@@ -114,8 +81,8 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
     }
     notes = {"format": FORMAT, "maps": maps, **metadata}
     texts = {_PREFIX + name: json.dumps(notes[name], sort_keys=True) for name in sorted(notes)}
-    schema = pa.schema([pa.field(column.name, column.kind, nullable=False) for column in _COLUMNS], metadata=texts)
-    values = [pa.array(column.values(table), type=column.kind) for column in _COLUMNS]
+    schema, columns = pa.schema(_FIELDS, metadata=texts), _columns(table)
+    values = [pa.array(columns[field.name], type=field.type) for field in _FIELDS]
     memory = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(values, schema=schema), memory, compression="zstd", write_page_checksum=True)
     with atomic_write(path) as stream:
@@ -123,21 +90,7 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
 
 
 def read_shard(path: str | os.PathLike[str]) -> LinkTable:
-    """Read the links of a shard.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    LinkTable
-
-    Raises
-    ------
-    PredictorError
-        If there is no such file, or it is damaged, or no shard.
-    """
+    """Read the links of a shard."""
     notes = shard_metadata(path)
     try:
         table = pq.ParquetFile(path, page_checksum_verification=True).read()
@@ -151,33 +104,18 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
 
 
 def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
-    """Read what `write_shard` noted beside the links, without the links.
-
-    Parameters
-    ----------
-    path : path-like
-
-    Returns
-    -------
-    dict
-
-    Raises
-    ------
-    PredictorError
-        If there is no such file, or its end is damaged, or it is no shard.
-    """
+    """Read what `write_shard` noted beside the links, without the links."""
     if not Path(path).is_file():
         raise PredictorError(f"path = '{path}' is not there: give a shard of a data set.")
     try:
         schema = pq.read_schema(path)
         texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
         notes = {key.removeprefix(_PREFIX): json.loads(text) for key, text in texts.items() if key.startswith(_PREFIX)}
-        names = schema.names
     except (OSError, ValueError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
-    expected = pa.schema([(column.name, column.kind) for column in _COLUMNS])
-    alike = names == expected.names and schema.types == expected.types
-    if notes.get("format") != FORMAT or not alike:
+    if notes.get("format") != FORMAT or [(each.name, each.type) for each in schema] != [
+        (each.name, each.type) for each in _FIELDS
+    ]:
         raise PredictorError(
             f"path = '{path}' is no shard of this version ({FORMAT}): give a folder that `sionna-partial dataset` "
             "wrote, or build the data set again."
@@ -200,11 +138,20 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
     Returns
     -------
     LinkTable
+        With `home`, `stage`, features `phi`, true `link_state` and `gain_db`, `inside` and `anywhere`, each (N,).
 
     Raises
     ------
     PredictorError
         If the folder holds no data set, a home is not in it, or a shard is damaged.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> settings = sp.DatasetSettings(links_per_home=4, stages=(0, 5))
+    >>> report = sp.build_dataset("links", [7], settings, workers=1)
+    >>> len(sp.read_dataset("links"))
+    16
     """
     index = Path(folder) / INDEX_FILE
     try:
@@ -238,7 +185,7 @@ def _links_of(columns: dict[str, Any], maps: Any) -> LinkTable:
     context = LinkContext(
         maps=tuple(_unpacked(each) for each in maps["partial"]),
         map_index=columns.pop("map_index"),
-        indirect_gain_db=np.column_stack([columns.pop(name) for name in _INDIRECT]),
+        indirect_gain_db=np.column_stack([columns.pop(name) for name in _REACHES]),
         strongest_unobserved_m=columns.pop("strongest_unobserved_m"),
         **positions,
     )

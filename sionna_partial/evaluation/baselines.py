@@ -1,4 +1,4 @@
-"""Simpler answers, to be set beside that of a predictor: each of them LinkFeatures -> LinkPrediction."""
+"""Baselines of a predictor: each of them LinkFeatures -> LinkPrediction."""
 
 import json
 from collections.abc import Mapping
@@ -27,16 +27,12 @@ _INDOOR_STD_DB = {LinkState.LOS: 3.0, LinkState.NLOS: 8.03}
 
 @dataclass(frozen=True)
 class Majority:
-    """One answer for every link: how many training links were in each state, and their gains.
+    """The same prediction for every link: fractions, means and standard deviations [dB] of the training links by state.
 
-    Parameters
-    ----------
-    shares, means_db, stds_db : (3,) tuples of float
-        By LinkState: share of the links, mean and standard deviation of their gain [dB]; a state without links has the
-        gain of an outage.
+    A state without links has the gain of an outage.
     """
 
-    shares: tuple[float, ...]
+    fractions: tuple[float, ...]
     means_db: tuple[float, ...]
     stds_db: tuple[float, ...]
 
@@ -52,38 +48,21 @@ class Majority:
         )
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
-        """Say the same of N links, whatever their features."""
-        rows = (self.shares, self.means_db, self.stds_db)
+        """Return the same for N links, whatever their features."""
+        rows = (self.fractions, self.means_db, self.stds_db)
         return LinkPrediction.of_parts(*(np.repeat(np.array(row)[:, None], len(phi), axis=1) for row in rows))
 
 
 @dataclass(frozen=True, eq=False)
 class Baselines:
-    """The baselines that are fitted to the training links of a predictor.
-
-    Parameters
-    ----------
-    majority : Majority
-    distance : Predictor
-        Fitted to links of which nothing but the distance is known.
-    """
+    """The baselines that are fitted to the training links of a predictor; `distance` uses the distance alone."""
 
     majority: Majority
     distance: Predictor
 
     @classmethod
     def fit(cls, links: LinkTable, settings: PredictorSettings) -> "Baselines":
-        """Fit to links whose receivers were drawn indoors.
-
-        Parameters
-        ----------
-        links : LinkTable
-        settings : PredictorSettings
-
-        Returns
-        -------
-        Baselines
-        """
+        """Fit to links whose receivers were drawn indoors."""
         blind = nothing_seen(links.phi, settings.frequency_hz)
         homes = list(dict.fromkeys(map(str, links.home)))
         distance = Predictor.fit(
@@ -94,31 +73,17 @@ class Baselines:
     def save(self, folder: Path) -> None:
         """Write `majority.json`, `distance.keras` and its card into a folder."""
         self.distance.save(folder / DISTANCE_FILE)
-        rows = zip(LinkState, self.majority.shares, self.majority.means_db, self.majority.stds_db, strict=True)
+        rows = zip(LinkState, self.majority.fractions, self.majority.means_db, self.majority.stds_db, strict=True)
         content = {
-            state.name: {"share": share, "gain_mean_db": mean_db, "gain_std_db": std_db}
-            for state, share, mean_db, std_db in rows
+            state.name: {"share": fraction, "gain_mean_db": mean_db, "gain_std_db": std_db}
+            for state, fraction, mean_db, std_db in rows
         }
         with atomic_write(folder / MAJORITY_FILE, "w") as stream:
             stream.write(json.dumps(content, indent=2) + "\n")
 
     @classmethod
     def load(cls, folder: Path) -> "Baselines":
-        """Read what `save` wrote.
-
-        Parameters
-        ----------
-        folder : pathlib.Path
-
-        Returns
-        -------
-        Baselines
-
-        Raises
-        ------
-        PredictorError
-            If a file is missing or damaged.
-        """
+        """Read what `save` wrote."""
         path = folder / MAJORITY_FILE
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
@@ -133,18 +98,7 @@ class Baselines:
 
 
 def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
-    """Return the features of the same N links on an empty map, where the distance is all that is known.
-
-    Parameters
-    ----------
-    phi : LinkFeatures
-    frequency_hz : float
-        Carrier frequency [Hz].
-
-    Returns
-    -------
-    LinkFeatures
-    """
+    """Return the features of the same N links on an empty map, where the distance is all that is known."""
     gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)
     return LinkFeatures(np.full(len(phi), LinkState.LOS), phi.distance_m, phi.distance_m, gain_db)
 
@@ -152,15 +106,7 @@ def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
 def indoor_los_probability(distance_m: NDArray[np.float64], office: str) -> NDArray[np.float64]:
     """Return the LOS probability of 3GPP TR 38.901 V18.0.0, Table 7.4.2-1, "Indoor - Mixed/Open office".
 
-    Parameters
-    ----------
-    distance_m : (N,) float64 array
-        Horizontal distance [m].
-    office : {"mixed", "open"}
-
-    Returns
-    -------
-    (N,) float64 array
+    The distance (N,) is horizontal [m]; `office` is one of `OFFICES`.
     """
     d = distance_m
     if office == "mixed":
@@ -171,19 +117,10 @@ def indoor_los_probability(distance_m: NDArray[np.float64], office: str) -> NDAr
 
 
 def indoor_gain_db(distance_m: NDArray[np.float64], frequency_hz: float) -> dict[LinkState, NDArray[np.float64]]:
-    """Return the path gain of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
+    """Return the path gain [dB] of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
 
-    Parameters
-    ----------
-    distance_m : (N,) float64 array
-        Distance in three dimensions [m]; the model is made for 1 to 150 m, and is extended to 1 cm here.
-    frequency_hz : float
-        Carrier frequency [Hz], 0.5 to 100 GHz in the model.
-
-    Returns
-    -------
-    dict of LinkState to (N,) float64 array
-        Negative path losses [dB], without shadow fading.
+    The distance (N,) is three-dimensional [m]; the model is made for 1 to 150 m and 0.5 to 100 GHz, and is extended to
+    1 cm here. There is no shadow fading.
     """
     decades, frequency = np.log10(np.maximum(distance_m, 0.01)), np.log10(frequency_hz / 1e9)
     los_db = 32.4 + 17.3 * decades + 20.0 * frequency
@@ -192,22 +129,10 @@ def indoor_gain_db(distance_m: NDArray[np.float64], frequency_hz: float) -> dict
 
 
 def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkPrediction:
-    """Answer with the indoor model of 3GPP TR 38.901, which knows distances only, and no outage.
+    """Predict with the indoor model of 3GPP TR 38.901, which depends on distance alone, and has no outage.
 
     The gain is Gaussian with the shadow fading of Table 7.4.1-1: 3 dB in LOS, 8.03 dB in NLOS. Transmitter and receiver
     are taken to be at the same height, so that the horizontal distance is the distance.
-
-    Parameters
-    ----------
-    phi : LinkFeatures
-        Of N links.
-    frequency_hz : float
-        Carrier frequency [Hz].
-    office : {"mixed", "open"}
-
-    Returns
-    -------
-    LinkPrediction
     """
     p_los, gains_db = indoor_los_probability(phi.distance_m, office), indoor_gain_db(phi.distance_m, frequency_hz)
     floor, none = np.full(len(phi), GAIN_FLOOR_DB), np.zeros(len(phi))
@@ -219,25 +144,10 @@ def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkP
     )
 
 
-def answers(
+def baseline_predictions(
     baselines: Baselines, paper: Predictor | None, phi: LinkFeatures, frequency_hz: float
 ) -> Mapping[str, LinkPrediction]:
-    """Let every baseline answer for N links.
-
-    Parameters
-    ----------
-    baselines : Baselines
-    paper : Predictor, optional
-        The paper's.
-    phi : LinkFeatures
-    frequency_hz : float
-        Carrier frequency [Hz].
-
-    Returns
-    -------
-    mapping of str to LinkPrediction
-        The paper's predictor first.
-    """
+    """Predict N links with every baseline; the paper's predictor comes first."""
     distance = baselines.distance
     return ({} if paper is None else {"paper": paper.predict(phi)}) | {
         "distance only": distance.predict(nothing_seen(phi, distance.settings.frequency_hz)),

@@ -1,36 +1,35 @@
-"""Judge a predictor beside simpler answers, on homes that it was trained on and on others: Predictor -> Evaluation."""
+"""Evaluate a predictor against baselines, on homes that it was trained on and on others: Predictor -> Evaluation."""
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.checks import Progress
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.datasets.link_table import LinkTable, stage_name
 from sionna_partial.errors import PredictorError
-from sionna_partial.evaluation.baselines import MAJORITY_FILE, Baselines, answers
+from sionna_partial.evaluation.baselines import MAJORITY_FILE, Baselines, baseline_predictions
 from sionna_partial.evaluation.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
-"""How many ends of a link are in observed cells."""
+"""Number of ends of a link that are in observed cells."""
 
 WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
 """The predictor where receivers may be outside: as if all were indoors, and with `LinkPrediction.anywhere`."""
 
 ALWAYS_OUTAGE = "always outage"
-"""What to beat where most receivers are outside."""
-
-Progress = Callable[[float, str], None]
+"""The baseline where most receivers are outside."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of merit of one answer on some links.
+    """Figures of merit of one prediction on some links.
 
     Parameters
     ----------
@@ -57,18 +56,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Difference:
-    """A predictor minus a baseline on the same links: means over test homes, and their standard errors.
+    """A predictor minus a baseline on the same links: paired difference over test homes, mean and standard error.
 
-    Parameters
-    ----------
-    receivers : {"indoor", "anywhere"}
-    stage : float
-    baseline : str
-    homes : int
-    accuracy, accuracy_error : float
-        Mean of the differences of the homes' accuracies, and its standard error over homes; nan for one home.
-    rmse_db, rmse_error_db : float
-        The same of the homes' root mean square gain errors [dB].
+    The standard error over homes is nan for one home.
     """
 
     receivers: str
@@ -83,7 +73,7 @@ class Difference:
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """What `evaluate` found.
+    """Result of `evaluate`.
 
     Parameters
     ----------
@@ -93,10 +83,10 @@ class Evaluation:
         Names of the "test" and "train" homes.
     rows : tuple of Row
     differences : tuple of Difference
-    calibrations : mapping of int to Calibration
-        Of the predictor on test homes, receivers indoors, by exploration steps.
+    calibrations : mapping of float to Calibration
+        Of the predictor on test homes, receivers indoors, by stage of exploration.
     notes : tuple of str
-        What to know when reading it.
+        Remarks for the reader.
     """
 
     predictor: str
@@ -133,17 +123,28 @@ def evaluate(
     baselines : Baselines, optional
         Those fitted to other links; by default those in the folder of the predictor, else the shipped ones.
     progress : callable, optional
-        Called as ``progress(share_done, message)``.
+        Called as ``progress(fraction_done, message)``.
 
     Returns
     -------
     Evaluation
+        `rows` of figures of merit (`select` filters them), paired `differences`, `calibrations` and `notes`.
 
     Raises
     ------
     PredictorError
         If the data set or a predictor cannot be read; if the data set has no links, or was traced at another frequency
         than the predictor's, or otherwise with diffraction; or if the predictor was trained on all of its homes.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> settings = sp.DatasetSettings(links_per_home=4, stages=(0, 5))
+    >>> report = sp.build_dataset("links", [7], settings, workers=1)
+    >>> evaluation = sp.evaluate("paper", "links")
+    >>> (row,) = evaluation.select(stage=5, receivers="indoor", ends_seen="all", answer="predictor")
+    >>> row.metrics.links
+    4
     """
     model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
     links, traces = open_links(dataset)
@@ -152,38 +153,35 @@ def evaluate(
         traces, LinkTraces.of_settings(model.settings), f"predictor '{model.name}' was trained on links", remedy
     )
     homes = _homes(model, links)
-    contestants = _Contestants(model, baselines or Baselines.load(_baselines_folder(model)), _paper(model))
+    fitted, paper = baselines or Baselines.load(_baselines_folder(model)), _paper(model)
     rows, differences, calibrations = [], [], {}
     parts = list(itertools.product(homes, map(float, np.unique(links.stage))))
     for index, (name, stage) in enumerate(parts):
         if progress:
             progress(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
-        both = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
-        for receivers, some, given in contestants.answers(both):
-            rows += list(_rows(name, receivers, stage, some, given))
+        part = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
+        prediction = model.predict(part.phi)  # once: receivers indoors and anywhere share transmitters and windows
+        for receivers in ("indoor", "anywhere"):
+            drawn = part.anywhere == (receivers == "anywhere")
+            if not drawn.any():
+                continue
+            some, own = part.take(drawn), prediction.take(drawn)
+            if receivers == "indoor":
+                others = baseline_predictions(fitted, paper, some.phi, model.settings.frequency_hz)
+                predictions = {"predictor": own, **others}
+            else:
+                predictions = _anywhere(model, some, own)
+            rows += list(_rows(name, receivers, stage, some, predictions))
             if name == "test":
-                differences += list(_differences(receivers, stage, some, given))
+                differences += list(_differences(receivers, stage, some, predictions))
                 if receivers == "indoor":
-                    calibrations[stage] = calibration(given["predictor"], some.link_state, some.gain_db)
-    notes = tuple(contestants.notes(homes["test"]))
+                    calibrations[stage] = calibration(own, some.link_state, some.gain_db)
+    notes = tuple(_notes(model, fitted.distance, paper, homes["test"]))
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
 
 
 def home_scores(answer: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Measure an answer on each home by itself.
-
-    Parameters
-    ----------
-    answer : LinkPrediction
-        For N links.
-    links : LinkTable
-        These links.
-
-    Returns
-    -------
-    accuracies, rmses_db : (H,) float64 arrays
-        Accuracy and root mean square gain error [dB] of each of the H homes, in the order of their names.
-    """
+    """Return accuracy and root mean square gain error [dB] of each home (H,), in the order of their names."""
     _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
     right = np.bincount(home, answer.link_state == links.link_state)
     squares = np.bincount(home, gain_errors_db(answer, links.link_state, links.gain_db) ** 2)
@@ -191,62 +189,26 @@ def home_scores(answer: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.fl
 
 
 def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Average over homes.
-
-    Parameters
-    ----------
-    values : (H,) float64 array
-        One of each home.
-
-    Returns
-    -------
-    mean, error : float
-        Their mean, and its standard error; nan for one home.
-    """
+    """Return the mean of values of homes (H,), and its standard error; nan for one home."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return float(values.mean()), float(error)
 
 
-@dataclass(frozen=True, eq=False)
-class _Contestants:
-    """Those who answer: the predictor, the fitted baselines, and the paper's predictor unless it is out of place."""
+def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> dict[str, LinkPrediction]:
+    """Predictions where receivers may be outside, from those for receivers indoors."""
+    p_indoor = np.where(links.context.rx_seen, 1.0, model.predict_indoor(links.phi))
+    outage = indoors.anywhere(np.zeros(len(links)))
+    return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 
-    predictor: Predictor
-    baselines: Baselines
-    paper: Predictor | None
 
-    def answers(self, links: LinkTable) -> Iterator[tuple[str, LinkTable, Mapping[str, LinkPrediction]]]:
-        """Yield "indoor" and "anywhere", the links of such receivers, and the answers for them.
-
-        The predictor is asked once: the transmitters of both are the same, and so are their windows.
-        """
-        given = self.predictor.predict(links.phi)
-        for receivers, answer in (("indoor", self._indoors), ("anywhere", self._anywhere)):
-            drawn = links.anywhere == (receivers == "anywhere")
-            if drawn.any():
-                some = links.take(drawn)
-                yield receivers, some, answer(some, given.take(drawn))
-
-    def _indoors(self, links: LinkTable, given: LinkPrediction) -> Mapping[str, LinkPrediction]:
-        """Answers where receivers are indoors."""
-        others = answers(self.baselines, self.paper, links.phi, self.predictor.settings.frequency_hz)
-        return {"predictor": given, **others}
-
-    def _anywhere(self, links: LinkTable, indoors: LinkPrediction) -> Mapping[str, LinkPrediction]:
-        """Answers where receivers may be outside, from the predictor's for receivers indoors."""
-        p_indoor = np.where(links.context.rx_seen, 1.0, self.predictor.predict_indoor(links.phi))
-        outage = indoors.anywhere(np.zeros(len(links)))
-        return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
-
-    def notes(self, test: tuple[str, ...]) -> Iterator[str]:
-        """Say which homes the others know."""
-        fitted = self.baselines.distance
-        those = "those" if set(fitted.homes) == set(self.predictor.homes) else "others than those"
-        yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
-        for name, model in (("The shipped paper's predictor", self.paper), ("Distance only", fitted)):
-            known = len(set(model.homes) & set(test)) if model else 0
-            if known:
-                yield f"{name} was trained on {known} of the {len(test)} test homes."
+def _notes(model: Predictor, fitted: Predictor, paper: Predictor | None, test: tuple[str, ...]) -> Iterator[str]:
+    """Which homes the baselines were trained on."""
+    those = "those" if set(fitted.homes) == set(model.homes) else "others than those"
+    yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
+    for name, other in (("The shipped paper's predictor", paper), ("Distance only", fitted)):
+        known = len(set(other.homes) & set(test)) if other else 0
+        if known:
+            yield f"{name} was trained on {known} of the {len(test)} test homes."
 
 
 def _homes(model: Predictor, links: LinkTable) -> dict[str, tuple[str, ...]]:
@@ -257,7 +219,7 @@ def _homes(model: Predictor, links: LinkTable) -> dict[str, tuple[str, ...]]:
     if not test:
         raise PredictorError(
             f"predictor '{model.name}' was trained on all {len(train)} homes of the data set: "
-            "give a data set of other homes, such as other seeds, or train with test_share above 0."
+            "give a data set of other homes, such as other seeds, or train with test_fraction above 0."
         )
     return {"test": test} | ({"train": train} if train else {})
 
@@ -275,21 +237,21 @@ def _paper(model: Predictor) -> Predictor | None:
 
 
 def _rows(
-    homes: str, receivers: str, stage: float, links: LinkTable, given: Mapping[str, LinkPrediction]
+    homes: str, receivers: str, stage: float, links: LinkTable, predictions: Mapping[str, LinkPrediction]
 ) -> Iterator[Row]:
     ends = links.context.tx_seen.astype(np.int64) + links.context.rx_seen
     cells = {"all": np.ones(len(links), dtype=bool)} | {name: ends == count for name, count in ENDS_SEEN.items()}
     for name, cell in cells.items():
         state, gain_db = links.link_state[cell], links.gain_db[cell]
-        for answer, prediction in given.items():
+        for answer, prediction in predictions.items():
             yield Row(homes, receivers, stage, name, answer, measure(prediction.take(cell), state, gain_db))
 
 
 def _differences(
-    receivers: str, stage: float, links: LinkTable, given: Mapping[str, LinkPrediction]
+    receivers: str, stage: float, links: LinkTable, predictions: Mapping[str, LinkPrediction]
 ) -> Iterator[Difference]:
-    """Compare the first answer with each of the others."""
-    scores = {answer: home_scores(prediction, links) for answer, prediction in given.items()}
+    """Compare the first prediction with each of the others."""
+    scores = {answer: home_scores(prediction, links) for answer, prediction in predictions.items()}
     first, *others = scores
     for baseline in others:
         accuracy, rmse_db = (one - other for one, other in zip(scores[first], scores[baseline], strict=True))

@@ -1,4 +1,4 @@
-"""How good a prediction is: LinkPrediction + what is true -> Metrics."""
+"""Figures of merit of predictions: LinkPrediction and true links -> Metrics."""
 
 import math
 from dataclasses import asdict, dataclass
@@ -28,7 +28,7 @@ LEAST_PROBABILITY = 1e-4
 
 DEFINITIONS = {
     "links": "number of links that were measured.",
-    "accuracy": "share of links whose likeliest link state is the true one.",
+    "accuracy": "fraction of links whose likeliest link state is the true one.",
     "rmse_db": "root mean square of predictive mean minus true path gain [dB]; an outage counts -150 dB on both sides.",
     "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
     "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
@@ -37,18 +37,18 @@ DEFINITIONS = {
     "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
     f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
     "likeliest state.",
-    "coverage_90": "share of links whose true gain lies in the central 90 % interval, by the randomised probability "
+    "coverage_90": "fraction of links whose true gain lies in the central 90 % interval, by the randomised probability "
     "integral transform, spread evenly over the probability of an outage; 0.9 is right.",
 }
-"""What each of the `Metrics` means."""
+"""Definitions of the `Metrics`."""
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Figures of merit of one prediction of N links, as `DEFINITIONS` says; nan where one has no finite value.
+    """Figures of merit of one prediction of N links, see `DEFINITIONS`; nan where one has no finite value.
 
     That is so without links; for `rmse_linked_db` if all links are in outage; for `nll` if a gain is predicted without
-    spread; and for `coverage_90` of an answer without any spread.
+    spread; and for `coverage_90` of a prediction without any spread.
     """
 
     links: int
@@ -67,15 +67,7 @@ class Metrics:
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """How often the likeliest link state is true, by the confidence in it: arrays (`CONFIDENCE_BINS`,).
-
-    Parameters
-    ----------
-    links : int64 array
-        Number of links in each bin of the confidence.
-    confidence, accuracy : float64 arrays
-        Their mean confidence and their accuracy; 0 in an empty bin.
-    """
+    """Links, mean confidence and accuracy in bins of the confidence (`CONFIDENCE_BINS`,); 0 in an empty bin."""
 
     links: NDArray[np.int64]
     confidence: NDArray[np.float64]
@@ -90,15 +82,10 @@ class Reliability:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Whether predicted probabilities are what they say.
+    """Calibration of link state and gain.
 
-    Parameters
-    ----------
-    state : Reliability
-        Of the link state.
-    gain_pit : (PIT_BINS,) float64 array
-        Shares of the randomised probability integral transform of the true gains in bins of equal width; all equal
-        when calibrated.
+    `gain_pit` (PIT_BINS,) has the fractions of the randomised probability integral transforms of the true gains in bins
+    of equal width; all are equal when calibrated.
     """
 
     state: Reliability
@@ -106,24 +93,11 @@ class Calibration:
 
 
 def measure(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Metrics:
-    """Compare a prediction of N links with what is true.
-
-    Parameters
-    ----------
-    answer : LinkPrediction
-    link_state : (N,) uint8 array of LinkState
-        True link states.
-    gain_db : (N,) float64 array
-        True omnidirectional path gains [dB]; in an outage they count as -150 dB.
-
-    Returns
-    -------
-    Metrics
-    """
+    """Compare a prediction of N links with their true link states and gains [dB]; outages count as -150 dB."""
     outage = link_state == LinkState.OUTAGE
     errors_db = gain_errors_db(answer, link_state, gain_db)
     nll_state, nll = _negative_log_likelihoods(answer, link_state, gain_db)
-    low, high = pit_shares(answer, link_state, gain_db, np.array(INTERVAL))
+    low, high = pit_fractions(answer, link_state, gain_db, np.array(INTERVAL))
     return Metrics(
         links=len(link_state),
         accuracy=_mean(answer.link_state == link_state),
@@ -137,20 +111,20 @@ def measure(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDAr
 
 
 def calibration(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Calibration:
-    """Measure the calibration of link state and gain; arguments as for `measure`."""
-    shares = pit_shares(answer, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
-    return Calibration(reliability(answer, link_state), np.diff(shares))
+    """Measure the calibration of link state and gain."""
+    fractions = pit_fractions(answer, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
+    return Calibration(reliability(answer, link_state), np.diff(fractions))
 
 
 def gain_errors_db(
     answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB; arguments as for `measure`."""
+    """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB."""
     return answer.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
 
 
 def reliability(answer: LinkPrediction, link_state: NDArray[np.uint8]) -> Reliability:
-    """Compare confidence and accuracy of the link state, bin by bin; arguments as for `measure`."""
+    """Compare confidence and accuracy of the link state, bin by bin."""
     confidence = np.max([answer.p_outage, answer.p_los, answer.p_nlos], axis=0)
     bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
     links = np.bincount(bins, minlength=CONFIDENCE_BINS)
@@ -159,29 +133,17 @@ def reliability(answer: LinkPrediction, link_state: NDArray[np.uint8]) -> Reliab
     return Reliability(links, *(total / np.maximum(links, 1) for total in sums))
 
 
-def pit_shares(
+def pit_fractions(
     answer: LinkPrediction,
     link_state: NDArray[np.uint8],
     gain_db: NDArray[np.float64],
     levels: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return how much of the probability integral transforms of the true gains lies below some levels.
+    """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
     that of an outage has, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
     prediction returns the levels themselves.
-
-    Parameters
-    ----------
-    answer, link_state, gain_db
-        As for `measure`.
-    levels : (K,) float64 array
-        In [0, 1].
-
-    Returns
-    -------
-    (K,) float64 array
-        Shares of the links; nan without links.
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
