@@ -18,7 +18,7 @@ from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import plot_comparison
-from sionna_partial.plots.figures import figure_png
+from sionna_partial.plots.style import figure_png
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.trace import Progress

@@ -21,7 +21,7 @@ from sionna_partial.errors import OutputError
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 from sionna_partial.plots.coverage_plot import plot_coverage
-from sionna_partial.plots.figures import figure_png
+from sionna_partial.plots.style import figure_png
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
 """What CSV and GeoTIFF hold; `wall_parts` serves pictures alone."""

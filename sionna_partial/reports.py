@@ -126,9 +126,8 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
     OutputError
         If writing fails.
     """
-    from sionna_partial.plots.evaluation_plot import plot_stages
-    from sionna_partial.plots.figures import figure_png
-    from sionna_partial.plots.reliability_plot import plot_reliability
+    from sionna_partial.plots.evaluation_plot import plot_reliability, plot_stages
+    from sionna_partial.plots.style import figure_png
 
     contents = (
         markdown(evaluation).encode(),

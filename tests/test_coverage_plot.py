@@ -13,7 +13,7 @@ from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage
-from sionna_partial.plots.figures import STATE_COLOURS, figure_png
+from sionna_partial.plots.style import STATE_COLOURS, figure_png
 
 LOS, NLOS, OUTAGE = (
     np.array(to_rgb(STATE_COLOURS[state])) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)

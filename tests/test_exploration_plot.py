@@ -10,7 +10,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.exploration_plot import MAX_PANELS, animate_exploration, plot_exploration
-from sionna_partial.plots.figures import BLUE, RED, YELLOW, figure_png
+from sionna_partial.plots.style import BLUE, RED, YELLOW, figure_png
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.explore import Exploration, explore_trajectory
 
@@ -79,8 +79,8 @@ class TestPlotExploration:
         (view,) = panels(figure)[0].patches
         assert view.get_xy()[0] == pytest.approx(drifting.believed_poses[-1, :2])
         assert [text.get_text() for text in figure.legends[0].texts][:2] == [
-            "where the robot believes to be",
-            "where it is",
+            "estimated trajectory",
+            "true trajectory",
         ]
 
     def test_many_moments_are_thinned(self, home):

@@ -18,7 +18,7 @@ from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.plots.coverage_plot import plot_coverage
-from sionna_partial.plots.figures import figure_png
+from sionna_partial.plots.style import figure_png
 
 SUFFIXES = (".nc", ".tif", ".csv", ".png", ".yaml")
 

@@ -5,8 +5,8 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.calibration.material_fit import Posterior
-from sionna_partial.plots.figures import figure_png
 from sionna_partial.plots.material_plot import ANGLES_DEG, plot_calibration
+from sionna_partial.plots.style import figure_png
 
 CONCRETE, BRICK = sp.Material(5.24, 0.6), sp.Material(3.9, 0.04)
 
@@ -41,7 +41,7 @@ def test_search_and_links() -> None:
     search, links, _ = plot_calibration(calibration()).axes
     assert search.lines[0].get_ydata().tolist() == [3.0, 2.5, 2.4]
     labels = [text.get_text() for text in links.get_legend().get_texts()]
-    assert labels == ["start, off by 5.0 dB", "calibrated, off by 1.0 dB"]
+    assert labels == ["start, RMSE 5.0 dB", "calibrated, RMSE 1.0 dB"]
     before, after = (points.get_offsets() for points in links.collections)
     assert len(before) == len(after) == 18
     np.testing.assert_allclose(after[:, 1] - after[:, 0], 1.0)

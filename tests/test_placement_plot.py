@@ -7,8 +7,8 @@ from placement_fakes import small_placement
 from sionna_partial.errors import SettingsError
 from sionna_partial.placement import placement as placement_module
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.figures import BLUE, RED, figure_png
 from sionna_partial.plots.placement_plot import plot_placement
+from sionna_partial.plots.style import BLUE, RED, figure_png
 
 
 @pytest.fixture

@@ -71,8 +71,8 @@ def calibrate(
         import json
 
         from sionna_partial.calibration.calibration import calibrate_materials
-        from sionna_partial.plots.figures import figure_png
         from sionna_partial.plots.material_plot import plot_calibration
+        from sionna_partial.plots.style import figure_png
 
         result = calibrate_materials(
             partial,
@@ -125,8 +125,8 @@ def place(
     with show_progress() as report:
         report(0.0, "loading the predictor")
         from sionna_partial.placement.placement import place_transmitter
-        from sionna_partial.plots.figures import figure_png
         from sionna_partial.plots.placement_plot import plot_placement
+        from sionna_partial.plots.style import figure_png
 
         result = place_transmitter(
             partial,

@@ -139,7 +139,7 @@ def explore(
         report(0.0, "reading the home" if home else "making a home")
         from sionna_partial.maps.map_files import load_map, save_map
         from sionna_partial.plots.exploration_plot import animate_exploration, plot_exploration
-        from sionna_partial.plots.figures import figure_png
+        from sionna_partial.plots.style import figure_png
         from sionna_partial.simulation.explore import explore_trajectory
         from sionna_partial.simulation.homes import make_home
 

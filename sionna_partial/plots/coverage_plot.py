@@ -17,16 +17,16 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
+from sionna_partial.checks import require
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import WALL_PARTS, require_coverage
-from sionna_partial.plots.figures import STATE_COLOURS
-from sionna_partial.settings import require
+from sionna_partial.plots.style import STAR, STATE_COLOURS, legend_below, shade
 
 _WIDTH_IN, _DPI, _MAX_PIXELS = 12.0, 150, 3000
 _STACKED_ASPECT = 1.8
 _HATCH, _HATCH_COLOUR = "////", (0.75, 0.75, 0.75, 0.8)
 _UNSEEN_OPACITY = 0.45
-_STAR: dict[str, Any] = {"marker": "*", "markersize": 13, "markerfacecolor": "white", "markeredgecolor": "black"}
+_STAR: dict[str, Any] = STAR | {"markersize": 13}
 
 
 @dataclass(frozen=True)
@@ -41,44 +41,22 @@ class _Layer:
 
 
 def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> NDArray[np.float64]:
-    """Mix the colours of the three link states by their probabilities (paper, Section IV-C).
-
-    Parameters
-    ----------
-    p_los, p_nlos, p_outage : (...) array-like
-        Probabilities that sum to 1.
-
-    Returns
-    -------
-    (..., 3) array
-        Red, green and blue in [0, 1]; NaN where the probabilities are NaN.
-    """
+    """Mix the colours of the three link states by their probabilities (paper, Section IV-C): (..., 3) in [0, 1]."""
     colours = np.array([to_rgb(STATE_COLOURS[state]) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)])
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
 
 
 LINK_STATE = _Layer("Link state", lambda data: mix_state_colours(data["p_los"], data["p_nlos"], data["p_outage"]))
-GAIN = _Layer(
-    "Mean path gain",
-    lambda data: data["gain_mean_db"].to_numpy(),
-    Normalize(-150.0, -60.0),
-    "viridis",
-    "mean [dB]",
-)
-DEVIATION = _Layer(
-    "Standard deviation of the path gain",
-    lambda data: data["gain_std_db"].to_numpy(),
-    Normalize(0.0, 40.0),
-    "magma_r",
-    "std. dev. [dB]",
-)
+_MEAN, _STD = "Mean path gain", "Standard deviation of the path gain"
+GAIN = _Layer(_MEAN, lambda data: data["gain_mean_db"].to_numpy(), Normalize(-150.0, -60.0), "viridis", "mean [dB]")
+STD = _Layer(_STD, lambda data: data["gain_std_db"].to_numpy(), Normalize(0.0, 40.0), "magma_r", "std. dev. [dB]")
 
 
 def plot_coverage(coverage: xr.Dataset) -> Figure:
     """Draw link state, mean gain and its standard deviation.
 
-    The link state is shown as the colours of the three states mixed by their probabilities. Walls are black, the area
-    that the map does not know is hatched, the transmitter is a star. On a complete map the outside is left blank.
+    The link state is shown as the colours of the three states mixed by their probabilities. Walls are black, the
+    unobserved area is hatched, the transmitter is a star. On a complete map the outside is left blank.
 
     Parameters
     ----------
@@ -88,18 +66,27 @@ def plot_coverage(coverage: xr.Dataset) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot: it need not be closed.
+        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
         For a Dataset that is no coverage map.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> import xarray as xr
+    >>> coverage = xr.load_dataset("coverage.nc")  # or directly from predict_map
+    >>> figure = sp.plot_coverage(coverage)
+    >>> figure.savefig("coverage.png")
     """
     require_coverage(coverage)
-    wide = _aspect(coverage) > _STACKED_ASPECT
-    layers = [LINK_STATE, GAIN, DEVIATION]
+    aspect = coverage.sizes["x"] / coverage.sizes["y"]
+    wide = aspect > _STACKED_ASPECT
+    layers = [LINK_STATE, GAIN, STD]
     rows = [[layer] for layer in layers] if wide else [layers]
-    figure, axes = _panels(rows, _aspect(coverage), keys_right=wide)
+    figure, axes = _panels(rows, aspect, keys_right=wide)
     for axis, layer in zip(itertools.chain(*axes), layers, strict=True):
         _draw(axis, coverage, layer)
         axis.set_title(layer.title)
@@ -109,29 +96,16 @@ def plot_coverage(coverage: xr.Dataset) -> Figure:
 
 
 def plot_comparison(coverages: Mapping[str, xr.Dataset]) -> Figure:
-    """Draw link state (above) and mean gain (below) of several coverage maps side by side (paper, Fig. 5).
+    """Draw link state (above) and mean gain (below) of several coverage maps of one area by title (paper, Fig. 5).
 
-    Parameters
-    ----------
-    coverages : mapping of str to xarray.Dataset
-        Title and coverage map of each column, all of one area. The walls of the first are drawn grey in the others
-        where these do not know them.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-
-    Raises
-    ------
-    SettingsError
-        If there is nothing to compare, or for a Dataset that is no coverage map.
+    The walls of the first are drawn grey in the others where these do not contain them.
     """
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
     for coverage in coverages.values():
         require_coverage(coverage)
     first = next(iter(coverages.values()))
     rows = [[layer] * len(coverages) for layer in (LINK_STATE, GAIN)]
-    figure, axes = _panels(rows, _aspect(first), keys_right=True)
+    figure, axes = _panels(rows, first.sizes["x"] / first.sizes["y"], keys_right=True)
     for row, layer in zip(axes, (LINK_STATE, GAIN), strict=True):
         for axis, coverage in zip(row, coverages.values(), strict=True):
             _draw(axis, coverage, layer, first)
@@ -141,10 +115,6 @@ def plot_comparison(coverages: Mapping[str, xr.Dataset]) -> Figure:
     figure.suptitle(_headline(first))
     _add_legend(figure, unseen_walls=True)
     return figure
-
-
-def _aspect(coverage: xr.Dataset) -> float:
-    return coverage.sizes["x"] / coverage.sizes["y"]
 
 
 def _headline(coverage: xr.Dataset) -> str:
@@ -212,11 +182,13 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: _Layer, reference: xr.Dataset
     wall = _walls(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
     axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=layer.norm, cmap=layer.cmap)
-    axis.imshow(_shade(_outside(coverage), 1.0, shade=255), extent=extent, origin="lower", interpolation="nearest")
+    axis.imshow(shade(_outside(coverage), grey=255), extent=extent, origin="lower", interpolation="nearest")
     _hatch_unknown(axis, coverage)
     if reference is not None:
-        axis.imshow(_shade(_walls(reference), _UNSEEN_OPACITY), extent=_extent(reference), origin="lower", zorder=3)
-    axis.imshow(_shade(wall, 1.0), extent=extent, origin="lower", zorder=3)
+        axis.imshow(
+            shade(_walls(reference), opacity=_UNSEEN_OPACITY), extent=_extent(reference), origin="lower", zorder=3
+        )
+    axis.imshow(shade(wall), extent=extent, origin="lower", zorder=3)
     x, y, _ = coverage.attrs["transmitter_m"]
     axis.plot(x, y, zorder=4, **_STAR)
     axis.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
@@ -244,15 +216,8 @@ def _outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
     return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
 
 
-def _shade(where: NDArray[np.bool_], opacity: float, shade: int = 0) -> NDArray[np.uint8]:
-    """Paint some cells in a shade of grey, black by default, and leave the rest transparent."""
-    picture = np.full((*where.shape, 4), shade, dtype=np.uint8)
-    picture[..., 3] = np.uint8(255 * opacity) * where
-    return picture
-
-
 def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Refine a picture to the size of `wall`, and let what no receiver's cell covers show its nearest neighbour.
+    """Refine a picture to the size of `wall`, and fill cells without receiver from their nearest neighbour.
 
     A wall thinner than a cell leaves a strip of cells without receiver bare; this is for the eye alone.
     """
@@ -265,7 +230,7 @@ def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[
 
 
 def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
-    """Hatch the cells that the map does not know but a receiver may be in."""
+    """Hatch the unobserved cells that a receiver may be in."""
     hatched = ~coverage["observed"].to_numpy() & ~_outside(coverage)
     unknown = np.pad(hatched, 1, mode="edge").astype(float)
     if not unknown.any():
@@ -279,11 +244,11 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
 
 
 def _add_legend(figure: Figure, *, unseen_walls: bool) -> None:
-    handles = [
-        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], label="transmitter", **_STAR),
         Patch(facecolor="black", label="wall"),
         Patch(facecolor="0.5", hatch=_HATCH, edgecolor=_HATCH_COLOUR, label="not observed"),
     ]
     if unseen_walls:
         handles.insert(2, Patch(facecolor="black", alpha=_UNSEEN_OPACITY, label="wall, not observed"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    legend_below(figure, handles)

@@ -1,4 +1,4 @@
-"""Pictures of an exploration: what the robot has seen, the way it took, and where it looks."""
+"""Pictures of an exploration: what the robot has seen, its trajectory, and its field of view."""
 
 import io
 import math
@@ -15,15 +15,15 @@ from matplotlib.path import Path as MarkerPath
 from numpy.typing import NDArray
 from PIL import Image
 
+from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.figures import BLUE, RED, YELLOW
-from sionna_partial.settings import require
+from sionna_partial.plots.style import BLUE, RED, YELLOW, corners_m, figure_png, legend_below, window_m
 from sionna_partial.simulation.camera import view_corners_m
 from sionna_partial.simulation.explore import Exploration
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
-"""How long an animation shows a frame, and its last one [ms]."""
+"""Time of a frame of an animation, and of its last one [ms]."""
 
 MAX_PANELS = 12
 """Largest number of moments in one contact sheet."""
@@ -33,11 +33,10 @@ _VIEW_OPACITY = 0.35
 _WIDTH_IN, _SHEET_ASPECT, _DPI = 12.0, 1.5, 110
 _FRAME_IN, _FRAME_DPI = 5.6, 90
 _MIXED_COLOURS, _ALIKE = 128, 16
-_BORDER_M = 0.3
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
-    """Draw what the robot had seen at each moment, with its way and its view.
+    """Draw what the robot had seen at each step, with its trajectory and its field of view.
 
     Parameters
     ----------
@@ -47,12 +46,19 @@ def plot_exploration(exploration: Exploration) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot: it need not be closed.
+        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
         For something else than an Exploration.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> exploration = sp.explore_trajectory(sp.make_home(3), steps=(10, 50), seed=0)
+    >>> figure = sp.plot_exploration(exploration)
+    >>> figure.savefig("exploration.png")
     """
     _require_exploration(exploration)
     count = min(len(exploration.steps), MAX_PANELS)
@@ -89,6 +95,12 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) 
         For something else than an Exploration, or another suffix.
     OutputError
         If the file cannot be written.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> exploration = sp.explore_trajectory(sp.make_home(3), steps=range(0, 21, 10), seed=0)
+    >>> sp.animate_exploration(exploration, "exploration.gif")
     """
     _require_exploration(exploration)
     require(Path(path).suffix.lower() == ".gif", "path", os.fspath(path), "give a name that ends with .gif.")
@@ -109,7 +121,7 @@ def _require_exploration(value: object) -> None:
 
 
 def _columns(count: int, aspect: float) -> int:
-    """Choose the columns of a sheet of panels that is neither high nor wide, and has few empty places."""
+    """Choose the columns of a sheet of panels that is neither high nor wide, and has few empty panels."""
 
     def fault(columns: int) -> float:
         rows = math.ceil(count / columns)
@@ -123,9 +135,7 @@ def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> I
     panel = figure.add_axes((0.3 / size[0], 0.3 / size[1], 1 - 0.6 / size[0], 1 - 0.7 / size[1]))
     _draw(panel, exploration, index)
     panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
-    return Image.open(buffer).convert("RGB")
+    return Image.open(io.BytesIO(figure_png(figure))).convert("RGB")
 
 
 def _palette(frame: Image.Image) -> Image.Image:
@@ -140,19 +150,19 @@ def _palette(frame: Image.Image) -> Image.Image:
 
 
 def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
-    """Draw one moment: the map, the way up to then, and the view."""
+    """Draw one step: the map, the trajectory up to then, and the field of view."""
     home, step = exploration.home, exploration.steps[index]
     x0, y0, x1, y1 = home.bounds_m
     picture = _picture(exploration.states[index], home.state)
     panel.imshow(picture, extent=(x0, x1, y0, y1), origin="lower", interpolation="nearest")
-    way, believed = exploration.poses[: step + 1], exploration.believed_poses[: step + 1]
+    true, believed = exploration.poses[: step + 1], exploration.believed_poses[: step + 1]
     if _drifts(exploration):
-        panel.plot(way[:, 0], way[:, 1], color=BLUE, linewidth=1.0, linestyle=":")
+        panel.plot(true[:, 0], true[:, 1], color=BLUE, linewidth=1.0, linestyle=":")
     panel.plot(believed[:, 0], believed[:, 1], color=BLUE, linewidth=1.4)
     panel.plot(*believed[0, :2], "o", color=BLUE, markersize=4)
     x, y, heading_deg = believed[-1]
     if step:
-        view = view_corners_m(home, way[-1], exploration.sensor) + believed[-1, :2] - way[-1, :2]
+        view = view_corners_m(home, true[-1], exploration.sensor) + believed[-1, :2] - true[-1, :2]
         panel.add_patch(Polygon(view, color=YELLOW, alpha=_VIEW_OPACITY, linewidth=0))
     panel.plot(x, y, marker=_arrow(heading_deg), color=RED, markersize=10, markeredgecolor="white")
     window = _window_m(exploration)
@@ -161,7 +171,7 @@ def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
 
 
 def _arrow(heading_deg: float) -> MarkerPath:
-    """Slender triangle that points where the robot looks."""
+    """Slender triangle in the heading of the robot."""
     angles = np.radians(heading_deg + np.array([0.0, 140.0, 220.0, 0.0]))
     return MarkerPath(np.stack([np.cos(angles), np.sin(angles)], axis=1), closed=True)
 
@@ -174,16 +184,9 @@ def _picture(state: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.f
 
 
 def _window_m(exploration: Exploration) -> tuple[float, float, float, float]:
-    """World x and y between which there is something to be seen: x0, x1, y0, y1 [m]."""
     home = exploration.home
-    rows, columns = np.nonzero((home.state != CellState.UNKNOWN) | (exploration.states[-1] != CellState.UNKNOWN))
-    (x, y), cell_m = home.origin_m, home.resolution_m
-    return (
-        x + columns.min() * cell_m - _BORDER_M,
-        x + (columns.max() + 1) * cell_m + _BORDER_M,
-        y + rows.min() * cell_m - _BORDER_M,
-        y + (rows.max() + 1) * cell_m + _BORDER_M,
-    )
+    known = (home.state != CellState.UNKNOWN) | (exploration.states[-1] != CellState.UNKNOWN)
+    return window_m(corners_m(known, home.origin_m, home.resolution_m))
 
 
 def _drifts(exploration: Exploration) -> bool:
@@ -192,14 +195,14 @@ def _drifts(exploration: Exploration) -> bool:
 
 def _add_legend(figure: Figure, exploration: Exploration, *, in_one_row: bool) -> None:
     handles: list[Line2D | Patch] = [
-        Line2D([], [], color=BLUE, marker="o", markersize=4, markevery=[0], label="way of the robot"),
+        Line2D([], [], color=BLUE, marker="o", markersize=4, markevery=[0], label="trajectory"),
         Line2D([], [], color=RED, marker=_arrow(0.0), markersize=10, linestyle="none", label="robot"),
-        Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="its view"),
+        Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="field of view"),
         Patch(color=_WALL, label="wall, seen"),
         Patch(color=_UNSEEN_WALL, label="wall, not seen"),
         Patch(color=_UNKNOWN, label="not seen"),
     ]
     if _drifts(exploration):
-        handles[0].set_label("where the robot believes to be")
-        handles.insert(1, Line2D([], [], color=BLUE, linewidth=1.0, linestyle=":", label="where it is"))
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles) if in_one_row else 3, frameon=False)
+        handles[0].set_label("estimated trajectory")
+        handles.insert(1, Line2D([], [], color=BLUE, linewidth=1.0, linestyle=":", label="true trajectory"))
+    legend_below(figure, handles, None if in_one_row else 3)

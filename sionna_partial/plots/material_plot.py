@@ -1,4 +1,4 @@
-"""Figure of a calibration of materials: the way of the search, the fit before and after, and the material found."""
+"""Figure of a calibration of materials: the search, the fit before and after, and the material found."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sionna_partial.calibration.calibration import MaterialCalibration
-from sionna_partial.plots.figures import BLUE, RED
+from sionna_partial.plots.style import BLUE, RED
 from sionna_partial.settings import Material
 from sionna_partial.tracing.slab import reflection_loss_db
 
@@ -22,11 +22,11 @@ _LINE: dict[str, Any] = {"linewidth": 1.6}
 
 
 def plot_calibration(calibration: MaterialCalibration) -> Figure:
-    """Draw what a calibration of materials did.
+    """Draw a calibration of materials.
 
     Left the loss after each step; in the middle the measured gains against those that are traced with the material of
     the start and with the calibrated one; right the loss of a reflection at walls, with two standard deviations to
-    either side, and that of the start: a picture for each material of a mesh.
+    either side, and that of the start: a panel for each material of a mesh.
 
     Parameters
     ----------
@@ -35,12 +35,16 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot: it need not be closed.
+        Not registered with pyplot: it need not be closed.
     """
     count = len(calibration.materials)
     figure = Figure(figsize=(4.2 * (2 + count), 3.9), dpi=150, layout="constrained")
     axes = figure.subplots(1, 2 + count)
-    _draw_loss(axes[0], calibration)
+    loss = calibration.loss
+    axes[0].plot(np.arange(len(loss)), loss, marker="o", markersize=4, color=BLUE, **_LINE)
+    axes[0].set(xlabel="step (0 is the start)", ylabel="negative log posterior per link", title="Search")
+    axes[0].xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes[0].grid(alpha=0.3)
     _draw_gains(axes[1], calibration)
     for which in range(count):
         _draw_reflection(axes[2 + which], calibration, which)
@@ -51,28 +55,14 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     return figure
 
 
-def _draw_loss(axis: Axes, calibration: MaterialCalibration) -> None:
-    axis.plot(np.arange(len(calibration.loss)), calibration.loss, marker="o", markersize=4, color=BLUE, **_LINE)
-    axis.set(xlabel="step (0 is the start)", ylabel="negative log posterior per link", title="Search")
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axis.grid(alpha=0.3)
-
-
 def _draw_gains(axis: Axes, calibration: MaterialCalibration) -> None:
     used = calibration.used
     measured = calibration.gain_db[used]
     pairs = (("start", calibration.gain_before_db, RED), ("calibrated", calibration.gain_after_db, BLUE))
     for name, traced_db, colour in pairs:
         rmse_db = float(np.sqrt(np.mean((traced_db[used] - measured) ** 2)))
-        axis.scatter(
-            measured,
-            traced_db[used],
-            s=9,
-            alpha=0.6,
-            linewidths=0,
-            color=colour,
-            label=f"{name}, off by {rmse_db:.1f} dB",
-        )
+        style: dict[str, Any] = {"s": 9, "alpha": 0.6, "linewidths": 0, "color": colour}
+        axis.scatter(measured, traced_db[used], label=f"{name}, RMSE {rmse_db:.1f} dB", **style)
     limits = [float(np.min(measured)) - 5.0, float(np.max(measured)) + 5.0]
     axis.plot(limits, limits, color="0.3", linewidth=0.9, linestyle="--")
     axis.set(xlabel="measured gain [dB]", ylabel="traced gain [dB]", title="Links", xlim=limits)
@@ -83,13 +73,8 @@ def _draw_gains(axis: Axes, calibration: MaterialCalibration) -> None:
 def _draw_reflection(axis: Axes, calibration: MaterialCalibration, which: int) -> None:
     start, found = calibration.start[which], calibration.materials[which]
     loss_db, std_db = calibration.reflection_loss_db(ANGLES_DEG, which=which)
-    before_db = reflection_loss_db(
-        start.relative_permittivity,
-        start.conductivity_s_m,
-        start.thickness_m,
-        calibration.settings.frequency_hz,
-        ANGLES_DEG,
-    )
+    slab = (start.relative_permittivity, start.conductivity_s_m, start.thickness_m)
+    before_db = reflection_loss_db(*slab, calibration.settings.frequency_hz, ANGLES_DEG)
     axis.fill_between(ANGLES_DEG, loss_db - 2.0 * std_db, loss_db + 2.0 * std_db, color=BLUE, alpha=0.2, linewidth=0)
     axis.plot(ANGLES_DEG, before_db, color=RED, label=f"start: {_words(start)}", **_LINE)
     axis.plot(ANGLES_DEG, loss_db, color=BLUE, label=f"calibrated: {_words(found)}", **_LINE)

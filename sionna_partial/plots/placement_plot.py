@@ -1,4 +1,4 @@
-"""Pictures of how a place for a transmitter was found."""
+"""Figure of the placement of a transmitter: receivers, candidate positions, and the search."""
 
 from typing import Any
 
@@ -10,25 +10,22 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import PercentFormatter
-from numpy.typing import NDArray
 
+from sionna_partial.checks import require
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.figures import BLUE, RED
-from sionna_partial.settings import require
+from sionna_partial.plots.style import BLUE, RED, STAR, corners_m, legend_below, shade, window_m
 
 _WIDTH_IN, _DPI = 9.0, 130
 _WALL, _UNKNOWN = "black", "0.86"
-_BORDER_M = 0.3
-_STAR: dict[str, Any] = {"marker": "*", "markersize": 15, "markerfacecolor": "white", "markeredgecolor": "black"}
+_STAR: dict[str, Any] = STAR | {"markersize": 15}
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
-    """Draw the map, the places that were looked at, the climbs, and the best place with what it covers.
+    """Draw the map, the evaluated positions, the local searches, and the best position with its coverage.
 
     Squares are receivers, in the colour of their probability of being covered from there (or of their mean gain), the
-    paler the less likely they are indoors. The way to the best place is red, other climbs are blue.
+    paler the less likely they are indoors. The search that found the best position is red, others are blue.
 
     Parameters
     ----------
@@ -38,7 +35,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot: it need not be closed.
+        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
@@ -51,7 +48,11 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     height = min(max((_WIDTH_IN - 1.8) * (y1 - y0) / (x1 - x0), 3.0), 14.0)
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
-    _draw_map(axis, placement.partial)
+    left, bottom, right, top = placement.partial.bounds_m
+    axis.set_facecolor(_UNKNOWN)
+    for state, grey, order in ((CellState.FREE, 255, 0.5), (CellState.WALL, 0, 3.0)):
+        picture, extent = shade(placement.partial.state == state, grey), (left, right, bottom, top)
+        axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
     squares = _draw_receivers(axis, placement)
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
@@ -73,34 +74,15 @@ def _headline(placement: TransmitterPlacement) -> str:
 
 
 def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:
-    """Part of the map that is drawn: what is known, and what counts (x0, x1, y0, y1) [m]."""
+    """Part of the map that is drawn: what is known, and the receivers that count (x0, x1, y0, y1) [m]."""
     partial, half = placement.partial, 0.5 * placement.spacing_m
-    rows, columns = np.nonzero(partial.state != CellState.UNKNOWN)
-    corners = np.column_stack([columns, rows])
-    known_m = np.vstack([corners, corners + 1]) * partial.resolution_m + partial.origin_m
+    known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     counting_m = placement.rx_m[placement.weight > 0.2, :2]
-    points_m = np.vstack([known_m, counting_m - half, counting_m + half])
-    (x0, y0), (x1, y1) = points_m.min(axis=0) - _BORDER_M, points_m.max(axis=0) + _BORDER_M
-    return float(x0), float(x1), float(y0), float(y1)
-
-
-def _draw_map(axis: Axes, partial: PartialMap) -> None:
-    x0, y0, x1, y1 = partial.bounds_m
-    axis.set_facecolor(_UNKNOWN)
-    free = _painted(partial.state == CellState.FREE, (255, 255, 255))
-    wall = _painted(partial.state == CellState.WALL, (0, 0, 0))
-    for picture, order in ((free, 0.5), (wall, 3.0)):
-        axis.imshow(picture, extent=(x0, x1, y0, y1), origin="lower", interpolation="nearest", zorder=order)
-
-
-def _painted(where: NDArray[np.bool_], colour: tuple[int, int, int]) -> NDArray[np.uint8]:
-    picture = np.zeros((*where.shape, 4), dtype=np.uint8)
-    picture[where] = (*colour, 255)
-    return picture
+    return window_m(np.vstack([known_m, counting_m - half, counting_m + half]))
 
 
 def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollection:
-    """Draw a square for each receiver, and return them as what the colour scale is for."""
+    """Draw a square for each receiver, and return what the colour scale belongs to."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.objective.name == "coverage"
@@ -122,18 +104,17 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
         x, y = climb.trajectory_m[:, :2].T
         axis.plot(x, y, color=RED if won else BLUE, marker="o", markersize=4, linewidth=1.8, zorder=5 if won else 4.5)
     x, y = placement.position_m[:2]
-    axis.plot(x, y, linestyle="none", zorder=6, **_STAR)
+    axis.plot(x, y, zorder=6, **_STAR)
 
 
 def _add_legend(figure: Figure) -> None:
-    handles = [
-        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="way there"),
-        Line2D([], [], color=BLUE, marker="o", markersize=4, label="other climb"),
-        Line2D(
-            [], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="looked at"
-        ),
+    start = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": "black", "linestyle": "none"}
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], label="transmitter", **_STAR),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="best search"),
+        Line2D([], [], color=BLUE, marker="o", markersize=4, label="other search"),
+        Line2D([], [], label="evaluated", **start),  # type: ignore[arg-type]
         Patch(color=_WALL, label="wall"),
         Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    legend_below(figure, handles)

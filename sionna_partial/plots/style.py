@@ -1,0 +1,56 @@
+"""Shared style of all figures: colours, shaded cells, legends, and equal PNG files for equal figures."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from sionna_partial.constants import LinkState
+
+YELLOW, RED, BLUE = "#ddaa33", "#bb5566", "#004488"
+"""Paul Tol's high-contrast colours: told apart with any colour vision and in grey."""
+
+STATE_COLOURS = {LinkState.LOS: YELLOW, LinkState.NLOS: RED, LinkState.OUTAGE: BLUE}
+"""The better the link, the brighter."""
+
+STAR: dict[str, Any] = {"marker": "*", "markerfacecolor": "white", "markeredgecolor": "black", "linestyle": "none"}
+"""Marker of the transmitter."""
+
+BORDER_M = 0.3
+"""Width of the border around the known cells in a picture [m]."""
+
+
+def figure_png(figure: Figure) -> bytes:
+    """Return a figure as a PNG file; equal figures give equal bytes."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def shade(where: NDArray[np.bool_], grey: int = 0, opacity: float = 1.0) -> NDArray[np.uint8]:
+    """Paint some cells grey, black by default, and leave the rest transparent: (ny, nx, 4)."""
+    picture = np.full((*where.shape, 4), grey, dtype=np.uint8)
+    picture[..., 3] = np.uint8(255 * opacity) * where
+    return picture
+
+
+def window_m(points_m: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Limits x0, x1, y0, y1 of a picture of points (N, 2) with a border [m]."""
+    (x0, y0), (x1, y1) = points_m.min(axis=0) - BORDER_M, points_m.max(axis=0) + BORDER_M
+    return float(x0), float(x1), float(y0), float(y1)
+
+
+def corners_m(cells: NDArray[np.bool_], origin_m: tuple[float, float], resolution_m: float) -> NDArray[np.float64]:
+    """Lower-left and upper-right corners of cells (2N, 2) [m]."""
+    corners = np.argwhere(cells)[:, ::-1]
+    return np.vstack([corners, corners + 1]) * resolution_m + origin_m
+
+
+def legend_below(figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None) -> None:
+    """Draw a legend below the axes, in one row by default."""
+    figure.legend(handles=handles, loc="outside lower center", ncols=columns or len(handles), frameon=False)
