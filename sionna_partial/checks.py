@@ -4,7 +4,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, is_dataclass
-from functools import cache
 from numbers import Integral, Real
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
@@ -77,13 +76,8 @@ class Checked:
     """
 
     def __post_init__(self) -> None:
-        for name, hint in _hints(type(self)).items():
+        for name, hint in get_type_hints(type(self), include_extras=True).items():
             _check(name, getattr(self, name), hint)
-
-
-@cache
-def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind, include_extras=True)
 
 
 def _check(name: str, value: object, hint: Any) -> None:
@@ -98,5 +92,5 @@ def _check(name: str, value: object, hint: Any) -> None:
         require(value in arguments, name, value, f"choose one of {arguments}.")
     elif hint is bool or arguments == (bool, NoneType):
         require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
-    elif is_dataclass(hint):
-        require(isinstance(value, hint), name, value, f"give {hint.__name__}(...).")  # type: ignore[arg-type]
+    elif isinstance(hint, type) and is_dataclass(hint):
+        require(isinstance(value, hint), name, value, f"give {hint.__name__}(...).")

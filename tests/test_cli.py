@@ -6,7 +6,6 @@ import subprocess
 import sys
 import warnings
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,8 +14,9 @@ import typer
 from PIL import Image
 from typer.testing import CliRunner, Result
 
+import sionna_partial as sp
 from sionna_partial import __version__, cli, info
-from sionna_partial.cli import shell
+from sionna_partial.cli.options import join_numbers, parse_material
 from sionna_partial.errors import BackendError, MapError, OutputError
 from sionna_partial.info import Finding
 from sionna_partial.maps.map_files import load_map, save_map
@@ -55,8 +55,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     def save_coverage(coverage: str, path: Path) -> None:
         calls.append((coverage, path))
 
-    monkeypatch.setattr("sionna_partial.coverage.predict_map", predict_map)
-    monkeypatch.setattr("sionna_partial.export.save_coverage", save_coverage)
+    monkeypatch.setattr(sp, "predict_map", predict_map)
+    monkeypatch.setattr(sp, "save_coverage", save_coverage)
     return calls
 
 
@@ -195,7 +195,7 @@ class TestPredict:
         def fail(*_: object, **__: object) -> None:
             raise error
 
-        monkeypatch.setattr("sionna_partial.export.save_coverage", fail)
+        monkeypatch.setattr(sp, "save_coverage", fail)
         result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path)
         assert result.exit_code == 2
         assert result.stderr == f"error: {error}\n"
@@ -208,7 +208,7 @@ class TestPredict:
             if path.suffix == ".csv":
                 raise OSError(28, "No space left on device")
 
-        monkeypatch.setattr("sionna_partial.export.save_coverage", write_some)
+        monkeypatch.setattr(sp, "save_coverage", write_some)
         out = tmp_path / "out"
         result = run("predict", map_path, "--tx", 1, 1, "--out", out)
         assert result.exit_code == 2
@@ -230,14 +230,12 @@ class TestPredict:
         def interrupt(*_: object, **__: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("sionna_partial.coverage.predict_map", interrupt)
+        monkeypatch.setattr(sp, "predict_map", interrupt)
         assert run("predict", map_path, "--tx", 1, 1, "--out", tmp_path).exit_code == 130
 
     def test_strict(self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         read: list[Any] = []
-        monkeypatch.setattr(
-            "sionna_partial.maps.map_files.load_map", lambda path, **options: read.append((path, options))
-        )
+        monkeypatch.setattr(sp, "load_map", lambda path, **options: read.append((path, options)))
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
         run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path, "--strict", "--up", "y", "--height-band", 0.5, 2)
         assert read == [
@@ -255,7 +253,7 @@ class TestPredict:
                 warnings.warn("many cells of shade 205", UserWarning, stacklevel=1)
             return room
 
-        monkeypatch.setattr("sionna_partial.maps.map_files.load_map", read)
+        monkeypatch.setattr(sp, "load_map", read)
         result = run("predict", tmp_path, "--tx", 1, 1, "--out", tmp_path)
         assert result.stderr.splitlines()[:2] == ["warning: origin yaw 0.5 rad", "warning: many cells of shade 205"]
 
@@ -284,15 +282,13 @@ class TestExportScene:
 
 
 class TestExplore:
-    def test_made_home(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, room: PartialMap) -> None:
-        asked: list[int] = []
-        monkeypatch.setattr("sionna_partial.simulation.homes.make_home", lambda seed: asked.append(seed) or room)
+    def test_made_home(self, tmp_path: Path) -> None:
         result = run("explore", "--out", tmp_path / "maps", "--seed", "7", "--steps", "6", "--steps", "2")
         assert result.exit_code == 0, result.output
-        assert asked == [7]
         names = ["steps_002.yaml", "steps_006.yaml", "complete.yaml", "exploration.png", "exploration.gif"]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'maps' / name}" for name in names]
-        for name, partial in zip(names, [*explore(room, (2, 6), 7), room], strict=False):
+        home = sp.make_home(7)
+        for name, partial in zip(names, [*explore(home, (2, 6), 7), home], strict=False):
             assert np.array_equal(load_map(tmp_path / "maps" / name).state, partial.state)
         with Image.open(tmp_path / "maps" / "exploration.gif") as animation:
             assert animation.n_frames == 7
@@ -322,9 +318,9 @@ class TestExplore:
 
 
 def test_demo_prints_table_and_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    def run_demo(out: Path, progress: Any) -> SimpleNamespace:
+    def run_demo(out: Path, progress: Any) -> tuple[list[str], str]:
         progress(0.5, "half way")
-        return SimpleNamespace(files={"coverage": out / "coverage.nc"}, table="accuracy 0.9")
+        return ["coverage.nc"], "accuracy 0.9"
 
     monkeypatch.setattr("sionna_partial.demo.run_demo", run_demo)
     result = run("demo", "--out", tmp_path)
@@ -371,13 +367,13 @@ class TestHelp:
 
 def test_join_numbers_leaves_the_rest_alone() -> None:
     args = ["map.yaml", "--tx", "1", "-2", "--out", "-3", "4"]
-    assert shell.join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
-    assert shell.join_numbers(["--tx=-1", "2", "--out=x", "3"], "--tx") == ["--tx=-1 2", "--out=x", "3"]
+    assert join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
+    assert join_numbers(["--tx=-1", "2", "--out=x", "3"], "--tx") == ["--tx=-1 2", "--out=x", "3"]
 
 
 def test_parse_material() -> None:
-    assert shell.parse_material("") == Material()
-    assert shell.parse_material("wood") == Material(itu="wood")
-    assert shell.parse_material("2.5,0.1,0.05") == Material(2.5, 0.1, 0.05)
+    assert parse_material("") == Material()
+    assert parse_material("wood") == Material(itu="wood")
+    assert parse_material("2.5,0.1,0.05") == Material(2.5, 0.1, 0.05)
     with pytest.raises(typer.BadParameter, match="'a,b,c' is neither an ITU name"):
-        shell.parse_material("a,b,c")
+        parse_material("a,b,c")

@@ -34,32 +34,31 @@ def scenes(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(scenes):
     """Result, folder and progress of one run."""
-    shares = []
+    fractions = []
     out = scenes.parent / "out"
-    return run_demo(out, lambda share, message: shares.append(share), home="hut", step=50), out, shares
+    return run_demo(out, lambda fraction, message: fractions.append(fraction), home="hut", step=50), out, fractions
 
 
-def test_the_demo_writes_every_file_and_says_where(run):
-    result, out, shares = run
+def test_the_demo_writes_every_file_and_returns_their_names(run):
+    (names, table), out, fractions = run
     assert sorted(file.name for file in out.iterdir()) == FILES
-    assert set(result.files) == set(FILES) - {"coverage.pgm"}
-    assert all(result.files[name] == out / name for name in result.files)
-    assert (out / "table.txt").read_text() == result.table
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
+    assert set(names) == set(FILES) - {"coverage.pgm"}
+    assert (out / "table.txt").read_text() == table
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
     with Image.open(out / "comparison.png") as image:
         assert image.width >= 1200
 
 
 def test_the_coverage_files_are_of_the_partial_map(run):
-    result, _, _ = run
+    _, out, _ = run
     expected = predict_map(map_of(PICTURE), TX)
-    xr.testing.assert_allclose(xr.load_dataset(result.files["coverage.nc"]), expected)
+    xr.testing.assert_allclose(xr.load_dataset(out / "coverage.nc"), expected)
 
 
 def test_the_table_compares_three_answers_in_three_areas(run):
-    result, _, _ = run
-    rows = {line[:22].strip(): line[22:] for line in result.table.splitlines()[3:]}
+    (_, table), _, _ = run
+    rows = {line[:22].strip(): line[22:] for line in table.splitlines()[3:]}
     assert list(rows) == ["nothing observed", "partial trace alone", "partial map"]
     assert all(row.count("%") == row.count("dB") == 3 for row in rows.values())
 

@@ -1,4 +1,4 @@
-"""The commands train and evaluate on a small data set: what they write, what they say, and how they fail."""
+"""The commands dataset, train and evaluate: what they pass on, what they write and print, and how they fail."""
 
 import json
 from pathlib import Path
@@ -9,9 +9,12 @@ from link_tables import fitted_baselines, make_dataset, make_table
 from predictor_links import QUIET, quick_predictor
 from typer.testing import CliRunner, Result
 
+import sionna_partial as sp
 from sionna_partial import cli
+from sionna_partial.datasets.dataset import DatasetReport
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.settings import PredictorSettings
+from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.settings import DatasetSettings, Material, PredictorSettings, SensorSettings
 
 pytestmark = [QUIET, pytest.mark.usefixtures("command_line")]
 
@@ -33,6 +36,75 @@ def predictor(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(*args: object) -> Result:
     return CliRunner().invoke(cli.app, [str(arg) for arg in args])
+
+
+class TestDataset:
+    @pytest.fixture
+    def calls(self, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+        """What `dataset` passes on, instead of a data set; homes from files fail."""
+        calls: list[Any] = []
+
+        def build(folder: Path, homes: list[int | Path], settings: DatasetSettings, **options: Any) -> DatasetReport:
+            options.pop("progress")(1, len(homes), "half way")
+            calls.append((folder, homes, settings, options))
+            failed = {str(home): "the roof fell in\nTraceback" for home in homes if isinstance(home, Path)}
+            return DatasetReport(folder, ("a", "b"), ("c",), failed, 90.0)
+
+        monkeypatch.setattr(sp, "build_dataset", build)
+        return calls
+
+    def test_defaults(self, calls: list[Any]) -> None:
+        result = run("dataset", "out")
+        assert result.exit_code == 0
+        (call,) = calls
+        options = {"scheduler": None, "workers": None, "home_time_limit_s": 900.0}
+        assert call == (Path("out"), [*range(20_000, 20_100)], DatasetSettings(), options)
+        assert "homes in out: 2 built in 1.5 min, 1 already there" in result.stdout
+
+    def test_options(self, calls: list[Any]) -> None:
+        settings = "--links 20 --transmitters 2 --stage 50 --stage 0 --seed 3 --field-of-view 360 --range 8"
+        settings += " --range-noise 0.02 --drift 0.01 --missed-walls 0.1 --material concrete"
+        where = ("--scheduler", "tcp://host:8786", "--workers", 3, "--time-limit", 60)
+        result = run("dataset", "out", "--homes", 2, "--first-seed", 7, *settings.split(), *where)
+        assert result.exit_code == 0
+        _, homes, passed, options = calls[0]
+        assert homes == [7, 8]
+        assert (passed.links_per_home, passed.transmitters_per_home, passed.stages, passed.seed) == (20, 2, (0, 50), 3)
+        assert passed.sensor == SensorSettings(0.02, 0.01, 0.1, 360.0, 8.0)
+        assert passed.scene.material == Material(itu="concrete")
+        assert options == {"scheduler": "tcp://host:8786", "workers": 3, "home_time_limit_s": 60.0}
+
+    def test_kinds_in_turn_fractions_and_mixed_sensors(self, calls: list[Any]) -> None:
+        options = ("--kind", "floor", "--kind", "hall", "--mixed-sensors", "--short-links", 0.5)
+        result = run("dataset", "out", "--homes", 3, "--first-seed", 7, "--stage", 0.25, "--stage", 0, *options)
+        assert result.exit_code == 0
+        _, homes, passed, _ = calls[0]
+        assert homes == [(7, "floor"), (8, "hall"), (9, "floor")]
+        assert (passed.stages, passed.sensor, passed.short_link_fraction) == ((0, 0.25), "mixed", 0.5)
+
+    def test_maps_alone_and_failed_homes(self, calls: list[Any]) -> None:
+        result = run("dataset", "out", "--map", "one.yaml", "--map", "two")
+        assert calls[0][1] == [Path("one.yaml"), Path("two")]
+        assert result.exit_code == 1
+        assert "one.yaml failed: the roof fell in\ntwo failed: the roof fell in\n" in result.stderr
+        assert "homes that failed: 2; the others can be used" in result.stderr
+        assert "the same command tries them again" in result.stderr
+
+    def test_default_homes_are_new_to_the_shipped_predictor(self, calls: list[Any]) -> None:
+        run("dataset", "out")
+        known = json.loads((PREDICTORS_FOLDER / "paper.json").read_text(encoding="utf-8"))["homes"]
+        assert known
+        assert not {f"make_home({seed})" for seed in calls[0][1]} & set(known)
+
+    def test_maps_and_seeds(self, calls: list[Any]) -> None:
+        run("dataset", "out", "--map", "one.yaml", "--homes", 1)
+        assert calls[0][1] == [20_000, Path("one.yaml")]
+
+    def test_bad_setting(self, calls: list[Any]) -> None:
+        result = run("dataset", "out", "--links", 2)
+        assert result.exit_code == 2
+        assert result.stderr.startswith("error: links_per_home = 2 is not allowed: give at least 4, one for each of")
+        assert calls == []
 
 
 class TestTrain:
@@ -61,7 +133,7 @@ class TestTrain:
             seen.update(options)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("sionna_partial.training.train", train)
+        monkeypatch.setattr(sp, "train", train)
         run("train", folder, "--out", tmp_path / "run")
         assert seen["settings"] == PredictorSettings("map", frequency_hz=60e9, diffraction=False)
         assert seen["test_fraction"] == 0.3
@@ -110,7 +182,7 @@ class TestEvaluate:
             seen.extend(arguments)
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("sionna_partial.evaluation.evaluate.evaluate", evaluate)
+        monkeypatch.setattr(sp, "evaluate", evaluate)
         run("evaluate", dataset, "--out", tmp_path / "report")
         assert seen == ["map", [dataset]]
 

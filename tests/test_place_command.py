@@ -10,6 +10,7 @@ from PIL import Image
 from placement_fakes import HALF_SEEN, use_fake_search
 from typer.testing import CliRunner, Result
 
+import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.placement import placement
@@ -34,7 +35,7 @@ def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     record = json.loads((out / "placement.json").read_text())
     x, y, z = record["position_m"]
-    covered = f"{record['score']:.1%} of the places are predicted above -100 dB"
+    covered = f"{record['score']:.1%} of the receivers are predicted above -100 dB"
     assert result.stdout.splitlines() == [
         f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {covered}",
         f"wrote {out / 'placement.json'}",
@@ -46,7 +47,7 @@ def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
 
 def test_worst_places(map_path: Path, tmp_path: Path) -> None:
     result = run(map_path, "--out", tmp_path / "place", "--objective", "percentile")
-    assert "m: the worst tenth of the places is predicted at " in result.stdout
+    assert "m: the worst tenth of the receivers is predicted at " in result.stdout
 
 
 def test_what_it_passes_on(map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -57,9 +58,9 @@ def test_what_it_passes_on(map_path: Path, tmp_path: Path, monkeypatch: pytest.M
         calls.append(options)
         return true(scene, seed=options["seed"])
 
-    monkeypatch.setattr(placement, "place_transmitter", place_transmitter)
+    monkeypatch.setattr(sp, "place_transmitter", place_transmitter)
     options = ["--threshold", -90, "--height", 2, "--rx-height", 1, "--seed", 3, "--frequency", 27e9, "--max-depth", 2]
-    options += ["--predictor", "paper", "--material", "concrete", "--checkpoint", tmp_path / "search.json"]
+    options += ["--predictor", "paper", "--material", "concrete"]
     assert run(map_path, "--out", tmp_path / "place", *options).exit_code == 0
     (found,) = calls
     assert {name: found[name] for name in ("threshold_db", "height_m", "rx_height_m", "seed", "predictor")} == {
@@ -71,7 +72,6 @@ def test_what_it_passes_on(map_path: Path, tmp_path: Path, monkeypatch: pytest.M
     }
     assert (found["trace_settings"].frequency_hz, found["trace_settings"].max_depth) == (27e9, 2)
     assert found["scene_settings"].material.itu == "concrete"
-    assert found["checkpoint"] == tmp_path / "search.json"
     assert found["objective"] == "coverage"
 
 

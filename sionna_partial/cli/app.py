@@ -1,4 +1,4 @@
-"""Command line: one subcommand for each arrow from a map to its coverage, and from homes to a predictor."""
+"""Command line: one subcommand for each step from a map to its coverage, and from homes to a predictor."""
 
 import logging
 import os
@@ -9,15 +9,15 @@ import typer
 from typer.core import TyperGroup
 
 from sionna_partial import __version__
-from sionna_partial.cli.inverse import calibrate, place
 from sionna_partial.cli.learning import dataset, evaluate, train
+from sionna_partial.cli.options import TransmitterCommand
+from sionna_partial.cli.planning import calibrate, place
 from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
-from sionna_partial.cli.shell import TransmitterCommand
 from sionna_partial.errors import SionnaPartialError
 
 
 class _ErrorLineGroup(TyperGroup):
-    """Reports an error that is the user's to mend in one line, with exit code 2."""
+    """Reports an error that the user can fix in one line, with exit code 2."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the subcommand."""
@@ -29,10 +29,10 @@ class _ErrorLineGroup(TyperGroup):
 
 
 class _WarningLine(logging.Handler):
-    """Writes warnings as one line each."""
+    """Writes warnings as one line each, to stderr as it is now."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record to stderr as it is now."""
+        """Write a record."""
         typer.echo(f"{record.levelname.lower()}: {record.getMessage()}", err=True)
 
 
@@ -69,12 +69,5 @@ def _prepare(
 
 
 app.command(cls=TransmitterCommand)(predict)
-app.command()(export_scene)
-app.command()(explore)
-app.command()(dataset)
-app.command()(train)
-app.command()(evaluate)
-app.command()(calibrate)
-app.command()(place)
-app.command()(demo)
-app.command()(info)
+for _command in (export_scene, explore, dataset, train, evaluate, calibrate, place, demo, info):
+    app.command()(_command)

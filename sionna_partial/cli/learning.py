@@ -3,23 +3,13 @@
 import itertools
 import shlex
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, cast
 
 import typer
 
-from sionna_partial.cli.shell import (
-    DriftOption,
-    FieldOfViewOption,
-    FrequencyOption,
-    MaterialOption,
-    MissedWallsOption,
-    RangeNoiseOption,
-    RangeOption,
-    parse_material,
-    print_files,
-    show_progress,
-    show_rate,
-)
+import sionna_partial as sp
+from sionna_partial.cli import options as opt
+from sionna_partial.cli.progress import show_progress, show_rate
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.files import require_writable
 from sionna_partial.settings import (
@@ -34,21 +24,17 @@ from sionna_partial.settings import (
     TraceSettings,
 )
 
-DatasetsArgument = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="DATASET",
-        help="Folder that `dataset` wrote, or several; homes may be in more than one.",
-        show_default=False,
-    ),
-]
-
-
 DEFAULT_HOMES = 100
 """Number of homes that are made where no map is given."""
 
 FIRST_SEED = 20_000
 """Seed of the first of them: not one of those that the shipped predictor was trained on (`make predictor`)."""
+
+_DATASET_HELP = "Folder that `dataset` wrote, or several; homes may be in more than one."
+_STAGE_HELP = "Steps, such as --stage 0 --stage 50, or fractions observed, such as 0 and 0.25."
+_NETWORKS_HELP = "Its input: the paper's features, what each path crosses, and the map around the transmitter."
+
+Datasets = Annotated[list[Path], typer.Argument(metavar="DATASET", help=_DATASET_HELP, show_default=False)]
 
 
 def dataset(
@@ -72,21 +58,18 @@ def dataset(
         float, typer.Option(help=f"Fraction of the links that are drawn shorter than {SHORT_LINK_M:g} m [1].")
     ] = DatasetSettings.short_link_fraction,
     transmitters: Annotated[int, typer.Option(help="Transmitters of a home.")] = DatasetSettings.transmitters_per_home,
-    stages: Annotated[
-        list[float],
-        typer.Option("--stage", help="Steps, such as --stage 0 --stage 50, or fractions observed, such as 0 and 0.25."),
-    ] = list(DatasetSettings.stages),  # noqa: B006
-    seed: Annotated[int, typer.Option(help="Seed of places and robots.")] = DatasetSettings.seed,
-    field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
-    range_m: RangeOption = SensorSettings.range_m,
-    range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
-    drift: DriftOption = SensorSettings.drift_m_per_m,
-    missed_walls: MissedWallsOption = SensorSettings.missed_wall_fraction,
+    stages: Annotated[list[float], typer.Option("--stage", help=_STAGE_HELP)] = list(DatasetSettings.stages),  # noqa: B006
+    seed: Annotated[int, typer.Option(help="Seed of positions and robots.")] = DatasetSettings.seed,
+    field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
+    range_m: opt.Range = SensorSettings.range_m,
+    range_noise: opt.RangeNoise = SensorSettings.range_noise_m,
+    drift: opt.Drift = SensorSettings.drift_m_per_m,
+    missed_walls: opt.MissedWalls = SensorSettings.missed_wall_fraction,
     mixed_sensors: Annotated[
         bool, typer.Option("--mixed-sensors", help="Draw a sensor for each home, in place of the five options above.")
     ] = False,
-    frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
-    material: MaterialOption = "",
+    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
+    material: opt.MaterialText = "",
     workers: Annotated[
         int | None, typer.Option(help="Homes at a time on this machine. Default: one for each core.")
     ] = None,
@@ -110,73 +93,64 @@ def dataset(
         seed=seed,
         sensor="mixed" if mixed_sensors else sensor,
         short_link_fraction=short_links,
-        scene=SceneSettings(material=parse_material(material)),
+        scene=SceneSettings(material=opt.parse_material(material)),
         trace=TraceSettings(frequency_hz=frequency),
     )
     count = homes if homes is not None else 0 if maps else DEFAULT_HOMES
     seeds = range(first_seed, first_seed + count)
     in_turn = itertools.cycle(cast("list[HomeKind]", kinds or []))
+    sources = [*(zip(seeds, in_turn, strict=False) if kinds else seeds), *(maps or [])]
     with show_rate("homes") as report:
-        from sionna_partial.datasets.dataset import build_dataset
-
-        result = build_dataset(
-            out,
-            [*(zip(seeds, in_turn, strict=False) if kinds else seeds), *(maps or [])],
-            settings,
-            scheduler=scheduler,
-            workers=workers,
-            home_time_limit_s=time_limit,
-            progress=report,
-        )
-    _say_what_was_done(result)
+        where = {"scheduler": scheduler, "workers": workers}
+        result = sp.build_dataset(out, sources, settings, home_time_limit_s=time_limit, progress=report, **where)  # type: ignore[arg-type]
+    built = f"{len(result.built)} built in {result.elapsed_s / 60.0:.1f} min"
+    typer.echo(f"homes in {result.folder}: {built}, {len(result.skipped)} already there")
+    for name, error in result.failed.items():
+        typer.echo(f"{name} failed: {error.splitlines()[0]}", err=True)
+    if result.failed:
+        reasons = f"the others can be used: {result.folder / 'failed'} has the reasons"
+        typer.echo(f"homes that failed: {len(result.failed)}; {reasons}; the same command tries them again.", err=True)
     raise typer.Exit(1 if result.failed else 0)
 
 
 def train(
-    folders: DatasetsArgument,
+    folders: Datasets,
     out: Annotated[Path, typer.Option(metavar="RUN", help="Folder for predictor and baselines.", show_default=False)],
     test_fraction: Annotated[float, typer.Option(help="Fraction of the homes that is kept for testing.")] = 0.3,
-    networks: Annotated[
-        NetworkKind,
-        typer.Option(help="What it sees: the paper's features, what each path crosses, and the map around."),
-    ] = "map",
+    networks: Annotated[NetworkKind, typer.Option(help=_NETWORKS_HELP)] = "map",
     passes: Annotated[
-        int, typer.Option(help="How many times the networks beside the paper's see the links.")
+        int, typer.Option(help="Passes of the networks beside the paper's over the links.")
     ] = PredictorSettings.passes,
     seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = PredictorSettings.seed,
 ) -> None:
     """Train a predictor, and test it on other homes.
 
-    RUN gets predictor.keras, which `predict --predictor` takes, simpler answers fitted to the same links, and the split
-    of the homes.
+    RUN gets predictor.keras, which `predict --predictor` takes, baselines fitted to the same links, and the split of
+    the homes.
     """
     require_writable(out)
     with show_progress() as report:
         report(0.0, "reading links")
         from sionna_partial.datasets.dataset_links import open_links, settings_for
         from sionna_partial.reports import summary
-        from sionna_partial.training import PREDICTOR_FILE
-        from sionna_partial.training import train as train_predictor
 
         links, traces = open_links(folders)
         settings = settings_for(traces, networks=networks, passes=passes, seed=seed)
-        run = train_predictor(links, test_fraction=test_fraction, settings=settings, progress=report)
+        run = sp.train(links, test_fraction=test_fraction, settings=settings, progress=report)
         files = run.save(out)
     typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")
-    print_files(files)
+    opt.print_files(out, [file.name for file in files])
     if run.evaluation:
-        typer.echo(
-            f"all figures of merit: sionna-partial evaluate {shlex.join(map(str, folders))} "
-            f"--predictor {out / PREDICTOR_FILE} --out REPORT"
-        )
+        command = f"sionna-partial evaluate {shlex.join(map(str, folders))}"
+        typer.echo(f"all figures of merit: {command} --predictor {out / 'predictor.keras'} --out REPORT")
 
 
 def evaluate(
-    folders: DatasetsArgument,
+    folders: Datasets,
     out: Annotated[Path, typer.Option(metavar="REPORT", help="Folder for the report.", show_default=False)],
     predictor: Annotated[str, typer.Option(metavar="NAME|FILE", help="'map', 'paper', or a .keras file.")] = "map",
 ) -> None:
-    """Judge a predictor beside simpler answers.
+    """Evaluate a predictor against baselines.
 
     REPORT gets all figures of merit with their definitions (report.md, report.json), and pictures. Homes of the data
     set that the predictor was not trained on are test homes.
@@ -184,26 +158,9 @@ def evaluate(
     require_writable(out)
     with show_progress() as report:
         report(0.0, "reading links")
-        from sionna_partial.evaluation.evaluate import evaluate as evaluate_predictor
-        from sionna_partial.reports import save_report, summary
+        from sionna_partial.reports import REPORT_FILES, save_report, summary
 
-        result = evaluate_predictor(predictor, folders, progress=report)
-        files = save_report(result, out)
+        result = sp.evaluate(predictor, folders, progress=report)
+        save_report(result, out)
     typer.echo(summary(result))
-    print_files(files)
-
-
-def _say_what_was_done(result: Any) -> None:
-    """Print what was built, and which homes are missing and why."""
-    minutes = result.elapsed_s / 60.0
-    typer.echo(
-        f"homes in {result.folder}: {len(result.built)} built in {minutes:.1f} min, {len(result.skipped)} already there"
-    )
-    for name, error in result.failed.items():
-        typer.echo(f"{name} failed: {error.splitlines()[0]}", err=True)
-    if result.failed:
-        typer.echo(
-            f"homes that failed: {len(result.failed)}; the others can be used: {result.folder / 'failed'} says why; "
-            "the same command tries them again.",
-            err=True,
-        )
+    opt.print_files(out, REPORT_FILES)

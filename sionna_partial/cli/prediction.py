@@ -5,31 +5,12 @@ from typing import Annotated
 
 import typer
 
-from sionna_partial.cli.shell import (
-    DiffractionOption,
-    DriftOption,
-    FieldOfViewOption,
-    FrequencyOption,
-    HeightBandOption,
-    MapArgument,
-    MaterialOption,
-    MaxDepthOption,
-    MemoryOption,
-    MissedWallsOption,
-    PredictorOption,
-    RangeNoiseOption,
-    RangeOption,
-    StrictOption,
-    UpOption,
-    WallHeightOption,
-    parse_material,
-    parse_position,
-    print_files,
-    show_progress,
-)
+import sionna_partial as sp
+from sionna_partial.cli import options as opt
+from sionna_partial.cli.progress import show_progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
 from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, SensorSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".yaml")
 """Formats of a coverage map."""
@@ -39,43 +20,38 @@ FRAMES = 50
 
 
 def predict(
-    map_path: MapArgument,
+    map_path: opt.Map,
     tx: Annotated[
         str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z.", show_default=False)
     ],
     out: Annotated[Path, typer.Option(help="Folder for the coverage files.", show_default=False)],
-    rx_height: Annotated[float, typer.Option(help="Height of the receivers [m].")] = DEFAULT_HEIGHT_M,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
-    frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
-    material: MaterialOption = "",
-    max_depth: MaxDepthOption = 6,
-    diffraction: DiffractionOption = True,
-    predictor: PredictorOption = "",
+    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
+    material: opt.MaterialText = "",
+    max_depth: opt.MaxDepth = 6,
+    diffraction: opt.Diffraction = True,
+    predictor: opt.PredictorName = "",
     receivers: Annotated[
-        str, typer.Option(metavar="indoor|anywhere", help="Given that receivers are indoors, or outside in outage.")
+        str, typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage.")
     ] = "indoor",
-    strict: StrictOption = False,
-    height_band: HeightBandOption = None,
-    up: UpOption = None,
-    wall_height: WallHeightOption = None,
-    memory: MemoryOption = MEMORY_GB,
+    strict: opt.Strict = False,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
+    wall_height: opt.WallHeight = None,
+    memory: opt.Memory = MEMORY_GB,
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
-    position = parse_position(tx)
+    position = opt.parse_position(tx)
     suffixes = [_parse_format(name) for name in formats]
-    scene_settings = SceneSettings(material=parse_material(material))
-    trace_settings = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
-    from sionna_partial.maps.map_files import load_map
-
-    partial = load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    scene_settings = SceneSettings(material=opt.parse_material(material))
+    trace_settings = opt.trace_settings(frequency, max_depth, diffraction)
+    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with show_progress() as report:
         report(0.0, "loading the predictor")
-        from sionna_partial.coverage import predict_map
-        from sionna_partial.export import save_coverage
-
-        coverage = predict_map(
+        coverage = sp.predict_map(
             partial,
             position,
             rx_height_m=rx_height,
@@ -85,35 +61,32 @@ def predict(
             trace_settings=trace_settings,
             receivers=receivers,
             memory_gb=memory,
-            progress=lambda share, message: report(0.9 * share, message),
+            progress=lambda fraction, message: report(0.9 * fraction, message),
         )
         names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
         with atomic_files(out) as folder:
             for index, name in enumerate(names):
                 report(0.9 + 0.1 * index / len(names), f"writing {name}")
-                save_coverage(coverage, folder / name)
-    print_files([out / name for name in names])
+                sp.save_coverage(coverage, folder / name)
+    opt.print_files(out, names)
 
 
 def export_scene(
-    map_path: MapArgument,
+    map_path: opt.Map,
     out: Annotated[Path, typer.Option(help="New or empty folder for the scene.", show_default=False)],
-    material: MaterialOption = "",
-    frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
-    strict: StrictOption = False,
-    height_band: HeightBandOption = None,
-    up: UpOption = None,
-    wall_height: WallHeightOption = None,
+    material: opt.MaterialText = "",
+    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
+    strict: opt.Strict = False,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
+    wall_height: opt.WallHeight = None,
 ) -> None:
     """Write a map as a scene folder that stock Sionna RT loads."""
-    settings = SceneSettings(material=parse_material(material))
+    settings = SceneSettings(material=opt.parse_material(material))
     settings.material.require_frequency(frequency)
-    from sionna_partial.maps.map_files import load_map
-    from sionna_partial.scene.scene import export_scene as write_scene
-
-    partial = load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
-    scene = write_scene(partial, out, settings, frequency_hz=frequency)
-    print_files([scene])
+    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    scene = sp.export_scene(partial, out, settings, frequency_hz=frequency)
+    opt.print_files(scene.parent, [scene.name])
 
 
 def explore(
@@ -121,13 +94,13 @@ def explore(
     home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
     steps: Annotated[list[int], typer.Option(help="Robot steps, such as --steps 9 --steps 99.")] = [50, 100, 150, 200],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of the robot, and of the home that is made.")] = 0,
-    field_of_view: FieldOfViewOption = SensorSettings.field_of_view_deg,
-    range_m: RangeOption = SensorSettings.range_m,
-    range_noise: RangeNoiseOption = SensorSettings.range_noise_m,
-    drift: DriftOption = SensorSettings.drift_m_per_m,
-    missed_walls: MissedWallsOption = SensorSettings.missed_wall_fraction,
-    height_band: HeightBandOption = None,
-    up: UpOption = None,
+    field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
+    range_m: opt.Range = SensorSettings.range_m,
+    range_noise: opt.RangeNoise = SensorSettings.range_noise_m,
+    drift: opt.Drift = SensorSettings.drift_m_per_m,
+    missed_walls: opt.MissedWalls = SensorSettings.missed_wall_fraction,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
 ) -> None:
     """Explore a home with a robot, and write what it maps.
 
@@ -137,32 +110,26 @@ def explore(
     require_writable(out)
     with show_progress() as report:
         report(0.0, "reading the home" if home else "making a home")
-        from sionna_partial.maps.map_files import load_map, save_map
-        from sionna_partial.plots.exploration_plot import animate_exploration, plot_exploration
-        from sionna_partial.plots.style import figure_png
-        from sionna_partial.simulation.explore import explore_trajectory
-        from sionna_partial.simulation.homes import make_home
-
-        complete = load_map(home, height_band_m=height_band, up=up) if home else make_home(seed)
+        complete = sp.load_map(home, height_band_m=height_band, up=up) if home else sp.make_home(seed)
         frames = range(0, max(steps) + 1, max(1, max(steps) // FRAMES))
-        exploration = explore_trajectory(
+        exploration = sp.explore_trajectory(
             complete,
             sorted({*steps, *frames}),
             seed,
             sensor=sensor,
-            progress=lambda share, message: report(0.1 + 0.4 * share, message),
+            progress=lambda fraction, message: report(0.1 + 0.4 * fraction, message),
         )
         asked, suffix = exploration.at(steps), ".yaml" if complete.mesh is None else ".npz"
         maps = {f"steps_{count:03d}{suffix}": partial for count, partial in zip(asked.steps, asked.maps, strict=True)}
         maps[f"complete{suffix}"] = complete
         with atomic_files(out) as folder:
             for name, partial in maps.items():
-                save_map(partial, folder / name)
+                sp.save_map(partial, folder / name)
             report(0.6, "drawing exploration.png")
-            (folder / "exploration.png").write_bytes(figure_png(plot_exploration(asked)))
+            sp.plot_exploration(asked).savefig(folder / "exploration.png")
             report(0.7, "drawing exploration.gif")
-            animate_exploration(exploration, folder / "exploration.gif")
-    print_files([out / name for name in (*maps, "exploration.png", "exploration.gif")])
+            sp.animate_exploration(exploration, folder / "exploration.gif")
+    opt.print_files(out, [*maps, "exploration.png", "exploration.gif"])
 
 
 def demo(
@@ -174,13 +141,13 @@ def demo(
         report(0.0, "loading the predictor")
         from sionna_partial.demo import run_demo
 
-        result = run_demo(out, report)
-    typer.echo(result.table)
-    print_files(list(result.files.values()))
+        files, table = run_demo(out, report)
+    typer.echo(table)
+    opt.print_files(out, files)
 
 
 def info() -> None:
-    """Say what is found, what is missing, and what to do."""
+    """Report what is found, what is missing, and what to do."""
     from rich.console import Console
     from rich.table import Column, Table
 

@@ -1,4 +1,4 @@
-"""Figure of the placement of a transmitter: receivers, candidate positions, and the search."""
+"""Pictures of how a place for a transmitter was found."""
 
 from typing import Any
 
@@ -11,21 +11,22 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import PercentFormatter
 
-from sionna_partial.checks import require
 from sionna_partial.constants import CellState
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.style import BLUE, RED, STAR, corners_m, legend_below, shade, window_m
+from sionna_partial.plots.style import BLUE, RED, corners_m, shade, window_m
+from sionna_partial.settings import require
 
 _WIDTH_IN, _DPI = 9.0, 130
 _WALL, _UNKNOWN = "black", "0.86"
-_STAR: dict[str, Any] = STAR | {"markersize": 15}
+_STAR: dict[str, Any] = {"marker": "*", "markersize": 15, "markerfacecolor": "white", "markeredgecolor": "black"}
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
-    """Draw the map, the evaluated positions, the local searches, and the best position with its coverage.
+    """Draw the map, the places that were looked at, the climbs, and the best place with what it covers.
 
     Squares are receivers, in the colour of their probability of being covered from there (or of their mean gain), the
-    paler the less likely they are indoors. The search that found the best position is red, others are blue.
+    paler the less likely they are indoors. The way to the best place is red, other climbs are blue.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
+        Not known to pyplot: it need not be closed.
 
     Raises
     ------
@@ -48,11 +49,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     height = min(max((_WIDTH_IN - 1.8) * (y1 - y0) / (x1 - x0), 3.0), 14.0)
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
-    left, bottom, right, top = placement.partial.bounds_m
-    axis.set_facecolor(_UNKNOWN)
-    for state, grey, order in ((CellState.FREE, 255, 0.5), (CellState.WALL, 0, 3.0)):
-        picture, extent = shade(placement.partial.state == state, grey), (left, right, bottom, top)
-        axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
+    _draw_map(axis, placement.partial)
     squares = _draw_receivers(axis, placement)
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
@@ -74,15 +71,23 @@ def _headline(placement: TransmitterPlacement) -> str:
 
 
 def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:
-    """Part of the map that is drawn: what is known, and the receivers that count (x0, x1, y0, y1) [m]."""
+    """Part of the map that is drawn: what is known, and what counts (x0, x1, y0, y1) [m]."""
     partial, half = placement.partial, 0.5 * placement.spacing_m
     known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     counting_m = placement.rx_m[placement.weight > 0.2, :2]
     return window_m(np.vstack([known_m, counting_m - half, counting_m + half]))
 
 
+def _draw_map(axis: Axes, partial: PartialMap) -> None:
+    x0, y0, x1, y1 = partial.bounds_m
+    axis.set_facecolor(_UNKNOWN)
+    for state, grey, order in ((CellState.FREE, 255, 0.5), (CellState.WALL, 0, 3.0)):
+        picture, extent = shade(partial.state == state, grey), (x0, x1, y0, y1)
+        axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
+
+
 def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollection:
-    """Draw a square for each receiver, and return what the colour scale belongs to."""
+    """Draw a square for each receiver, and return them as what the colour scale is for."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.objective.name == "coverage"
@@ -104,17 +109,18 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
         x, y = climb.trajectory_m[:, :2].T
         axis.plot(x, y, color=RED if won else BLUE, marker="o", markersize=4, linewidth=1.8, zorder=5 if won else 4.5)
     x, y = placement.position_m[:2]
-    axis.plot(x, y, zorder=6, **_STAR)
+    axis.plot(x, y, linestyle="none", zorder=6, **_STAR)
 
 
 def _add_legend(figure: Figure) -> None:
-    start = {"marker": "o", "markerfacecolor": "white", "markeredgecolor": "black", "linestyle": "none"}
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], label="transmitter", **_STAR),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="best search"),
-        Line2D([], [], color=BLUE, marker="o", markersize=4, label="other search"),
-        Line2D([], [], label="evaluated", **start),  # type: ignore[arg-type]
+    handles = [
+        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="way there"),
+        Line2D([], [], color=BLUE, marker="o", markersize=4, label="other climb"),
+        Line2D(
+            [], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="looked at"
+        ),
         Patch(color=_WALL, label="wall"),
         Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
     ]
-    legend_below(figure, handles)
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)

@@ -1,0 +1,107 @@
+"""Options that subcommands share, and numbers and materials that are parsed from text."""
+
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperCommand
+
+from sionna_partial.settings import Material, TraceSettings
+
+_MAP_HELP = "ROS map_server YAML, exported scene folder, .npz, or mesh."
+_BAND_HELP = "Of a mesh: z between which its surfaces are walls [m]."
+_MATERIAL_HELP = "ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
+
+Map = Annotated[Path, typer.Argument(metavar="MAP", help=_MAP_HELP, show_default=False)]
+Strict = Annotated[bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")]
+HeightBand = Annotated[
+    tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help=_BAND_HELP, show_default=False)
+]
+Up = Annotated[str | None, typer.Option(metavar="y|z", help="Of a mesh: the axis that points up.", show_default=False)]
+WallHeight = Annotated[
+    float | None, typer.Option(help="Height of walls and ceiling [m]. Default: the map's.", show_default=False)
+]
+MaterialText = Annotated[str, typer.Option(help=_MATERIAL_HELP)]
+Frequency = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
+MaxDepth = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
+Diffraction = Annotated[
+    bool,
+    typer.Option("--diffraction/--no-diffraction", help="Diffraction at vertical edges of walls."),
+]
+RxHeight = Annotated[float, typer.Option(help="Height of the receivers [m].")]
+Memory = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
+PredictorName = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
+FieldOfView = Annotated[float, typer.Option(help="Field of view of the robot, up to 360 [degree].")]
+Range = Annotated[float, typer.Option("--range", help="Range of its sensor [m].")]
+RangeNoise = Annotated[float, typer.Option(help="Standard deviation of its range readings [m].")]
+Drift = Annotated[float, typer.Option(help="Odometry drift per metre travelled [1].")]
+MissedWalls = Annotated[float, typer.Option(help="Fraction of walls that it does not detect, as glass [1].")]
+
+
+class TransmitterCommand(TyperCommand):
+    """Takes `--tx X Y` and `--tx X Y Z`: an option with two or three values."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Join the numbers after --tx to one value."""
+        return super().parse_args(ctx, join_numbers(args, "--tx"))
+
+
+def join_numbers(args: Sequence[str], option: str) -> list[str]:
+    """Join the numbers that follow `option`, negative ones too, to the one value that a parser can take."""
+    joined: list[str] = []
+    rest = list(args)
+    while rest:
+        arg = rest.pop(0)
+        if arg.startswith(f"{option}="):
+            rest.insert(0, arg.removeprefix(f"{option}="))
+            arg = option
+        if arg == option:
+            words = list(itertools.takewhile(_is_number, rest)) or rest[:1]
+            del rest[: len(words)]
+            parse_position(" ".join(words))
+            arg = f"{option}={' '.join(words)}"
+        joined.append(arg)
+    return joined
+
+
+def parse_position(text: str) -> tuple[float, ...]:
+    """Transmitter position from "X Y" or "X Y Z" [m]."""
+    words = text.replace(",", " ").split()
+    if len(words) not in (2, 3) or not all(map(_is_number, words)):
+        raise typer.BadParameter(f"--tx {text!r} is not a position: give --tx X Y or --tx X Y Z in metres.")
+    return tuple(map(float, words))
+
+
+def parse_material(text: str) -> Material:
+    """Material from an ITU name or "permittivity,conductivity,thickness"; the default for ""."""
+    words = text.split(",")
+    if not text or len(words) == 1:
+        return Material(itu=text) if text else Material()
+    if len(words) != 3 or not all(map(_is_number, words)):
+        raise typer.BadParameter(
+            f"--material {text!r} is neither an ITU name nor permittivity,conductivity,thickness: "
+            "give for example concrete, or 2.94,0.1226,0.1."
+        )
+    permittivity, conductivity_s_m, thickness_m = map(float, words)
+    return Material(permittivity, conductivity_s_m, thickness_m)
+
+
+def trace_settings(frequency_hz: float, max_depth: int, diffraction: bool) -> TraceSettings:
+    """Trace settings of a subcommand; with diffraction where it is the default."""
+    return TraceSettings(frequency_hz, max_depth, diffraction=None if diffraction else False)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def print_files(folder: Path, names: Sequence[str]) -> None:
+    """Print the files that were written."""
+    for name in names:
+        typer.echo(f"wrote {folder / name}")

@@ -1,0 +1,140 @@
+"""Subcommands that fit a material or a transmitter position: calibrate, place."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import sionna_partial as sp
+from sionna_partial.cli import options as opt
+from sionna_partial.cli.progress import show_progress
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
+from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.settings import Objective, SceneSettings
+
+TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
+"""Angles of incidence of the printed losses [degrees]."""
+
+_CSV_HELP = "Columns tx_x,tx_y,tx_z,rx_x,rx_y,rx_z [m], gain_db [dB]."
+_OBJECTIVE_HELP = "Mean predicted coverage, or the gain of the worst tenth of the receivers."
+
+
+def calibrate(
+    map_path: opt.Map,
+    measurements: Annotated[Path, typer.Option(metavar="CSV", help=_CSV_HELP, show_default=False)],
+    out: Annotated[
+        Path, typer.Option(help="Folder for the calibrated map, the numbers and a picture.", show_default=False)
+    ],
+    material: opt.MaterialText = "",
+    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
+    max_depth: opt.MaxDepth = 6,
+    diffraction: opt.Diffraction = True,
+    strict: opt.Strict = False,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
+    wall_height: opt.WallHeight = None,
+) -> None:
+    """Find the material of a building from measured path gains.
+
+    The folder --out gets the map with the calibrated material (predict takes it), the numbers as JSON, and a picture.
+    """
+    scene_settings = SceneSettings(material=opt.parse_material(material))
+    settings = opt.trace_settings(frequency, max_depth, diffraction)
+    from sionna_partial.measurements.measurements import measurements_of
+
+    measured = measurements_of(measurements)
+    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "loading Sionna RT")
+        result = sp.calibrate_materials(
+            partial,
+            measured,
+            start=scene_settings.material if material else None,
+            settings=settings,
+            scene_settings=scene_settings,
+            progress=report,
+        )
+        with atomic_files(out) as folder:
+            sp.save_map(result.scene, folder / "calibrated.npz")
+            (folder / "calibration.json").write_text(json.dumps(result.record(), indent=1) + "\n", encoding="utf-8")
+            sp.plot_calibration(result).savefig(folder / "calibration.png")
+    typer.echo(_table(result))
+    opt.print_files(out, ["calibrated.npz", "calibration.json", "calibration.png"])
+
+
+def place(
+    map_path: opt.Map,
+    out: Annotated[Path, typer.Option(help="Folder for the numbers and a picture.", show_default=False)],
+    objective: Annotated[Objective, typer.Option(help=_OBJECTIVE_HELP)] = "coverage",
+    threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
+    height: Annotated[float, typer.Option(help="Height of the transmitter [m].")] = DEFAULT_HEIGHT_M,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
+    seed: Annotated[int, typer.Option(help="Seed of the positions that are compared.")] = 0,
+    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
+    material: opt.MaterialText = "",
+    max_depth: opt.MaxDepth = 6,
+    diffraction: opt.Diffraction = True,
+    predictor: opt.PredictorName = "",
+    strict: opt.Strict = False,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
+    wall_height: opt.WallHeight = None,
+) -> None:
+    """Find a good position for a transmitter on a partial map.
+
+    The folder --out gets the position and the search as JSON, and a picture.
+    """
+    scene_settings = SceneSettings(material=opt.parse_material(material))
+    trace_settings = opt.trace_settings(frequency, max_depth, diffraction)
+    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    require_writable(out)
+    with show_progress() as report:
+        report(0.0, "loading the predictor")
+        result = sp.place_transmitter(
+            partial,
+            objective=objective,
+            threshold_db=threshold,
+            height_m=height,
+            seed=seed,
+            rx_height_m=rx_height,
+            predictor=predictor or None,
+            scene_settings=scene_settings,
+            trace_settings=trace_settings,
+            progress=report,
+        )
+        with atomic_files(out) as folder:
+            result.save(folder / "placement.json")
+            sp.plot_placement(result).savefig(folder / "placement.png")
+    x, y, z = result.position_m
+    if result.objective.name == "coverage":
+        score = f"{result.score:.1%} of the receivers are predicted above {result.objective.threshold_db:g} dB"
+    else:
+        score = f"the worst tenth of the receivers is predicted at {result.score:.1f} dB"
+    typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {score}")
+    opt.print_files(out, ["placement.json", "placement.png"])
+
+
+def _table(result: "sp.MaterialCalibration") -> str:
+    """Tabulate the materials, and how well they explain the measurements."""
+    numbers = result.record()
+    lines = []
+    for which, (found, start) in enumerate(zip(result.materials, result.start, strict=True)):
+        own = "" if len(result.materials) == 1 else f"[{which}]"
+        stds = [float(std[which] if own else std) for std in (result.permittivity_std, result.conductivity_std)]
+        rows = (
+            ("permittivity", found.relative_permittivity, stds[0], "", start.relative_permittivity),
+            ("conductivity", found.conductivity_s_m, stds[1], " S/m", start.conductivity_s_m),
+        )
+        for name, value, std, unit, before in rows:
+            note = "   CANNOT BE DETERMINED" if f"{name}{own}" in result.undetermined else ""
+            lines.append(f"{name + own:<18}{value:.4g} +- {std:.2g}{unit} (start {before:.4g}{unit}){note}")
+        losses = zip(*result.reflection_loss_db(TABLE_ANGLES_DEG, which=which), TABLE_ANGLES_DEG, strict=True)
+        texts = (f"{loss:.1f} +- {std:.1f} dB at {angle:g} deg" for loss, std, angle in losses)
+        lines.append(f"{'reflection' + own:<18}{', '.join(texts)}")
+    left = ", ".join(f"{count} {reason}" for reason, count in result.left_out.items() if count) or "none"
+    rmse = numbers["rmse_db"]
+    lines.append(f"{'links':<18}{numbers['links_used']} used; left out: {left}")
+    lines.append(f"{'traced - measured':<18}{rmse['before']:.2f} dB before, {rmse['after']:.2f} dB after (RMS)")
+    return "\n".join([*lines, f"{'noise':<18}{result.noise_db:.1f} dB"])
