@@ -24,7 +24,7 @@ from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.style import figure_png
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
-"""What CSV and GeoTIFF hold; `wall_parts` serves pictures alone."""
+"""Variables in CSV and GeoTIFF; `wall_parts` is for pictures alone."""
 
 LINK_STATES = ("link_state", "partial_link_state")
 
@@ -56,24 +56,26 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
         For a Dataset that is no coverage map.
     OutputError
         For another suffix, or if writing fails; nothing half written is left behind.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> sp.save_coverage(coverage, "coverage.nc")
+    >>> sp.save_coverage(coverage, "coverage.csv")
     """
     require_coverage(coverage)
     target = output_path(path)
     suffix = target.suffix.lower()
-    if suffix not in _WRITERS:
-        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(_WRITERS)}.")
-    _WRITERS[suffix](coverage, target)
-
-
-def _writer(encode: Callable[[xr.Dataset], bytes]) -> Callable[[xr.Dataset, Path], None]:
-    """Make a writer of an encoder: the file is ready in memory before the disk is touched."""
-
-    def write(coverage: xr.Dataset, path: Path) -> None:
-        content = encode(coverage)
-        with atomic_write(path) as stream:
+    if suffix not in FORMATS:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(FORMATS)}.")
+    if suffix == ".yaml":
+        _write_ros_map(coverage, target)
+    else:
+        content = _ENCODERS[suffix](coverage)  # complete before the disk is touched
+        with atomic_write(target) as stream:
             stream.write(content)
-
-    return write
 
 
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:
@@ -135,10 +137,6 @@ def _encode_csv(coverage: xr.Dataset) -> bytes:
     return bytes(table.to_csv(index=False, lineterminator="\n"), "utf-8")
 
 
-def _encode_png(coverage: xr.Dataset) -> bytes:
-    return figure_png(plot_coverage(coverage))
-
-
 def _write_ros_map(coverage: xr.Dataset, path: Path) -> None:
     """Write the YAML and its PGM; if one cannot be written, neither is."""
     spacing_m = float(coverage.attrs["spacing_m"])
@@ -162,13 +160,12 @@ def _write_ros_map(coverage: xr.Dataset, path: Path) -> None:
         picture.write(header + np.flipud(percent).tobytes())
 
 
-_WRITERS: dict[str, Callable[[xr.Dataset, Path], None]] = {
-    ".nc": _writer(_encode_netcdf),
-    ".tif": _writer(_encode_geotiff),
-    ".csv": _writer(_encode_csv),
-    ".png": _writer(_encode_png),
-    ".yaml": _write_ros_map,
+_ENCODERS: dict[str, Callable[[xr.Dataset], bytes]] = {
+    ".nc": _encode_netcdf,
+    ".tif": _encode_geotiff,
+    ".csv": _encode_csv,
+    ".png": lambda coverage: figure_png(plot_coverage(coverage)),
 }
 
-FORMATS = tuple(_WRITERS)
-"""Suffixes that `save_coverage` knows."""
+FORMATS = (*_ENCODERS, ".yaml")
+"""Suffixes that `save_coverage` accepts."""

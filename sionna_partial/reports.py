@@ -1,15 +1,15 @@
-"""Evaluations as text and files: Evaluation -> report.md, report.json, stages.png, calibration.png."""
+"""Reports of evaluations: Evaluation -> report.md, report.json, stages.png, calibration.png."""
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from sionna_partial.datasets.link_table import stage_name
 from sionna_partial.evaluation.evaluate import Difference, Evaluation, Row
-from sionna_partial.evaluation.metrics import DEFINITIONS, Metrics
+from sionna_partial.evaluation.metrics import DEFINITIONS
 from sionna_partial.files import atomic_files
 
 REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")
@@ -24,22 +24,12 @@ _COLUMNS = {
     "calibration_error": ("calibration error", ".3f"),
     "coverage_90": ("in 90 %", ".3f"),
 }
-_WHERE = {"indoor": "receivers indoors", "anywhere": "receivers anywhere on the map, outside in outage"}
+_WHERE = {"indoor": "receivers indoors", "anywhere": "receivers anywhere on the map, outage outdoors"}
 _MISSING = "-"
 
 
 def summary(evaluation: Evaluation) -> str:
-    """Return accuracy and gain error on test homes, a column for each stage: what fits a terminal.
-
-    Parameters
-    ----------
-    evaluation : Evaluation
-
-    Returns
-    -------
-    str
-        Markdown with aligned columns.
-    """
+    """Return accuracy and gain error on test homes, a column for each stage, as Markdown that fits a terminal."""
     tables = []
     for receivers, title in _WHERE.items():
         rows = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
@@ -50,16 +40,7 @@ def summary(evaluation: Evaluation) -> str:
 
 
 def markdown(evaluation: Evaluation) -> str:
-    """Return the whole report, definitions first.
-
-    Parameters
-    ----------
-    evaluation : Evaluation
-
-    Returns
-    -------
-    str
-    """
+    """Return the whole report, definitions first."""
     counts = " and ".join(f"{len(names)} {kind}" for kind, names in evaluation.homes.items())
     head = [
         f"# Evaluation of predictor `{evaluation.predictor}`",
@@ -67,27 +48,18 @@ def markdown(evaluation: Evaluation) -> str:
         "was not trained on.",
         *evaluation.notes,
         "\n".join(f"- **{_COLUMNS[name][0]}**: {text}" for name, text in DEFINITIONS.items()),
-        f"`{_MISSING}` stands where there is no finite value: a likelihood where a trace answers without spread, or a "
-        "model holds a state impossible that occurs.",
+        f"`{_MISSING}` stands where there is no finite value, as of the likelihood of a gain that is predicted "
+        "without standard deviation.",
     ]
     sections = [_metrics_section(evaluation, "test", ends_seen="all")]
     sections += [_metrics_section(evaluation, "test", ends_seen=ends) for ends in ("both", "one", "none")]
     if "train" in evaluation.homes:
         sections.append(_metrics_section(evaluation, "train", ends_seen="all"))
-    return "\n\n".join([*head, *sections, *_anywhere(evaluation, evaluation.homes), *_differences(evaluation)]) + "\n"
+    return "\n\n".join([*head, *sections, *_anywhere(evaluation), *_differences(evaluation)]) + "\n"
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the report as JSON has it: null where there is no finite value.
-
-    Parameters
-    ----------
-    evaluation : Evaluation
-
-    Returns
-    -------
-    dict
-    """
+    """Return the report as JSON has it: null where there is no finite value."""
     return {
         "predictor": evaluation.predictor,
         "sha256": evaluation.fingerprint,
@@ -95,7 +67,10 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         "notes": list(evaluation.notes),
         "definitions": DEFINITIONS,
         "rows": [{**asdict(row), "metrics": row.metrics.as_json()} for row in evaluation.rows],
-        "differences": [_finite(asdict(difference)) for difference in evaluation.differences],
+        "differences": [
+            {name: None if value != value else value for name, value in asdict(each).items()}
+            for each in evaluation.differences
+        ],
         "calibration": {
             f"{stage:g}": {
                 "links": calibration.state.links.tolist(),
@@ -109,53 +84,21 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 
 def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """Write `report.md`, `report.json`, `stages.png` and `calibration.png`, all or none.
-
-    Parameters
-    ----------
-    evaluation : Evaluation
-    folder : pathlib.Path
-
-    Returns
-    -------
-    list of pathlib.Path
-        The files.
-
-    Raises
-    ------
-    OutputError
-        If writing fails.
-    """
+    """Write `REPORT_FILES`, all or none, and return them."""
     from sionna_partial.plots.evaluation_plot import plot_reliability, plot_stages
     from sionna_partial.plots.style import figure_png
 
-    contents = (
-        markdown(evaluation).encode(),
-        (json.dumps(as_json(evaluation), indent=2, allow_nan=False) + "\n").encode(),
-        figure_png(plot_stages(evaluation)),
-        figure_png(plot_reliability(evaluation.calibrations)),
-    )
-    with atomic_files(folder) as place:
+    text = json.dumps(as_json(evaluation), indent=2, allow_nan=False) + "\n"
+    figures = figure_png(plot_stages(evaluation)), figure_png(plot_reliability(evaluation.calibrations))
+    contents = (markdown(evaluation).encode(), text.encode(), *figures)
+    with atomic_files(folder) as files:
         for name, content in zip(REPORT_FILES, contents, strict=True):
-            (place / name).write_bytes(content)
+            (files / name).write_bytes(content)
     return [folder / name for name in REPORT_FILES]
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, names: int = 1) -> str:
-    """Lay out a Markdown table, its columns aligned for the eye.
-
-    Parameters
-    ----------
-    header : sequence of str
-    rows : iterable of sequences of str
-        As long as `header`.
-    names : int
-        Number of columns, from the left, that are aligned to the left; the others hold figures.
-
-    Returns
-    -------
-    str
-    """
+    """Return a Markdown table with aligned columns: the first `names` to the left, figures to the right."""
     cells = [list(header), *map(list, rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     sides = [str.ljust] * names + [str.rjust] * (len(widths) - names)
@@ -170,9 +113,9 @@ def _metrics_section(evaluation: Evaluation, homes: str, ends_seen: str) -> str:
     return _section(f"{homes.capitalize()} homes, {_WHERE['indoor']}{whose}", rows)
 
 
-def _anywhere(evaluation: Evaluation, kinds: Iterable[str]) -> Iterable[str]:
-    """Sections on receivers that may be outside, of "test" or "train" homes."""
-    for homes in kinds:
+def _anywhere(evaluation: Evaluation) -> Iterable[str]:
+    """Sections on receivers that may be outside."""
+    for homes in evaluation.homes:
         rows = evaluation.select(homes=homes, receivers="anywhere", ends_seen="all")
         if rows:
             yield _section(f"{homes.capitalize()} homes, {_WHERE['anywhere']}", rows)
@@ -180,10 +123,9 @@ def _anywhere(evaluation: Evaluation, kinds: Iterable[str]) -> Iterable[str]:
 
 def _differences(evaluation: Evaluation) -> Iterable[str]:
     """Sections on paired differences."""
-    for receivers, first in (("indoor", "predictor"), ("anywhere", "with indoor model")):
+    for receivers, where, first in (("indoor", "indoors", "predictor"), ("anywhere", "anywhere", "with indoor model")):
         rows = [each for each in evaluation.differences if each.receivers == receivers]
         if rows:
-            where = "indoors" if receivers == "indoor" else "anywhere"
             title = f"Test homes, receivers {where}: {first} minus other, mean and standard error over homes"
             header = ["stage", "other", "homes", "accuracy", "RMSE [dB]"]
             yield f"### {title}\n\n{markdown_table(header, map(_difference_cells, rows), names=2)}"
@@ -200,13 +142,16 @@ def _by_stage(rows: Sequence[Row]) -> str:
 
 def _section(title: str, rows: Sequence[Row]) -> str:
     header = ["stage", "answer", *(label for label, _ in _COLUMNS.values())]
-    cells = ([stage_name(row.stage), row.answer, *_cells(row.metrics)] for row in rows if row.metrics.links)
+    cells = [
+        [
+            stage_name(row.stage),
+            row.answer,
+            *(_text(getattr(row.metrics, name), _COLUMNS[name][1]) for name in _COLUMNS),
+        ]
+        for row in rows
+        if row.metrics.links
+    ]
     return f"### {title}\n\n{markdown_table(header, cells, names=2)}"
-
-
-def _cells(metrics: Metrics) -> list[str]:
-    values = {field.name: getattr(metrics, field.name) for field in fields(metrics)}
-    return [_text(values[name], form) for name, (_, form) in _COLUMNS.items()]
 
 
 def _difference_cells(each: Difference) -> list[str]:
@@ -217,7 +162,3 @@ def _difference_cells(each: Difference) -> list[str]:
 
 def _text(value: float, form: str) -> str:
     return _MISSING if math.isnan(value) else format(value, form)
-
-
-def _finite(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in values.items()}

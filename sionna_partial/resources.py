@@ -7,7 +7,7 @@ from typing import Any
 from sionna_partial.errors import SceneError
 
 HOMES_FILE = "homes.json"
-"""File in the scenes folder that says of each home how it was made, and where its transmitter stands."""
+"""File in the scenes folder with the origin of each home and its transmitter position."""
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -16,35 +16,17 @@ PREDICTORS_FOLDER = _PACKAGE / "predictors"
 
 
 def scenes_folder() -> Path:
-    """Folder of the demo scenes: inside the installed package, or at the top of the repository.
-
-    Returns
-    -------
-    pathlib.Path
-
-    Raises
-    ------
-    SceneError
-        If there is none.
-    """
-    for place in (_PACKAGE / "scenes", _PACKAGE.parent / "scenes"):
-        if (place / HOMES_FILE).is_file():
-            return place
+    """Return the folder of the demo scenes: inside the installed package, or at the top of the repository."""
+    for folder in (_PACKAGE / "scenes", _PACKAGE.parent / "scenes"):
+        if (folder / HOMES_FILE).is_file():
+            return folder
     raise SceneError(f"The demo scenes are missing in '{_PACKAGE / 'scenes'}': install sionna-partial again.")
 
 
 def demo_homes() -> dict[str, dict[str, Any]]:
-    """Describe the demo homes, each a folder in `scenes_folder`.
+    """Describe the demo homes, each a folder in `scenes_folder`, by name.
 
-    Returns
-    -------
-    dict
-        By name; "transmitter" is the position (x, y, z) [m], the rest is how the home was made.
-
-    Raises
-    ------
-    SceneError
-        If there are none, or their description is damaged.
+    "transmitter" is the position (x, y, z) [m], the rest is how the home was made.
     """
     path = scenes_folder() / HOMES_FILE
     try:

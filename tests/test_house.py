@@ -20,7 +20,18 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
-    "foundations": ("constants", "errors", "resources", "settings", "files", "planar", "cores", "llvm", "llvm_probe"),
+    "foundations": (
+        "constants",
+        "errors",
+        "checks",
+        "settings",
+        "resources",
+        "files",
+        "planar",
+        "cores",
+        "llvm",
+        "llvm_probe",
+    ),
     "maps": (
         *("mesh.cut", "mesh.mesh", "partial_map", "map_turn", "ros_map"),
         *("mesh.files", "mesh.mitsuba_xml", "mesh.cells", "map_files"),
@@ -51,12 +62,9 @@ ROOMS = {
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
-    "plots": (
-        *("figures", "coverage_plot", "exploration_plot", "reliability_plot", "material_plot", "placement_plot"),
-        "evaluation_plot",
-    ),
+    "plots": (*("style", "coverage_plot", "exploration_plot", "material_plot", "placement_plot", "evaluation_plot"),),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("shell", "prediction", "learning", "inverse", "app"),
+    "cli": ("options", "progress", "prediction", "learning", "planning", "app"),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
@@ -71,22 +79,13 @@ IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit"}
 """Imported where they are needed, after `load_llvm`, never at the top of a module."""
 
 HEAVY = IN_FUNCTIONS | {
-    *(
-        "numpy",
-        "scipy",
-        "numba",
-        "skimage",
-        "shapely",
-        "trimesh",
-        "matplotlib",
-        "xarray",
-        "rasterio",
-        "h5netcdf",
-        "h5py",
-    ),
-    *("PIL", "yaml", "pandas", "pyarrow", "dask", "distributed"),
+    *("numpy", "scipy", "numba", "skimage", "shapely", "trimesh", "matplotlib", "xarray", "rasterio", "h5netcdf"),
+    *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed"),
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
+
+PLOTS_ARE_FOR = ("plots.", "cli.", "export", "demo", "reports")
+"""Beginnings of the modules that may import plots: they are a leaf."""
 
 NOT_IMPORTED = {
     "dask": "what distributed is the scheduler of; the cluster's commands are `dask scheduler` and `dask worker`",
@@ -119,6 +118,12 @@ def imported_at_the_top(tree: ast.Module) -> set[str]:
     return {name.partition(".")[0] for node in outside for name in imported(node)}
 
 
+def own_imports(module: str) -> set[str]:
+    """Modules of the package that a module imports."""
+    prefix = "sionna_partial."
+    return {name.removeprefix(prefix) for name in imported(tree_of(module)) if name.startswith(prefix)}
+
+
 def declared(kind: str) -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = project["dependencies"] if kind == "run" else project["optional-dependencies"][kind]
@@ -143,12 +148,25 @@ class TestOneDirection:
 
     @pytest.mark.parametrize("module", MODULES)
     def test_module_imports_only_from_those_before_it(self, module: str) -> None:
-        names = {
-            name.removeprefix("sionna_partial.")
-            for name in imported(tree_of(module))
-            if name.startswith("sionna_partial.")
-        }
-        assert names <= set(MODULES[: MODULES.index(module)])
+        assert own_imports(module) <= set(MODULES[: MODULES.index(module)])
+
+    @pytest.mark.parametrize("module", MODULES)
+    def test_room_imports_only_from_rooms_before_it(self, module: str) -> None:
+        order, room_of = list(ROOMS), dict(zip(MODULES, (room for room in ROOMS for _ in ROOMS[room]), strict=True))
+        rooms = {room_of[name] for name in own_imports(module)}
+        assert rooms <= set(order[: order.index(room_of[module]) + 1])
+
+    def test_plots_are_a_leaf(self) -> None:
+        users = [module for module in MODULES if any(name.startswith("plots.") for name in own_imports(module))]
+        assert [module for module in users if not module.startswith(PLOTS_ARE_FOR)] == []
+
+    def test_only_the_command_line_uses_the_lazy_names(self) -> None:
+        for module in MODULES:
+            lazy = any(
+                isinstance(node, ast.Import) and node.names[0].name == "sionna_partial"
+                for node in ast.walk(tree_of(module))
+            )
+            assert not lazy or module.startswith("cli."), module
 
     @pytest.mark.parametrize("module", MODULES)
     def test_libraries_that_need_llvm_first_are_imported_in_functions(self, module: str) -> None:
@@ -162,17 +180,8 @@ class TestLightImports:
     @pytest.mark.parametrize(
         "command",
         [
-            "",
-            "predict",
-            "export-scene",
-            "explore",
-            "dataset",
-            "train",
-            "evaluate",
-            "calibrate",
-            "place",
-            "demo",
-            "info",
+            *("", "predict", "export-scene", "explore", "dataset", "train", "evaluate"),
+            *("calibrate", "place", "demo", "info"),
         ],
     )
     def test_help(self, command: str) -> None:
@@ -190,17 +199,6 @@ class TestPublicNames:
         assert not isinstance(value, ModuleType)
         assert getattr(value, "__name__", name) == name
         assert name in dir(sionna_partial)
-
-    def test_names_for_type_checkers_are_those_that_load(self) -> None:
-        tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
-        typed = {
-            alias.name: str(node.module).removeprefix("sionna_partial.")
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ImportFrom) and str(node.module).startswith("sionna_partial.")
-            for alias in node.names
-        }
-        assert typed == sionna_partial._MODULE_OF
-        assert {*typed, "__version__"} == set(sionna_partial.__all__)
 
     def test_unknown_name(self) -> None:
         with pytest.raises(AttributeError, match="module 'sionna_partial' has no attribute 'teleport'"):

@@ -32,7 +32,7 @@ def tables(text):
 class TestSummary:
     def test_figures_stand_where_they_belong(self, evaluation):
         found = tables(summary(evaluation))
-        for receivers, where in (("indoor", "indoors"), ("anywhere", "anywhere on the map, outside in outage")):
+        for receivers, where in (("indoor", "indoors"), ("anywhere", "anywhere on the map, outage outdoors")):
             rows = found[f"Test homes (2), receivers {where}"]
             assert rows[0] == ["accuracy, RMSE", "0 steps", "100 steps"]
             measured = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
@@ -95,8 +95,8 @@ class TestMarkdown:
             "Test homes, receivers indoors, one end seen",
             "Test homes, receivers indoors, no end seen",
             "Train homes, receivers indoors",
-            "Test homes, receivers anywhere on the map, outside in outage",
-            "Train homes, receivers anywhere on the map, outside in outage",
+            "Test homes, receivers anywhere on the map, outage outdoors",
+            "Train homes, receivers anywhere on the map, outage outdoors",
         ]
 
     def test_no_row_without_links(self, evaluation):

@@ -30,7 +30,7 @@ def names(wheel: Path) -> list[str]:
 
 def test_package_is_whole(names: list[str]) -> None:
     sources = {f"sionna_partial/{path.name}" for path in (ROOT / "sionna_partial").glob("*.py")}
-    assert sources | {"sionna_partial/py.typed"} <= set(names)
+    assert sources | {"sionna_partial/py.typed", "sionna_partial/__init__.pyi"} <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in names)
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, cast
 import typer
 
 import sionna_partial as sp
-from sionna_partial.cli import options as opt
+import sionna_partial.cli.options as opt
 from sionna_partial.cli.progress import show_progress, show_rate
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.files import require_writable

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 import sionna_partial as sp
-from sionna_partial.cli import options as opt
+import sionna_partial.cli.options as opt
 from sionna_partial.cli.progress import show_progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.files import atomic_files, require_writable

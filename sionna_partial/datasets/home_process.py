@@ -110,7 +110,7 @@ def run_home(task: HomeTask) -> HomeResult:
         return HomeResult("done")
     lines: list[str] = []
     for _ in range(ATTEMPTS):
-        process = next((idle for idle in iter(_take_idle, None) if idle.is_alive), None) or _HomeProcess()
+        process = next((each for each in iter(_take_idle, None) if each.is_alive), None) or _HomeProcess()
         if _stopped.is_set():
             process.close()
             return HomeResult("failed", "stopped")
@@ -136,8 +136,8 @@ def stop_homes() -> None:
     _stopped.set()
     for process in list(_alive):
         process.kill()
-    while (process := _take_idle()) is not None:
-        process.close()
+    for idle in iter(_take_idle, None):
+        idle.close()
 
 
 def serve(descriptor: int) -> None:
