@@ -111,10 +111,8 @@ def train(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> settings = sp.DatasetSettings(links_per_home=4, stages=(0, 5))
-    >>> report = sp.build_dataset("links", [7], settings, workers=1)
     >>> from sionna_partial.settings import PredictorSettings
-    >>> run = sp.train("links", test_fraction=0.0, settings=PredictorSettings("paper"))
+    >>> run = sp.train("links", test_fraction=0.0, settings=PredictorSettings("paper"))  # that build_dataset wrote
     >>> run.train_homes
     ('make_home(7)',)
     """

@@ -139,9 +139,7 @@ def evaluate(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> settings = sp.DatasetSettings(links_per_home=4, stages=(0, 5))
-    >>> report = sp.build_dataset("links", [7], settings, workers=1)
-    >>> evaluation = sp.evaluate("paper", "links")
+    >>> evaluation = sp.evaluate("paper", "links")  # that build_dataset wrote
     >>> (row,) = evaluation.select(stage=5, receivers="indoor", ends_seen="all", answer="predictor")
     >>> row.metrics.links
     4

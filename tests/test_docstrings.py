@@ -1,0 +1,27 @@
+"""The examples in the docstrings of the public names run as they stand."""
+
+import doctest
+from pathlib import Path
+
+import pytest
+from predictor_links import QUIET
+
+import sionna_partial as sp
+
+pytestmark = QUIET
+
+CHAINS = (("build_dataset", "read_dataset", "train", "evaluate"), ("save_coverage", "plot_coverage"))
+"""Names whose examples read the files that the first of them wrote."""
+
+ALONE = tuple((name,) for name in sp.__all__ if name not in {*sum(CHAINS, ()), "__version__"})
+
+
+@pytest.mark.parametrize("names", [*CHAINS, *ALONE], ids=lambda names: names[0])
+def test_examples(names: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    finder, report = doctest.DocTestFinder(exclude_empty=True), list[str]()
+    for name in names:
+        for example in finder.find(getattr(sp, name), name, globs={}):
+            runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+            runner.run(example, out=report.append)
+            assert runner.summarize(verbose=False).failed == 0, "".join(report)

@@ -1,0 +1,35 @@
+"""The shipped predictor, evaluated on two shipped homes that it was not trained on, is as good as it was or better."""
+
+import pytest
+from predictor_links import QUIET
+
+import sionna_partial as sp
+from sionna_partial.datasets.home_links import home_links
+from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.evaluation.evaluate import Evaluation
+from sionna_partial.resources import scenes_folder
+
+pytestmark = QUIET
+
+HOMES = ("apartment", "house")
+SETTINGS = sp.DatasetSettings(links_per_home=200, transmitters_per_home=2, stages=(50, 100))
+
+
+@pytest.fixture(scope="module")
+def evaluation() -> Evaluation:
+    tables = (home_links(sp.load_map(scenes_folder() / name / "complete"), name, SETTINGS) for name in HOMES)
+    return sp.evaluate(None, LinkTable.concatenate(tables))
+
+
+@pytest.mark.parametrize(
+    ("receivers", "answer", "stage", "accuracy", "rmse_db"),
+    [
+        ("indoor", "predictor", 50, 0.0, 99.0),
+    ],
+)
+def test_figures_of_merit(
+    evaluation: Evaluation, receivers: str, answer: str, stage: int, accuracy: float, rmse_db: float
+) -> None:
+    (row,) = evaluation.select(receivers=receivers, answer=answer, stage=stage, ends_seen="all")
+    assert row.metrics.accuracy >= accuracy - 0.05
+    assert row.metrics.rmse_db <= rmse_db + 3.0
