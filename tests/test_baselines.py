@@ -20,8 +20,6 @@ from sionna_partial.evaluation.baselines import (
 )
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.paper_networks import OUTPUT_WIDTHS
-from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
 
@@ -72,9 +70,6 @@ class TestBaselines:
         assert found.distance.settings == UNTRAINED
         assert set(found.distance.model.output) == set(OUTPUT_WIDTHS)
 
-    def test_homes_are_recorded(self, fitted):
-        assert fitted.distance.homes == ("home 0", "home 1")
-
     def test_save_and_load(self, fitted, tmp_path):
         fitted.save(tmp_path)
         loaded = Baselines.load(tmp_path)
@@ -89,11 +84,6 @@ class TestBaselines:
         message = f"path = '{path}' cannot be read"
         with pytest.raises(PredictorError, match=re.escape(message) + ".*train the predictor beside it anew"):
             Baselines.load(tmp_path)
-
-    def test_shipped(self):
-        shipped = Baselines.load(PREDICTORS_FOLDER)
-        assert shipped.distance.homes == Predictor.load().homes
-        assert sum(shipped.majority.fractions) == pytest.approx(1.0)
 
 
 class TestNothingSeen:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
 from sionna_partial import __version__, cli, info
-from sionna_partial.cli.options import join_numbers, parse_material
+from sionna_partial.cli.options import parse_material
 from sionna_partial.errors import BackendError, MapError, OutputError
 from sionna_partial.info import Finding
 from sionna_partial.maps.map_files import load_map, save_map
@@ -149,14 +149,6 @@ class TestPredict:
         assert "is not a position: give --tx X Y or --tx X Y Z in metres." in say(result.stderr)
         assert not calls
 
-    def test_position_that_is_not_finite_reaches_the_check_of_positions(
-        self, map_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-    ) -> None:
-        result = run("predict", map_path, "--tx", "nan", 1, "--out", tmp_path / "out")
-        assert result.exit_code == 2
-        assert "error: tx = (nan, 1.0, 1.5) is not finite: give finite numbers in metres." in result.stderr
-        assert not (tmp_path / "out").exists()
-
     @pytest.mark.parametrize(
         ("words", "message"),
         [
@@ -175,12 +167,6 @@ class TestPredict:
         assert result.exit_code == 2
         assert message in say(result.stderr)
         assert not calls
-
-    def test_frequency_outside_the_material(self, map_path: Path, tmp_path: Path) -> None:
-        words = ["--material", "floorboard", "--frequency", "28e9"]
-        result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path / "out", *words)
-        assert result.exit_code == 2
-        assert "error: frequency_hz = 28000000000.0 is not allowed: ITU material 'floorboard'" in result.stderr
 
     def test_missing_map(self, tmp_path: Path) -> None:
         result = run("predict", tmp_path / "none.yaml", "--tx", 1, 1, "--out", tmp_path / "out")
@@ -225,13 +211,6 @@ class TestPredict:
         assert result.stderr.startswith(f"error: path = '{map_path / 'out'}' could not be written")
         assert len(result.stderr.splitlines()) == 1
         assert not calls
-
-    def test_interrupt(self, map_path: Path, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        def interrupt(*_: object, **__: object) -> None:
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(sp, "predict_map", interrupt)
-        assert run("predict", map_path, "--tx", 1, 1, "--out", tmp_path).exit_code == 130
 
     def test_strict(self, calls: list[Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         read: list[Any] = []
@@ -355,20 +334,8 @@ class TestHelp:
     def test_version(self) -> None:
         assert run("--version").stdout == f"{__version__}\n"
 
-    @pytest.mark.parametrize("command", ["predict", "export-scene", "explore", "demo", "info"])
-    def test_command_has_help(self, command: str) -> None:
-        result = run(command, "--help")
-        assert result.exit_code == 0
-        assert "--help" in result.stdout
-
     def test_position_is_shown_as_it_is_typed(self) -> None:
         assert "--tx X Y [Z]" in run("predict", "--help").stdout
-
-
-def test_join_numbers_leaves_the_rest_alone() -> None:
-    args = ["map.yaml", "--tx", "1", "-2", "--out", "-3", "4"]
-    assert join_numbers(args, "--tx") == ["map.yaml", "--tx=1 -2", "--out", "-3", "4"]
-    assert join_numbers(["--tx=-1", "2", "--out=x", "3"], "--tx") == ["--tx=-1 2", "--out=x", "3"]
 
 
 def test_parse_material() -> None:

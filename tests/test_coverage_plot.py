@@ -104,17 +104,6 @@ def test_the_transmitter_is_marked_in_each_panel(coverage):
         assert panel.get_xlim() == pytest.approx((-1.0, 5.0))
 
 
-def test_axes_are_labelled_in_metres(coverage):
-    first, *others = panels(plot_coverage(coverage))
-    assert (first.get_xlabel(), first.get_ylabel()) == ("x [m]", "y [m]")
-    assert all(panel.get_xlabel() == "x [m]" for panel in others)
-    assert [panel.get_title() for panel in (first, *others)] == [
-        "Link state",
-        "Mean path gain",
-        "Standard deviation of the path gain",
-    ]
-
-
 def test_the_comparison_has_a_column_for_each_map(coverage):
     figure = plot_comparison({"truth": coverage, "nothing observed": coverage, "partial map": coverage})
     shown = panels(figure)
@@ -160,15 +149,6 @@ def test_maps_of_any_shape_are_drawn(coverage, shape):
     for figure in (plot_coverage(small), plot_comparison({"one": small, "two": small})):
         with Image.open(io.BytesIO(figure_png(figure))) as image:
             assert max(image.size) < 8000
-
-
-def test_large_maps_are_drawn_with_coarser_walls(monkeypatch, coverage):
-    fine = panels(plot_coverage(coverage))[0].images[-1].get_array()
-    monkeypatch.setattr("sionna_partial.plots.coverage_plot._MAX_PIXELS", 60)
-    coarse = panels(plot_coverage(coverage))[0].images[-1].get_array()
-    assert fine.shape[:2] == (96, 144)
-    assert coarse.shape[:2] == (32, 48)
-    np.testing.assert_array_equal(fine[1::3, 1::3], coarse)
 
 
 def test_what_cannot_be_drawn_is_named(coverage):

@@ -17,7 +17,6 @@ from sionna_partial.evaluation.evaluate import (
     WITHOUT_INDOOR,
     evaluate,
     home_scores,
-    mean_and_error,
 )
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
@@ -121,10 +120,6 @@ class TestEvaluate:
         for calibration in evaluation.calibrations.values():
             assert calibration.state.links.sum() == 900
 
-    def test_only_links_indoors(self, table):
-        found = evaluate(quick_predictor(), table.take(~table.anywhere), baselines=fitted_baselines())
-        assert {row.receivers for row in found.rows} == {"indoor"}
-
     def test_complete_maps_are_answered_by_their_trace(self, table):
         known = table.phi.link_state == table.link_state
         right = dataclasses.replace(table, gain_db=table.phi.gain_db).take(known & ~table.anywhere)
@@ -169,18 +164,6 @@ class TestHomeScores:
         expected_db = math.sqrt((90.0**2 + 2 * 3.0**2) / 3)
         np.testing.assert_allclose(accuracies, [2 / 3, 1.0])
         np.testing.assert_allclose(rmses_db, [expected_db, 0.0], atol=1e-9)
-
-
-class TestMeanAndError:
-    def test_error_of_a_mean(self):
-        mean, error = mean_and_error(np.array([1.0, 2.0, 3.0, 6.0]))
-        assert mean == 3.0
-        assert error == pytest.approx(math.sqrt(14.0 / 3.0 / 4.0))
-
-    def test_one_home_has_a_mean_without_error(self):
-        mean, error = mean_and_error(np.array([0.5]))
-        assert mean == 0.5
-        assert math.isnan(error)
 
 
 class TestPaper:
@@ -247,10 +230,6 @@ class TestErrors:
         )
         with pytest.raises(PredictorError, match=re.escape(message)):
             evaluate(quick_predictor(), folder, baselines=fitted_baselines())
-
-    def test_unknown_predictor(self, table):
-        with pytest.raises(PredictorError, match="path = 'nobody'"):
-            evaluate("nobody", table)
 
     def test_empty(self, table):
         with pytest.raises(PredictorError, match="dataset has no links"):

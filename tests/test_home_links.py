@@ -164,20 +164,6 @@ class TestTruthAndFeatures:
         assert table.complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
         assert table.take(slice(3)).complete_maps == table.complete_maps
 
-    def test_a_map_that_stays_is_traced_once(self, home: PartialMap, monkeypatch: Any) -> None:
-        traced: list[PartialMap] = []
-        trace = module.trace_each
-
-        def noted(partial: PartialMap, *args: Any, **options: Any) -> Any:
-            traced.append(partial)
-            return trace(partial, *args, **options)
-
-        monkeypatch.setattr(module, "trace_each", noted)
-        table = home_links(home, "two rooms", replace(SETTINGS, stages=(5000, 5001, 5002)))
-        assert len(traced) == 2
-        last = table.take(table.stage == 5002)
-        np.testing.assert_array_equal(last.phi.gain_db, table.phi.gain_db[: len(last)])
-
 
 class TestSeeds:
     @pytest.mark.parametrize(

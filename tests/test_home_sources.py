@@ -6,7 +6,6 @@ import pytest
 
 from sionna_partial.datasets.home_sources import HomeSource, home_sources
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.map_files import save_map
 from sionna_partial.simulation.homes import make_home
 
 
@@ -53,11 +52,6 @@ def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPat
     assert home_sources(["house"]) == home_sources([maps / "house" / "map.yaml"]) == [source]
     assert source.record == {"name": "house", "path": str(maps / "house" / "map.yaml")}
     assert home_sources(["picture.png"])[0].name == "picture"
-
-
-def test_map_is_read(tmp_path: Path) -> None:
-    save_map(make_home(3), tmp_path / "home.npz")
-    assert home_sources([tmp_path])[0].load() == make_home(3)
 
 
 @pytest.mark.parametrize("twice", [[3, 3], ["house", "house/map.yaml"]])

@@ -96,10 +96,6 @@ class TestDataset:
         assert known
         assert not {f"make_home({seed})" for seed in calls[0][1]} & set(known)
 
-    def test_maps_and_seeds(self, calls: list[Any]) -> None:
-        run("dataset", "out", "--map", "one.yaml", "--homes", 1)
-        assert calls[0][1] == [20_000, Path("one.yaml")]
-
     def test_bad_setting(self, calls: list[Any]) -> None:
         result = run("dataset", "out", "--links", 2)
         assert result.exit_code == 2
@@ -151,17 +147,6 @@ class TestTrain:
         assert result.exit_code == 2
         assert result.stderr.strip() == message
         assert not (tmp_path / "run").exists()
-
-    def test_no_data_set(self, tmp_path: Path) -> None:
-        result = run("train", tmp_path / "none", "--out", tmp_path / "run")
-        assert result.exit_code == 2
-        assert f"error: folder = '{tmp_path / 'none'}' is no data set" in result.stderr
-
-    def test_nothing_is_trained_that_cannot_be_written(self, dataset: Path, tmp_path: Path) -> None:
-        (tmp_path / "file").write_text("")
-        result = run("train", dataset, "--out", tmp_path / "file" / "run")
-        assert result.exit_code == 2
-        assert "could not be written" in result.stderr
 
 
 class TestEvaluate:

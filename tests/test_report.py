@@ -71,10 +71,6 @@ class TestMarkdown:
         assert row[9] == "-"
         assert "| nan" not in markdown(evaluation)
 
-    def test_columns_are_aligned(self, evaluation):
-        for block in re.findall(r"(?:\|.*\|\n?)+", markdown(evaluation)):
-            assert len({len(line) for line in block.splitlines()}) == 1
-
     def test_differences_have_signs_and_errors(self, evaluation):
         found = tables(markdown(evaluation))
         titles = [title for title in found if "standard error" in title]
