@@ -83,9 +83,9 @@ def main() -> None:
     arguments = parse_arguments()
     links, traces = indoor_links(arguments.dataset)
     names = list(dict.fromkeys(map(str, links.home)))[: arguments.homes]
-    train_homes, test_homes = split_homes(names, arguments.test_fraction, SEED)
+    train_homes, test_homes = split_homes(names, arguments.test_share, SEED)
     if not test_homes:
-        raise SystemExit(f"--test-fraction {arguments.test_fraction:g} leaves no home to measure on: give more than 0.")
+        raise SystemExit(f"--test-share {arguments.test_share:g} leaves no home to measure on: give more than 0.")
     held_out = TestSet("Homes held out", links.take(np.isin(links.home, test_homes)), traces)
     links = links.take(np.isin(links.home, train_homes))
     sets = [held_out, *(TestSet(f"Homes of {quoted(folders)}", *indoor_links(*folders)) for folders in arguments.test)]
@@ -121,7 +121,7 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument("--passes", type=int, default=6, help="how many times the networks see the links")
     parser.add_argument("--homes", type=int, help="of the data set, the first; default: all")
-    parser.add_argument("--test-fraction", type=float, default=0.15, help="share of these homes that is held out")
+    parser.add_argument("--test-share", type=float, default=0.15, help="share of these homes that is held out")
     parser.add_argument(
         "--also", type=named_predictor, nargs="+", default=[], metavar="NAME=PREDICTOR", help=".keras file, or `map`"
     )

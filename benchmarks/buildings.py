@@ -20,7 +20,7 @@ from scipy import ndimage
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.style import figure_png
+from sionna_partial.plots.figures import figure_png
 
 FIRST_SEED = 80_000
 KINDS = ("floor", "hall", "warehouse")

@@ -43,15 +43,15 @@ def main() -> None:
     parser.add_argument("--homes", type=int, default=150, help="to build")
     parser.add_argument("--first-seed", type=int, default=10_000, help="of these homes")
     parser.add_argument("--read", type=Path, nargs=2, metavar=("OBSERVED", "MAP"), help="data sets to read instead")
-    parser.add_argument("--test-fraction", type=float, default=0.3, help="share of the homes that is held out")
+    parser.add_argument("--test-share", type=float, default=0.3, help="share of the homes that is held out")
     parser.add_argument("--out", type=Path, help="Markdown file to write")
     arguments = parser.parse_args()
     seeds = range(arguments.first_seed, arguments.first_seed + arguments.homes)
     folders = arguments.read or [build(arguments.folder / extent, extent, seeds) for extent in EXTENTS]
     tables = same_links(*(read(*pair) for pair in zip(folders, EXTENTS, strict=True)))
-    train_homes, test_homes = split_homes(sorted(set(map(str, tables[0].home))), arguments.test_fraction, SEED)
+    train_homes, test_homes = split_homes(sorted(set(map(str, tables[0].home))), arguments.test_share, SEED)
     if not test_homes:
-        raise SystemExit(f"--test-fraction {arguments.test_fraction:g} leaves no home to measure on: give more than 0.")
+        raise SystemExit(f"--test-share {arguments.test_share:g} leaves no home to measure on: give more than 0.")
     scores = {}
     for extent, links in zip(EXTENTS, tables, strict=True):
         say(f"floor and ceiling: {extent}, training on {len(train_homes)} homes, measuring on {len(test_homes)}")

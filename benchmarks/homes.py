@@ -24,7 +24,7 @@ from scipy import ndimage
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.style import figure_png
+from sionna_partial.plots.figures import figure_png
 from sionna_partial.prediction.features import unobserved_distance_m
 from sionna_partial.scene.outlines import wall_outlines
 

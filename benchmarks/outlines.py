@@ -35,12 +35,12 @@ NOISES = {
     "lidar, noise 2 cm, drift 1 %, 5 % missed": {
         "range_noise_m": 0.02,
         "drift_m_per_m": 0.01,
-        "missed_wall_fraction": 0.05,
+        "missed_wall_share": 0.05,
     },
     "lidar, noise 5 cm, drift 1 %, 5 % missed": {
         "range_noise_m": 0.05,
         "drift_m_per_m": 0.01,
-        "missed_wall_fraction": 0.05,
+        "missed_wall_share": 0.05,
     },
 }
 LINKS = 2000

@@ -34,7 +34,7 @@ from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.files import atomic_files
 from sionna_partial.plots.coverage_plot import plot_comparison
-from sionna_partial.plots.style import BLUE, RED, figure_png
+from sionna_partial.plots.figures import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.simulation.homes import HomeKind
 from sionna_partial.tracing.trace import trace_each

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.style import figure_png
+from sionna_partial.plots.figures import figure_png
 from sionna_partial.resources import demo_homes, scenes_folder
 
 RUNS = 3

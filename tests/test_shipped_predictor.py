@@ -12,7 +12,7 @@ from sionna_partial.resources import scenes_folder
 pytestmark = QUIET
 
 HOMES = ("apartment", "house")
-SETTINGS = sp.DatasetSettings(links_per_home=200, transmitters_per_home=2, stages=(50, 100))
+SETTINGS = sp.DatasetSettings(links_per_home=200, transmitters_per_home=4, stages=(100, 200))
 
 
 @pytest.fixture(scope="module")
