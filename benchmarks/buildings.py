@@ -17,10 +17,10 @@ from homes import perimeter_cells, plain, room_count
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import ndimage
+from sionna_partial.plots.figures import figure_png
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.figures import figure_png
 
 FIRST_SEED = 80_000
 KINDS = ("floor", "hall", "warehouse")

@@ -21,10 +21,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import ndimage
+from sionna_partial.plots.figures import figure_png
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.figures import figure_png
 from sionna_partial.prediction.features import unobserved_distance_m
 from sionna_partial.scene.outlines import wall_outlines
 

@@ -25,6 +25,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from sionna_partial.plots.figures import BLUE, RED, figure_png
 
 import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links, map_area
@@ -34,7 +35,6 @@ from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.files import atomic_files
 from sionna_partial.plots.coverage_plot import plot_comparison
-from sionna_partial.plots.figures import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.simulation.homes import HomeKind
 from sionna_partial.tracing.trace import trace_each

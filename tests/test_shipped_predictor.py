@@ -6,7 +6,7 @@ from predictor_links import QUIET
 import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.link_table import LinkTable
-from sionna_partial.evaluation.evaluate import Evaluation
+from sionna_partial.evaluation.evaluate import WITH_INDOOR, Evaluation
 from sionna_partial.resources import scenes_folder
 
 pytestmark = QUIET
@@ -24,12 +24,24 @@ def evaluation() -> Evaluation:
 @pytest.mark.parametrize(
     ("receivers", "answer", "stage", "accuracy", "rmse_db"),
     [
-        ("indoor", "predictor", 50, 0.0, 99.0),
+        ("indoor", "predictor", 100, 0.59, 26.2),
+        ("indoor", "predictor", 200, 0.69, 21.7),
+        ("anywhere", WITH_INDOOR, 100, 0.83, 19.0),
+        ("anywhere", WITH_INDOOR, 200, 0.84, 18.3),
     ],
 )
-def test_figures_of_merit(
+def test_figures_of_merit_stay_in_their_band(
     evaluation: Evaluation, receivers: str, answer: str, stage: int, accuracy: float, rmse_db: float
 ) -> None:
     (row,) = evaluation.select(receivers=receivers, answer=answer, stage=stage, ends_seen="all")
+    assert row.metrics.links == 2 * SETTINGS.links_per_home
     assert row.metrics.accuracy >= accuracy - 0.05
     assert row.metrics.rmse_db <= rmse_db + 3.0
+
+
+def test_map_is_worth_more_than_the_distance_alone(evaluation: Evaluation) -> None:
+    rows = evaluation.select(receivers="indoor", stage=200, ends_seen="all")
+    metrics = {row.answer: row.metrics for row in rows}
+    for baseline in ("distance only", "partial trace"):
+        assert metrics["predictor"].accuracy > metrics[baseline].accuracy
+        assert metrics["predictor"].rmse_db < metrics[baseline].rmse_db
