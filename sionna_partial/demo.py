@@ -57,7 +57,7 @@ def run_demo(
 
 
 def demo_scene(home: str, step: int) -> tuple[PartialMap, PartialMap, tuple[float, ...]]:
-    """Load a shipped home: the complete map, what the robot knows of it, and the transmitter position [m]."""
+    """Load a shipped home: the complete map, its partial map, and the transmitter position [m]."""
     scenes, homes = scenes_folder(), demo_homes()
     if home not in homes:
         raise SceneError(f"home = {home!r} is not in '{scenes}': choose one of {', '.join(homes)}.")

@@ -1,4 +1,4 @@
-"""Exceptions raised for input that cannot give a trustworthy answer."""
+"""Exceptions raised for input that cannot give a trustworthy result."""
 
 
 class SionnaPartialError(Exception):

@@ -144,8 +144,12 @@ def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
     """
     target = output_path(folder)
     require_writable(target)
-    target.mkdir(parents=True, exist_ok=True)
-    with (target / LOCK_FILE).open("a+", encoding="utf-8") as stream:
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+        stream = (target / LOCK_FILE).open("a+", encoding="utf-8")
+    except OSError as error:
+        raise _output_error(target / LOCK_FILE, error) from error
+    with stream:
         try:
             fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -132,20 +132,20 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
 
 
 def _by_stage(rows: Sequence[Row]) -> str:
-    """Tabulate accuracy and gain error, a line for each answer and a column for each stage."""
-    stages, answers = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "answer"))
-    found = {(row.answer, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
+    """Tabulate accuracy and gain error, a line for each model and a column for each stage."""
+    stages, models = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "model"))
+    found = {(row.model, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
     header = ["accuracy, RMSE", *(stage_name(stage) for stage in stages)]
-    cells = ([answer, *(found.get((answer, stage), _MISSING) for stage in stages)] for answer in answers)
+    cells = ([model, *(found.get((model, stage), _MISSING) for stage in stages)] for model in models)
     return markdown_table(header, cells)
 
 
 def _section(title: str, rows: Sequence[Row]) -> str:
-    header = ["stage", "answer", *(label for label, _ in _COLUMNS.values())]
+    header = ["stage", "model", *(label for label, _ in _COLUMNS.values())]
     cells = [
         [
             stage_name(row.stage),
-            row.answer,
+            row.model,
             *(_text(getattr(row.metrics, name), _COLUMNS[name][1]) for name in _COLUMNS),
         ]
         for row in rows

@@ -43,12 +43,12 @@ class TrainingRun:
             "train": list(self.train_homes),
             "test": list(self.test_homes),
         }
-        with atomic_files(folder) as place:
-            self.predictor.save(place / PREDICTOR_FILE)
-            self.baselines.save(place)
-            with atomic_write(place / SPLIT_FILE, "w") as stream:
+        with atomic_files(folder) as files:
+            self.predictor.save(files / PREDICTOR_FILE)
+            self.baselines.save(files)
+            with atomic_write(files / SPLIT_FILE, "w") as stream:
                 stream.write(json.dumps(split, indent=2) + "\n")
-            names = sorted(file.name for file in place.iterdir())
+            names = sorted(file.name for file in files.iterdir())
         return [Path(folder) / name for name in names]
 
 
@@ -155,7 +155,7 @@ def _card_metrics(evaluation: Evaluation) -> dict[str, Any]:
     for receivers, name in (("indoor", "exploration_steps"), ("anywhere", "exploration_steps_receivers_anywhere")):
         stages: dict[str, dict[str, Any]] = {}
         for row in evaluation.select(homes="test", receivers=receivers, ends_seen="all"):
-            if row.answer != "paper":
-                stages.setdefault(f"{row.stage:g}", {})[row.answer] = row.metrics.as_json()
+            if row.model != "paper":
+                stages.setdefault(f"{row.stage:g}", {})[row.model] = row.metrics.as_json()
         metrics[name] = stages
     return metrics

@@ -53,13 +53,13 @@ class TestEvaluate:
     def test_every_answer_at_every_stage_for_all_and_by_ends_seen(self, evaluation):
         for homes, stage in (("test", 0), ("test", 100), ("train", 0), ("train", 100)):
             rows = evaluation.select(homes=homes, receivers="indoor", stage=stage)
-            assert [(row.ends_seen, row.answer) for row in rows] == [
+            assert [(row.ends_seen, row.model) for row in rows] == [
                 (ends, answer) for ends in ("all", "both", "one", "none") for answer in ANSWERS
             ]
 
     def test_links_are_split_by_ends_seen(self, evaluation):
         for receivers, answer in (("indoor", "majority"), ("anywhere", WITH_INDOOR)):
-            rows = evaluation.select(homes="test", receivers=receivers, stage=0, answer=answer)
+            rows = evaluation.select(homes="test", receivers=receivers, stage=0, model=answer)
             total, *parts = (row.metrics.links for row in rows)
             assert total == sum(parts) == 3 * 300
             assert min(parts) > 0
@@ -67,7 +67,7 @@ class TestEvaluate:
     def test_figures_are_those_of_the_links(self, table, evaluation):
         chosen = np.isin(table.home, ["home 0", "home 2", "home 3"]) & ~table.anywhere & (table.stage == 100)
         links = table.take(chosen & table.context.tx_seen & table.context.rx_seen)
-        (row,) = evaluation.select(homes="test", receivers="indoor", stage=100, ends_seen="both", answer="predictor")
+        (row,) = evaluation.select(homes="test", receivers="indoor", stage=100, ends_seen="both", model="predictor")
         expected = measure(quick_predictor().predict(links.phi), links.link_state, links.gain_db).as_json()
         assert row.metrics.as_json() == pytest.approx(expected)
 
@@ -75,14 +75,14 @@ class TestEvaluate:
         for homes in ("test", "train"):
             for stage in (0, 100):
                 rows = evaluation.select(homes=homes, receivers="anywhere", stage=stage, ends_seen="all")
-                found = {row.answer: row.metrics for row in rows}
+                found = {row.model: row.metrics for row in rows}
                 with_it, without = found[WITH_INDOOR], found[WITHOUT_INDOOR]
                 assert with_it.accuracy > without.accuracy + 0.05
                 for name in ("rmse_db", "nll_state", "calibration_error"):
                     assert getattr(with_it, name) < getattr(without, name), name
 
     def test_always_outage_is_right_as_often_as_there_is_one(self, table, evaluation):
-        (row,) = evaluation.select(homes="train", receivers="anywhere", stage=0, ends_seen="all", answer=ALWAYS_OUTAGE)
+        (row,) = evaluation.select(homes="train", receivers="anywhere", stage=0, ends_seen="all", model=ALWAYS_OUTAGE)
         truth = table.link_state[(table.home == "home 1") & table.anywhere & (table.stage == 0)]
         assert row.metrics.accuracy == np.mean(truth == OUTAGE)
         assert row.metrics.rmse_db > 0.0
@@ -123,7 +123,7 @@ class TestEvaluate:
     def test_complete_maps_are_answered_by_their_trace(self, table):
         known = table.phi.link_state == table.link_state
         right = dataclasses.replace(table, gain_db=table.phi.gain_db).take(known & ~table.anywhere)
-        rows = evaluate(quick_predictor(), right, baselines=fitted_baselines()).select(answer="partial trace")
+        rows = evaluate(quick_predictor(), right, baselines=fitted_baselines()).select(model="partial trace")
         assert {(row.metrics.accuracy, row.metrics.rmse_db, row.metrics.nll_state) for row in rows} == {(1.0, 0.0, 0.0)}
         assert set(right.link_state) >= {LOS, OUTAGE}
 
@@ -169,12 +169,12 @@ class TestHomeScores:
 class TestPaper:
     def test_the_papers_is_not_compared_with_itself(self, table):
         found = evaluate("paper", table, baselines=fitted_baselines())
-        assert {row.answer for row in found.select(receivers="indoor")} == {*ANSWERS} - {"paper"}
+        assert {row.model for row in found.select(receivers="indoor")} == {*ANSWERS} - {"paper"}
 
     def test_the_papers_is_left_out_at_another_frequency(self, table):
         settings = dataclasses.replace(quick_predictor().settings, frequency_hz=60e9)
         found = evaluate(dataclasses.replace(quick_predictor(), settings=settings), table, baselines=fitted_baselines())
-        assert "paper" not in {row.answer for row in found.rows}
+        assert "paper" not in {row.model for row in found.rows}
 
     def test_a_note_says_which_test_homes_it_was_trained_on(self, table):
         name = Predictor.load("paper").homes[0]
@@ -199,7 +199,7 @@ class TestBaselinesFolder:
         fitted_baselines().save(tmp_path)
         monkeypatch.setattr(evaluate_module, "PREDICTORS_FOLDER", tmp_path / "none")
         found = evaluate(tmp_path / "mine.keras", table)
-        (row, *_) = found.select(answer="majority", receivers="indoor")
+        (row, *_) = found.select(model="majority", receivers="indoor")
         truth = table.link_state[~table.anywhere & (table.stage == 0)]
         assert row.metrics.accuracy == np.mean(truth == 2)
 
@@ -209,7 +209,7 @@ class TestBaselinesFolder:
         (tmp_path / "alone").mkdir()
         quick_predictor().save(tmp_path / "alone" / "mine.keras")
         for predictor in (quick_predictor(), tmp_path / "alone" / "mine.keras"):
-            assert evaluate(predictor, table).select(answer="distance only")
+            assert evaluate(predictor, table).select(model="distance only")
 
 
 class TestErrors:

@@ -27,14 +27,14 @@ class TestPlotStages:
         for axis, name in zip(axes, ("accuracy", "rmse_db", "rmse_linked_db"), strict=True):
             lines = {line.get_label(): line for line in axis.get_lines()}
             for answer in ("predictor", "distance only", "partial trace", "TR 38.901 open office"):
-                rows = evaluation.select(homes="test", receivers="indoor", ends_seen="all", answer=answer)
+                rows = evaluation.select(homes="test", receivers="indoor", ends_seen="all", model=answer)
                 expected = [[row.stage, getattr(row.metrics, name)] for row in rows]
                 np.testing.assert_array_equal(lines[answer].get_xydata(), expected)
 
     def test_of_training_homes_only_the_predictor(self, evaluation):
         labels = [line.get_label() for line in plot_stages(evaluation).axes[0].get_lines()]
         assert [label for label in labels if "training" in label] == ["predictor, training homes"]
-        assert len(labels) == len({row.answer for row in evaluation.select(receivers="indoor")}) + 1
+        assert len(labels) == len({row.model for row in evaluation.select(receivers="indoor")}) + 1
 
     def test_every_line_has_a_colour_of_its_own(self, evaluation):
         lines = plot_stages(evaluation).axes[0].get_lines()
@@ -43,7 +43,7 @@ class TestPlotStages:
     def test_no_training_homes(self, evaluation):
         rows = tuple(row for row in evaluation.rows if row.homes == "test")
         figure = plot_stages(dataclasses.replace(evaluation, rows=rows))
-        assert len(figure.axes[0].get_lines()) == len({row.answer for row in rows if row.receivers == "indoor"})
+        assert len(figure.axes[0].get_lines()) == len({row.model for row in rows if row.receivers == "indoor"})
 
     def test_equal_files(self, evaluation):
         one, other = (figure_png(plot_stages(evaluation)) for _ in range(2))

@@ -342,7 +342,10 @@ class TestLockedFolder:
         with pytest.raises(OutputError, match=r"could not be written \(Permission denied\): choose a folder"):
             locked_folder(tmp_path).__enter__()
 
-    def test_file_in_the_way(self, tmp_path: Path) -> None:
+    def test_file_or_folder_in_the_way(self, tmp_path: Path) -> None:
+        (tmp_path / ".lock").mkdir()
+        with pytest.raises(OutputError, match=r"\.lock' could not be written \(Is a directory\)"):
+            locked_folder(tmp_path).__enter__()
         (tmp_path / "a").touch()
         with pytest.raises(OutputError, match="a part of the path is a file"):
             locked_folder(tmp_path / "a").__enter__()

@@ -36,9 +36,9 @@ class TestSummary:
             rows = found[f"Test homes (2), receivers {where}"]
             assert rows[0] == ["accuracy, RMSE", "0 steps", "100 steps"]
             measured = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
-            assert len(rows) - 2 == len({row.answer for row in measured})
+            assert len(rows) - 2 == len({row.model for row in measured})
             for row in measured:
-                (cells,) = (cells for cells in rows if cells[0] == row.answer)
+                (cells,) = (cells for cells in rows if cells[0] == row.model)
                 cell = cells[rows[0].index(f"{row.stage:g} steps")]
                 assert cell.split() == [f"{row.metrics.accuracy:.3f}", f"{row.metrics.rmse_db:.2f}", "dB"]
 
@@ -60,7 +60,7 @@ class TestMarkdown:
     def test_figures_stand_where_they_belong(self, evaluation):
         rows = tables(markdown(evaluation))["Test homes, receivers indoors"]
         (row,) = (cells for cells in rows if cells[:2] == ["100 steps", "predictor"])
-        (found,) = evaluation.select(homes="test", stage=100, answer="predictor", ends_seen="all")
+        (found,) = evaluation.select(homes="test", stage=100, model="predictor", ends_seen="all")
         assert rows[0][2:5] == ["links", "accuracy", "RMSE [dB]"]
         assert row[2:5] == ["600", f"{found.metrics.accuracy:.3f}", f"{found.metrics.rmse_db:.2f}"]
 
@@ -120,10 +120,10 @@ class TestAsJson:
         content = json.loads(json.dumps(as_json(evaluation), allow_nan=False))
         assert content["homes"] == {"test": ["home 0", "home 2"], "train": ["home 1"]}
         assert len(content["rows"]) == len(evaluation.rows)
-        assert {row["metrics"]["nll"] for row in content["rows"] if row["answer"] == "partial trace"} == {None}
+        assert {row["metrics"]["nll"] for row in content["rows"] if row["model"] == "partial trace"} == {None}
         assert content["differences"][-1]["baseline"] == "always outage"
         assert sum(content["calibration"]["0"]["links"]) == 600
-        assert WITH_INDOOR in {row["answer"] for row in content["rows"]}
+        assert WITH_INDOOR in {row["model"] for row in content["rows"]}
 
 
 class TestSaveReport:

@@ -22,7 +22,7 @@ def evaluation() -> Evaluation:
 
 
 @pytest.mark.parametrize(
-    ("receivers", "answer", "stage", "accuracy", "rmse_db"),
+    ("receivers", "model", "stage", "accuracy", "rmse_db"),
     [
         ("indoor", "predictor", 100, 0.59, 26.2),
         ("indoor", "predictor", 200, 0.69, 21.7),
@@ -31,9 +31,9 @@ def evaluation() -> Evaluation:
     ],
 )
 def test_figures_of_merit_stay_in_their_band(
-    evaluation: Evaluation, receivers: str, answer: str, stage: int, accuracy: float, rmse_db: float
+    evaluation: Evaluation, receivers: str, model: str, stage: int, accuracy: float, rmse_db: float
 ) -> None:
-    (row,) = evaluation.select(receivers=receivers, answer=answer, stage=stage, ends_seen="all")
+    (row,) = evaluation.select(receivers=receivers, model=model, stage=stage, ends_seen="all")
     assert row.metrics.links == 2 * SETTINGS.links_per_home
     assert row.metrics.accuracy >= accuracy - 0.05
     assert row.metrics.rmse_db <= rmse_db + 3.0
@@ -41,7 +41,7 @@ def test_figures_of_merit_stay_in_their_band(
 
 def test_map_is_worth_more_than_the_distance_alone(evaluation: Evaluation) -> None:
     rows = evaluation.select(receivers="indoor", stage=200, ends_seen="all")
-    metrics = {row.answer: row.metrics for row in rows}
+    metrics = {row.model: row.metrics for row in rows}
     for baseline in ("distance only", "partial trace"):
         assert metrics["predictor"].accuracy > metrics[baseline].accuracy
         assert metrics["predictor"].rmse_db < metrics[baseline].rmse_db

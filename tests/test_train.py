@@ -87,7 +87,7 @@ class TestTrain:
         assert p_indoor.mean() == pytest.approx(hidden.inside.mean(), abs=0.02)
 
     def test_the_card_says_what_was_measured_on_test_homes(self, run):
-        (row,) = run.evaluation.select(homes="test", stage=100, answer="majority", ends_seen="all")
+        (row,) = run.evaluation.select(homes="test", stage=100, model="majority", ends_seen="all")
         assert run.predictor.metrics["exploration_steps"]["100"]["majority"] == row.metrics.as_json()
         anywhere = run.predictor.metrics["exploration_steps_receivers_anywhere"]["0"]
         assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
@@ -101,7 +101,7 @@ class TestTrain:
         assert {"near_map_network", "far_map_network", "link_network"} <= set(seeing.predictor.model.output)
         assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")
         links = table.take(~table.anywhere & np.isin(table.home, seeing.test_homes))
-        (row,) = seeing.evaluation.select(receivers="indoor", ends_seen="all", answer="predictor")
+        (row,) = seeing.evaluation.select(receivers="indoor", ends_seen="all", model="predictor")
         expected = measure(seeing.predictor.predict(links.phi), links.link_state, links.gain_db)
         assert row.metrics.as_json() == pytest.approx(expected.as_json(), rel=1e-6)
         assert [share for share, _ in calls] == sorted(share for share, _ in calls)

@@ -41,7 +41,7 @@ class Row:
         Steps that the robot has explored; below 1, the fraction that it was to observe.
     ends_seen : {"all", "both", "one", "none"}
         Which links: all, or those with so many ends in observed cells.
-    answer : str
+    model : str
         "predictor" or a baseline.
     metrics : Metrics
     """
@@ -50,7 +50,7 @@ class Row:
     receivers: str
     stage: float
     ends_seen: str
-    answer: str
+    model: str
     metrics: Metrics
 
 
@@ -140,7 +140,7 @@ def evaluate(
     --------
     >>> import sionna_partial as sp
     >>> evaluation = sp.evaluate("paper", "links")  # that build_dataset wrote
-    >>> (row,) = evaluation.select(stage=5, receivers="indoor", ends_seen="all", answer="predictor")
+    >>> (row,) = evaluation.select(stage=5, receivers="indoor", ends_seen="all", model="predictor")
     >>> row.metrics.links
     4
     """
@@ -178,11 +178,11 @@ def evaluate(
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
 
 
-def home_scores(answer: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return accuracy and root mean square gain error [dB] of each home (H,), in the order of their names."""
     _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
-    right = np.bincount(home, answer.link_state == links.link_state)
-    squares = np.bincount(home, gain_errors_db(answer, links.link_state, links.gain_db) ** 2)
+    right = np.bincount(home, prediction.link_state == links.link_state)
+    squares = np.bincount(home, gain_errors_db(prediction, links.link_state, links.gain_db) ** 2)
     return right / count, np.sqrt(squares / count)
 
 
@@ -241,15 +241,15 @@ def _rows(
     cells = {"all": np.ones(len(links), dtype=bool)} | {name: ends == count for name, count in ENDS_SEEN.items()}
     for name, cell in cells.items():
         state, gain_db = links.link_state[cell], links.gain_db[cell]
-        for answer, prediction in predictions.items():
-            yield Row(homes, receivers, stage, name, answer, measure(prediction.take(cell), state, gain_db))
+        for model, prediction in predictions.items():
+            yield Row(homes, receivers, stage, name, model, measure(prediction.take(cell), state, gain_db))
 
 
 def _differences(
     receivers: str, stage: float, links: LinkTable, predictions: Mapping[str, LinkPrediction]
 ) -> Iterator[Difference]:
     """Compare the first prediction with each of the others."""
-    scores = {answer: home_scores(prediction, links) for answer, prediction in predictions.items()}
+    scores = {model: home_scores(prediction, links) for model, prediction in predictions.items()}
     first, *others = scores
     for baseline in others:
         accuracy, rmse_db = (one - other for one, other in zip(scores[first], scores[baseline], strict=True))

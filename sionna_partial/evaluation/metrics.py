@@ -92,49 +92,49 @@ class Calibration:
     gain_pit: NDArray[np.float64]
 
 
-def measure(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Metrics:
+def measure(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Metrics:
     """Compare a prediction of N links with their true link states and gains [dB]; outages count as -150 dB."""
     outage = link_state == LinkState.OUTAGE
-    errors_db = gain_errors_db(answer, link_state, gain_db)
-    nll_state, nll = _negative_log_likelihoods(answer, link_state, gain_db)
-    low, high = pit_fractions(answer, link_state, gain_db, np.array(INTERVAL))
+    errors_db = gain_errors_db(prediction, link_state, gain_db)
+    nll_state, nll = _negative_log_likelihoods(prediction, link_state, gain_db)
+    low, high = pit_fractions(prediction, link_state, gain_db, np.array(INTERVAL))
     return Metrics(
         links=len(link_state),
-        accuracy=_mean(answer.link_state == link_state),
+        accuracy=_mean(prediction.link_state == link_state),
         rmse_db=math.sqrt(_mean(errors_db**2)),
         rmse_linked_db=math.sqrt(_mean(errors_db[~outage] ** 2)),
         nll_state=nll_state,
         nll=nll,
-        calibration_error=reliability(answer, link_state).error,
-        coverage_90=float(high - low) if (answer.gain_std_db > _NO_SPREAD_DB).any() else math.nan,
+        calibration_error=reliability(prediction, link_state).error,
+        coverage_90=float(high - low) if (prediction.gain_std_db > _NO_SPREAD_DB).any() else math.nan,
     )
 
 
-def calibration(answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Calibration:
+def calibration(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Calibration:
     """Measure the calibration of link state and gain."""
-    fractions = pit_fractions(answer, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
-    return Calibration(reliability(answer, link_state), np.diff(fractions))
+    fractions = pit_fractions(prediction, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
+    return Calibration(reliability(prediction, link_state), np.diff(fractions))
 
 
 def gain_errors_db(
-    answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
+    prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB."""
-    return answer.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+    return prediction.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
 
 
-def reliability(answer: LinkPrediction, link_state: NDArray[np.uint8]) -> Reliability:
+def reliability(prediction: LinkPrediction, link_state: NDArray[np.uint8]) -> Reliability:
     """Compare confidence and accuracy of the link state, bin by bin."""
-    confidence = np.max([answer.p_outage, answer.p_los, answer.p_nlos], axis=0)
+    confidence = np.max([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
     bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
     links = np.bincount(bins, minlength=CONFIDENCE_BINS)
-    right = (answer.link_state == link_state).astype(np.float64)
+    right = (prediction.link_state == link_state).astype(np.float64)
     sums = (np.bincount(bins, weights, minlength=CONFIDENCE_BINS) for weights in (confidence, right))
     return Reliability(links, *(total / np.maximum(links, 1) for total in sums))
 
 
 def pit_fractions(
-    answer: LinkPrediction,
+    prediction: LinkPrediction,
     link_state: NDArray[np.uint8],
     gain_db: NDArray[np.float64],
     levels: NDArray[np.float64],
@@ -147,21 +147,21 @@ def pit_fractions(
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
-    below, upto = _gain_probabilities(answer, np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db))
+    below, upto = _gain_probabilities(prediction, np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db))
     width = np.maximum(upto - below, 1e-12)
     return np.array([np.clip((level - below) / width, 0.0, 1.0).mean() for level in levels])
 
 
 def _gain_probabilities(
-    answer: LinkPrediction, gain_db: NDArray[np.float64]
+    prediction: LinkPrediction, gain_db: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Predicted probabilities (N,) of a smaller gain, and of a gain that is not greater."""
     floor, none = np.full_like(gain_db, GAIN_FLOOR_DB), np.zeros_like(gain_db)
     below, upto = none.copy(), none.copy()
     for p, mean_db, std_db in (
-        (answer.p_outage, floor, none),
-        (answer.p_los, answer.gain_los_mean_db, answer.gain_los_std_db),
-        (answer.p_nlos, answer.gain_nlos_mean_db, answer.gain_nlos_std_db),
+        (prediction.p_outage, floor, none),
+        (prediction.p_los, prediction.gain_los_mean_db, prediction.gain_los_std_db),
+        (prediction.p_nlos, prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db),
     ):
         offset_db = gain_db - mean_db
         spread = ndtr(offset_db / np.where(std_db > 0.0, std_db, 1.0))
@@ -171,13 +171,13 @@ def _gain_probabilities(
 
 
 def _negative_log_likelihoods(
-    answer: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
+    prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Of the link state, and of link state and gain; nan where it is not finite."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
-    p = np.select([los, outage], [answer.p_los, answer.p_outage], answer.p_nlos)
-    mean_db = np.where(los, answer.gain_los_mean_db, answer.gain_nlos_mean_db)
-    std_db = np.where(los, answer.gain_los_std_db, answer.gain_nlos_std_db)
+    p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
+    mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)
+    std_db = np.where(los, prediction.gain_los_std_db, prediction.gain_nlos_std_db)
     with np.errstate(divide="ignore", invalid="ignore"):
         state = -np.log(np.maximum(p, LEAST_PROBABILITY))
         gain = 0.5 * ((gain_db - mean_db) / std_db) ** 2 + np.log(std_db * math.sqrt(2.0 * math.pi))

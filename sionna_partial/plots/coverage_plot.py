@@ -153,10 +153,10 @@ def _draw_key(key: Axes, layer: _Layer, *, upright: bool) -> None:
     if layer.norm is None:
         _draw_triangle(key)
         return
-    place = (0.05, 0.05, 0.17, 0.9) if upright else (0.05, 0.7, 0.9, 0.2)
+    bounds = (0.05, 0.05, 0.17, 0.9) if upright else (0.05, 0.7, 0.9, 0.2)
     orientation = "vertical" if upright else "horizontal"
     scale = ScalarMappable(layer.norm, layer.cmap)
-    bar = key.figure.colorbar(scale, cax=key.inset_axes(place), orientation=orientation, extend="max")
+    bar = key.figure.colorbar(scale, cax=key.inset_axes(bounds), orientation=orientation, extend="max")
     bar.set_label(layer.unit)
 
 

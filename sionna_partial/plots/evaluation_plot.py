@@ -49,12 +49,12 @@ def plot_stages(evaluation: Evaluation) -> Figure:
 
 def _draw_lines(axis: Axes, rows: list[Row], name: str) -> None:
     """Draw one figure of merit."""
-    answers = list(dict.fromkeys(row.answer for row in rows))
-    for answer, colour in zip(answers, itertools.cycle(_COLOURS), strict=False):
+    models = list(dict.fromkeys(row.model for row in rows))
+    for model, colour in zip(models, itertools.cycle(_COLOURS), strict=False):
         for homes, style in _STYLES.items():
-            some = [row for row in rows if (row.answer, row.homes) == (answer, homes)]
-            if some and (homes == "test" or answer == "predictor"):
-                label = answer if homes == "test" else f"{answer}, training homes"
+            some = [row for row in rows if (row.model, row.homes) == (model, homes)]
+            if some and (homes == "test" or model == "predictor"):
+                label = model if homes == "test" else f"{model}, training homes"
                 points = zip(*((row.stage, getattr(row.metrics, name)) for row in some), strict=True)
                 axis.plot(*points, color=colour, label=label, markersize=4, **style)
     axis.set_xticks(sorted({row.stage for row in rows}))

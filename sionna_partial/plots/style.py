@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sionna_partial.constants import LinkState
 
 YELLOW, RED, BLUE = "#ddaa33", "#bb5566", "#004488"
-"""Paul Tol's high-contrast colours: told apart with any colour vision and in grey."""
+"""Paul Tol's high-contrast colours: distinguishable with any colour vision and in grey."""
 
 STATE_COLOURS = {LinkState.LOS: YELLOW, LinkState.NLOS: RED, LinkState.OUTAGE: BLUE}
 """The better the link, the brighter."""
