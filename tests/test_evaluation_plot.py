@@ -40,11 +40,6 @@ class TestPlotStages:
         lines = plot_stages(evaluation).axes[0].get_lines()
         assert len({line.get_color() for line in lines if "training" not in line.get_label()}) == len(lines) - 1
 
-    def test_no_training_homes(self, evaluation):
-        rows = tuple(row for row in evaluation.rows if row.homes == "test")
-        figure = plot_stages(dataclasses.replace(evaluation, rows=rows))
-        assert len(figure.axes[0].get_lines()) == len({row.model for row in rows if row.receivers == "indoor"})
-
     def test_equal_files(self, evaluation):
         one, other = (figure_png(plot_stages(evaluation)) for _ in range(2))
         assert one == other
