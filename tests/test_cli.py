@@ -91,22 +91,8 @@ class TestPredict:
 
     def test_every_option(self, map_path: Path, calls: list[Any], tmp_path: Path) -> None:
         options = "--rx-height 1 --spacing 0.3 --frequency 60e9 --max-depth 2 --predictor paper --material 4,0.1,0.2"
-        options += " --receivers anywhere --no-diffraction --wall-height 2.7 --memory 1.5"
-        result = run(
-            "predict",
-            map_path,
-            "--tx",
-            1,
-            -0.5,
-            2,
-            "--out",
-            tmp_path,
-            *options.split(),
-            "--format",
-            "nc",
-            "--format",
-            ".CSV",
-        )
+        options += " --receivers anywhere --no-diffraction --wall-height 2.7 --memory 1.5 --format nc --format .CSV"
+        result = run("predict", map_path, "--tx", 1, -0.5, 2, "--out", tmp_path, *options.split())
         assert result.exit_code == 0, result.output
         scene, tx, settings = calls[0]
         assert scene.wall_height_m == 2.7
