@@ -110,10 +110,11 @@ def run_home(task: HomeTask) -> HomeResult:
         return HomeResult("done")
     lines: list[str] = []
     for _ in range(ATTEMPTS):
-        process = next((each for each in iter(_take_idle, None) if each.is_alive), None) or _HomeProcess()
         if _stopped.is_set():
-            process.close()
             return HomeResult("failed", "stopped")
+        process = next((each for each in iter(_take_idle, None) if each.is_alive), None) or _HomeProcess()
+        if _stopped.is_set():  # while it started
+            process.kill()
         result = process.make(task)
         if isinstance(result, HomeResult):
             _idle.append(process)
