@@ -2,8 +2,8 @@
 
 Each home gets hidden materials. Their gains are traced on the complete home at positions that are free on the map, with
 noise, and `calibrate_materials` gets the map (complete or half explored) and the noisy gains. Errors are those of the
-loss of a reflection at angles of incidence from 0 to 75 degrees, where the loss is below 30 dB; "te" is the polarisation
-of vertical antennas at walls. Gains of links that were not measured are compared with their truth. Run it with
+loss of a reflection at angles of incidence from 0 to 75 degrees, where the loss is below 30 dB; "te" is the
+polarisation of vertical antennas at walls. Gains of links that were not measured are compared with their truth. Run
 
     python benchmarks/material_calibration.py
 """
