@@ -139,15 +139,15 @@ def moved(links: DifferentiableLinks, name: str, step: float) -> NDArray[np.floa
     return getattr(links.base, field_of(name)) + step * direction
 
 
-def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, width: float) -> NDArray[np.bool_]:
-    """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within width."""
+def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: float) -> NDArray[np.bool_]:
+    """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within reach."""
     changed = np.zeros(len(paths.rx_m), dtype=bool)
     if name not in "xyz":
         return changed  # paths are a matter of geometry
-    for step in (-width, width):
-        position_m = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
-        there = scene.paths.paths(position_m, paths.rx_m)
-        kept = paths.at(replace(paths.base, tx_m=position_m))[0]
+    for step in (-reach, reach):
+        place = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
+        there = scene.paths.paths(place, paths.rx_m)
+        kept = paths.at(replace(paths.base, tx_m=place))[0]
         old = np.bincount(paths.rx_of_path, weights=paths.power, minlength=len(changed))
         gone = np.bincount(paths.rx_of_path, weights=paths.power * (kept == 0.0), minlength=len(changed))
         fixed = np.bincount(paths.rx_of_path, weights=kept, minlength=len(changed))

@@ -162,9 +162,9 @@ def random_links(
     tx, rx = positions[:TRANSMITTERS], positions[TRANSMITTERS:]
     rx = rx[np.linalg.norm(rx[:, None] - tx, axis=2).min(axis=1) > NEAREST_M]
     solid = replace(home, state=np.where(free, sp.CellState.FREE, sp.CellState.UNKNOWN))
-    partial = sp.explore(home, (STEPS,), seed=seed)[0]
+    seen = sp.explore(home, (STEPS,), seed=seed)[0]
     missing_m = [
-        np.concatenate([unobserved_distance_m(each, position, rx) for position in tx]) for each in (solid, partial)
+        np.concatenate([unobserved_distance_m(partial, place, rx) for place in tx]) for partial in (solid, seen)
     ]
     return sp.trace_links(home, tx, rx), np.linalg.norm(rx - tx[:, None], axis=2).ravel(), *missing_m
 
