@@ -43,6 +43,7 @@ def inputs(tmp_path: Path) -> Path:
     """Folder with the map, the measurements and the scan that the blocks read."""
     for name in ("map.yaml", "map.pgm"):
         shutil.copy(scenes_folder() / "apartment" / "step100" / name, tmp_path)
+    (tmp_path / "scenes").symlink_to(scenes_folder())
     trimesh.creation.box((7.0, 5.0, 3.0), transform=trimesh.transformations.translation_matrix((3, 2, 1.5))).export(
         tmp_path / "scan.ply"
     )
@@ -82,7 +83,7 @@ def test_other_pages_have_no_python_blocks() -> None:
 
 def test_commands_and_their_options_exist() -> None:
     text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES).replace("\\\n", " ")
-    commands = re.findall(r"(?:^ *|`)sionna-partial ([a-z-]+)([^`\n]*)", text, flags=re.MULTILINE)
+    commands = re.findall(r"(?:^ *|`|/bin/)sionna-partial ([a-z-]+)([^`\n]*)", text, flags=re.MULTILINE)
     known = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     assert len(commands) > 8
     for name, arguments in commands:
