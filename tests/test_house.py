@@ -47,7 +47,7 @@ ROOMS = {
     "calibration": (
         *("gain_errors", "material_paths", "material_fit", "material_search", "measured_building", "calibration"),
     ),
-    "placement": ("area", "objective", "climb", "state", "views", "placement"),
+    "placement": ("area", "placement"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
