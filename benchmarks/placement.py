@@ -98,7 +98,7 @@ def measure(partial: sp.PartialMap, home: sp.PartialMap, threshold_db: float) ->
 def exhaustive(
     area: PlacementArea, positions_m: NDArray[np.float64], model: sp.Predictor, settings: PlacementSettings
 ) -> NDArray[np.float64]:
-    """The objective at every position, the fastest public way: scenes are built once for many positions."""
+    """Return the objective at every position, the fastest public way: scenes are built once for many positions."""
     scores = []
     for start in range(0, len(positions_m), POSITIONS_AT_ONCE):
         some_m = positions_m[start : start + POSITIONS_AT_ONCE]
@@ -147,9 +147,8 @@ def summary(rows: list[dict[str, Any]], title: str) -> None:
     if not rows:
         return
     homes = sorted({row["seed"] for row in rows})
-    print(
-        f"\n{title}: {len(rows)} maps of {len(homes)} homes, {np.mean([row['positions'] for row in rows]):.0f} positions"
-    )
+    positions = np.mean([row["positions"] for row in rows])
+    print(f"\n{title}: {len(rows)} maps of {len(homes)} homes, {positions:.0f} positions")
     print(f"| {'search':16} | covered in truth | minus exhaustive | predicted | minus exhaustive | time / exhaustive |")
     print("|---|---|---|---|---|---|")
     total = sum(row["seconds"]["exhaustive"] for row in rows)

@@ -167,7 +167,7 @@ def _grid(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, 
 
 
 def _pairs(start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ends (A B, 3) of the lines from each of A points to each of B others."""
+    """Return the ends (A B, 3) of the lines from each of A points to each of B others."""
     return np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
 
 

@@ -219,7 +219,7 @@ def place_transmitter(
 
 
 def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDArray[np.float64]:
-    """What the objective takes of each link (N,): P(gain > threshold), or the mean gain [dB]."""
+    """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
     covered = np.zeros(len(prediction.p_los))
@@ -234,7 +234,7 @@ def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDAr
 
 
 def placement_score(values: NDArray[np.float64], weight: NDArray[np.float64], settings: PlacementSettings) -> float:
-    """The objective, of the values (N,) of receivers with weights (N,): rounded, since threads change the last bits."""
+    """Return the objective of receivers' values (N,) and weights (N,), rounded: threads change the last bits."""
     fraction = weight / weight.sum()
     if settings.objective == "coverage":
         return round(float(values @ fraction), 5)
