@@ -326,6 +326,6 @@ def _doubt(result: MaterialCalibration, name: str) -> str:
     low, high = posterior.interval(values)
     unit = "" if is_permittivity else " S/m"
     return (
-        f"the measurements cannot determine the {name}: its 95 % interval is {low:.2g} to {high:.2g}{unit}. Do not take "
-        "its value for a property of the material."
+        f"the measurements cannot determine the {name}: its 95 % interval is {low:.2g} to {high:.2g}{unit}. Do not "
+        "take its value for a property of the material."
     )
