@@ -11,13 +11,7 @@ from scipy.stats import norm
 
 import sionna_partial as sp
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.placement.placement import (
-    FEWEST_STARTS,
-    MOST_STARTS,
-    TransmitterPlacement,
-    link_values,
-    placement_score,
-)
+from sionna_partial.placement.placement import STARTS, TransmitterPlacement, link_values, placement_score
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import PlacementSettings
 
@@ -74,7 +68,7 @@ class TestPercentile:
 class TestSearch:
     def test_refines_the_best_start(self) -> None:
         found = placed()
-        assert FEWEST_STARTS == len(found.starts_m) == len(found.start_scores)
+        assert STARTS[0] == len(found.starts_m) == len(found.start_scores)
         np.testing.assert_array_equal(found.trajectory_m[0], found.starts_m[found.start_scores.argmax()])
         np.testing.assert_array_equal(found.trajectory_m[-1], found.position_m)
         assert (np.diff(found.scores) > 0.0).all()
@@ -83,7 +77,7 @@ class TestSearch:
     def test_more_starts_on_a_large_map(self) -> None:
         hall = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.5)
         settings = sp.TraceSettings(max_depth=0, diffraction=False)
-        assert len(sp.place_transmitter(hall, trace_settings=settings).starts_m) == MOST_STARTS
+        assert len(sp.place_transmitter(hall, trace_settings=settings).starts_m) == STARTS[1]
 
     def test_heights_and_free_cells(self) -> None:
         found = placed(height_m=2.5, rx_height_m=0.7)

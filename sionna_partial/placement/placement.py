@@ -3,7 +3,6 @@
 import json
 import math
 import os
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -32,23 +31,20 @@ from sionna_partial.tracing.trace import Progress, Tracer, checked_settings, nea
 RECEIVERS = 120
 """Largest number of receivers during the search; the final positions are compared at all receivers."""
 
+STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
+"""Number of positions that are traced first, and of those that are refined: fewest, most, and area for each [m^2].
+Fewer than 6 starts would miss the best room of a small home."""
+
 STEPS_M = (0.6, 0.25)
-"""Steps of the refinement [m]: neighbours at these distances are tried in turn."""
+"""Distances at which the refinement tries neighbours, in turn [m]."""
 
-FEWEST_STARTS, MOST_STARTS, AREA_PER_START_M2 = 6, 16, 3.5
-"""Number of positions that are traced first, one for each 3.5 m^2. Fewer than 6 would miss the best room of a home."""
-
-FEWEST_REFINED, MOST_REFINED, AREA_PER_REFINED_M2 = 1, 4, 25.0
-"""Number of starts that are refined, one for each 25 m^2."""
+_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
 SIMILARITY_PENALTY = 0.6
 """How much a start loses that sees the same receivers as one that is chosen already."""
 
 FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 """Of the receivers, sorted by gain, the worst 5 % count in full, and linearly less up to 15 %."""
-
-Evaluate = Callable[[NDArray[np.float64], PlacementArea], list[NDArray[np.float64]]]
-"""Returns the values of the receivers of an area for each of the transmitter positions (P, 3) [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,29 +188,37 @@ def place_transmitter(
     if not partial.is_complete:
         model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
     area = placement_area(partial, float(settings.height_m), float(settings.rx_height_m), model)
+    thinned = area.thinned(RECEIVERS)
     with temporary_folder() as folder:
-        tracer = Tracer(partial, folder, trace_settings, scene_settings)
-        starts_m = _starts(area, settings, trace_settings.frequency_hz)
-
-        def evaluate(positions_m: NDArray[np.float64], seen_by: PlacementArea) -> list[NDArray[np.float64]]:
-            return _values(positions_m, seen_by, tracer, model, settings)
-
-        found = _search(area, settings, starts_m, evaluate, report)
+        objective = _Objective(Tracer(partial, folder, trace_settings, scene_settings), model, settings)
+        report(0.1, "comparing positions")
+        starts_m = _starts(thinned, settings, trace_settings.frequency_hz)
+        start_scores = objective.scores(starts_m, thinned)
+        routes = _refined(objective, thinned, starts_m, start_scores, report)
+        report(0.9, "evaluating the best positions")
+        values = [objective.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
+    scores = [placement_score(each, area.weight, settings) for each in values]
+    best = int(np.argmax(scores))
     report(1.0, "done")
-    provenance = {
-        "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
-        "predictor_sha256": "" if model is None else model.fingerprint,
-        "scene_settings": asdict(scene_settings),
-        "trace_settings": asdict(trace_settings),
-    }
     return TransmitterPlacement(
-        **found,
+        position_m=routes[best][0][-1],
+        score=scores[best],
+        trajectory_m=routes[best][0],
+        scores=routes[best][1],
+        starts_m=starts_m,
+        start_scores=start_scores,
         rx_m=area.rx_m,
         weight=area.weight,
+        values=values[best],
         spacing_m=area.spacing_m,
         partial=partial,
         settings=settings,
-        provenance=provenance,
+        provenance={
+            "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
+            "predictor_sha256": "" if model is None else model.fingerprint,
+            "scene_settings": asdict(scene_settings),
+            "trace_settings": asdict(trace_settings),
+        },
     )
 
 
@@ -250,22 +254,45 @@ def _counted(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)
 
 
-def _starts(area: PlacementArea, settings: PlacementSettings, frequency_hz: float) -> NDArray[np.float64]:
-    """Choose positions (S, 3) that see much, each something else, the best first [m].
+@dataclass(frozen=True, eq=False)
+class _Objective:
+    """The objective at transmitter positions: links are traced and predicted."""
 
-    A position's score is lowered by how much it sees what one chosen before sees.
-    """
-    thinned, positions_m = area.thinned(RECEIVERS), area.positions(int(settings.seed))
-    range_m = math.inf
+    tracer: Tracer
+    model: Predictor | None
+    settings: PlacementSettings
+
+    def values(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+        """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
+        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.tracer.settings.frequency_hz)
+        values = np.full(far.shape, 1.0 if self.settings.objective == "coverage" else 0.0)
+        if not far.any():
+            return values
+        features = []
+        for tx_m, kept in zip(positions_m, far, strict=True):
+            paths = self.tracer.paths(tx_m, area.rx_m[kept], lambda fraction, message: None)
+            features.append(features_of_paths(area.partial, tx_m, area.rx_m[kept], paths))
+        phi = LinkFeatures.concatenate(features)
+        prediction = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+        values[far] = link_values(prediction, self.settings)
+        return values
+
+    def scores(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+        """Scores (P,) of positions (P, 3) [m]."""
+        return np.array([placement_score(each, area.weight, self.settings) for each in self.values(positions_m, area)])
+
+
+def _starts(area: PlacementArea, settings: PlacementSettings, frequency_hz: float) -> NDArray[np.float64]:
+    """Choose positions (S, 3) [m] by visibility: a score is lowered by what the position sees of what others see."""
+    positions_m, range_m = area.positions(int(settings.seed)), math.inf
     if settings.objective == "coverage":  # by Friis' formula
         loss = 10.0 ** (-settings.threshold_db / 20.0)
         range_m = SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi) * loss
-    seen = thinned.visibility(positions_m, range_m)
-    scores = np.array([placement_score(values, thinned.weight, settings) for values in seen])
-    fraction = thinned.weight / thinned.weight.sum()
+    seen = area.visibility(positions_m, range_m)
+    scores = np.array([placement_score(values, area.weight, settings) for values in seen])
+    fraction = area.weight / area.weight.sum()
     chosen, similarity = [int(np.argmax(scores))], np.zeros(len(scores))
-    count = _per_area(area, AREA_PER_START_M2, FEWEST_STARTS, MOST_STARTS)
-    while len(chosen) < min(count, len(scores)):
+    while len(chosen) < min(_per_area(area, *STARTS), len(scores)):
         similarity = np.maximum(similarity, 1.0 - np.abs(seen - seen[chosen[-1]]) @ fraction)
         left = scores - SIMILARITY_PENALTY * similarity
         left[chosen] = -math.inf
@@ -273,88 +300,29 @@ def _starts(area: PlacementArea, settings: PlacementSettings, frequency_hz: floa
     return positions_m[chosen]
 
 
-def _per_area(area: PlacementArea, each_m2: float, fewest: int, most: int) -> int:
-    return min(max(round(area.size_m2 / each_m2), fewest), most)
-
-
-def _search(
+def _refined(
+    objective: _Objective,
     area: PlacementArea,
-    settings: PlacementSettings,
     starts_m: NDArray[np.float64],
-    evaluate: Evaluate,
+    start_scores: NDArray[np.float64],
     report: Progress,
-) -> dict[str, Any]:
-    """Evaluate the starts, refine the best of them, and compare the results at all receivers."""
-    thinned = area.thinned(RECEIVERS)
-
-    def scores_of(positions_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.array([placement_score(each, thinned.weight, settings) for each in evaluate(positions_m, thinned)])
-
-    report(0.1, "comparing positions")
-    start_scores = scores_of(starts_m)
-    count = _per_area(area, AREA_PER_REFINED_M2, FEWEST_REFINED, MOST_REFINED)
-    best = np.argsort(-start_scores, kind="stable")[:count]
-    routes = [(starts_m[[index]], start_scores[[index]]) for index in best]
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Move the best starts to better neighbours: positions (K, 3) [m] and scores (K,) of each route."""
+    best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]
+    routes = [([starts_m[index]], [start_scores[index]]) for index in best]
     for number, step_m in enumerate(STEPS_M):
         report(0.4 + 0.5 * number / len(STEPS_M), f"refining, step {number + 1} of {len(STEPS_M)}")
-        around_m = [_neighbours(area, trajectory_m[-1], step_m) for trajectory_m, _ in routes]
-        around_scores = np.split(scores_of(np.vstack(around_m)), np.cumsum([len(each) for each in around_m])[:-1])
-        for route, (trajectory_m, scores) in enumerate(routes):
-            if around_scores[route].max(initial=-math.inf) > scores[-1]:
-                to = int(np.argmax(around_scores[route]))
-                trajectory_m = np.vstack([trajectory_m, around_m[route][to]])
-                routes[route] = trajectory_m, np.append(scores, around_scores[route][to])
-    report(0.9, "evaluating the best positions")
-    values = evaluate(np.stack([trajectory_m[-1] for trajectory_m, _ in routes]), area)
-    final_scores = [placement_score(each, area.weight, settings) for each in values]
-    best_route = int(np.argmax(final_scores))
-    trajectory_m, scores = routes[best_route]
-    return {
-        "position_m": trajectory_m[-1],
-        "score": final_scores[best_route],
-        "trajectory_m": trajectory_m,
-        "scores": scores,
-        "starts_m": starts_m,
-        "start_scores": start_scores,
-        "values": values[best_route],
-    }
+        neighbours_m = np.array([route_m[-1] for route_m, _ in routes])[:, None] + step_m * _DIRECTIONS
+        neighbours_m[..., :2] = np.round(neighbours_m[..., :2], 3)
+        stands = area.stands(neighbours_m)
+        scores = np.full(stands.shape, -math.inf)
+        scores[stands] = objective.scores(neighbours_m[stands], area)
+        for (route_m, route_scores), around_m, around_scores in zip(routes, neighbours_m, scores, strict=True):
+            if around_scores.max() > route_scores[-1]:
+                route_m.append(around_m[around_scores.argmax()])
+                route_scores.append(around_scores.max())
+    return [(np.array(route_m), np.array(route_scores)) for route_m, route_scores in routes]
 
 
-def _neighbours(area: PlacementArea, position_m: NDArray[np.float64], step_m: float) -> NDArray[np.float64]:
-    """Positions (K, 3) at a step along the axes where a transmitter may stand [m]."""
-    around_m = position_m + step_m * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, -1.0, 0]])
-    around_m[:, :2] = np.round(around_m[:, :2], 3)
-    return around_m[area.stands(around_m)]
-
-
-def _values(
-    positions_m: NDArray[np.float64],
-    area: PlacementArea,
-    tracer: Tracer,
-    model: Predictor | None,
-    settings: PlacementSettings,
-) -> list[NDArray[np.float64]]:
-    """Trace and predict from each of the positions (P, 3): values (N,) of the receivers.
-
-    A receiver at the transmitter is covered, with a gain of 0 dB.
-    """
-    if not len(positions_m):
-        return []
-    at_transmitter = 1.0 if settings.objective == "coverage" else 0.0
-    limit_m = nearest_m(tracer.settings.frequency_hz)
-    far = [np.linalg.norm(area.rx_m - tx_m, axis=1) >= limit_m for tx_m in positions_m]
-    features = [
-        features_of_paths(area.partial, tx_m, area.rx_m[kept], tracer.paths(tx_m, area.rx_m[kept], _quiet))
-        for tx_m, kept in zip(positions_m, far, strict=True)
-    ]
-    phi = LinkFeatures.concatenate(features)
-    of_links = link_values(LinkPrediction.of_trace(phi) if model is None else model.predict(phi), settings)
-    values = [np.full(len(area.rx_m), at_transmitter) for _ in positions_m]
-    parts = np.split(of_links, np.cumsum([kept.sum() for kept in far])[:-1])
-    for each, kept, part in zip(values, far, parts, strict=True):
-        each[kept] = part
-    return values
-
-
-def _quiet(fraction: float, message: str) -> None:
-    """Report nothing."""
+def _per_area(area: PlacementArea, fewest: int, most: int, each_m2: float) -> int:
+    return min(max(round(area.size_m2 / each_m2), fewest), most)
