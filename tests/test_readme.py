@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 import sionna_partial as sp
-from sionna_partial.calibration import material_fit
+from sionna_partial.calibration import material_search
 from sionna_partial.resources import scenes_folder
 
 README = Path(__file__).resolve().parents[1] / "README.md"
@@ -43,14 +43,8 @@ def test_python_lines_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         tmp_path / "scan.ply"
     )
     write_measurements(tmp_path)
-    for name, value in {
-        "MOST_FRINGES": 1,
-        "MOST_CELLS": 60,
-        "FEW_FRINGES": 1,
-        "FRINGE_CELLS": 1,
-        "COARSE_CELLS": 8,
-    }.items():
-        monkeypatch.setattr(material_fit, name, value)  # a short search
+    for name, value in {"MOST_TEETH": 1, "MOST_CELLS": 60, "FEW_TEETH": 1, "TEETH_PARTS": 1, "COARSE_PARTS": 8}.items():
+        monkeypatch.setattr(material_search, name, value)  # a short search
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for block in blocks("python"):
