@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial as bind
 from pathlib import Path
 from typing import Any
 
@@ -226,14 +225,17 @@ def calibrate_materials(
         np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(measured)), GAIN_FLOOR_DB)
         for each in (fit.steps[0], fit.point)
     ]
+    doubts = _undetermined(begin, fit)
+    for message in doubts.values():
+        _log.warning("%s", message)
     values = (*fit.point.values, *fit.deviations)
     numbers = [float(each[0]) if partial.mesh is None or len(materials) == 1 else each for each in values]
-    result = MaterialCalibration(
+    return MaterialCalibration(
         permittivity=numbers[0],
         conductivity=numbers[1],
         permittivity_std=numbers[2],
         conductivity_std=numbers[3],
-        undetermined=_undetermined(begin, fit),
+        undetermined=tuple(doubts),
         loss=np.minimum.accumulate([each.loss for each in fit.steps]) / used.sum(),
         noise_db=fit.point.errors.noise_db,
         used=used,
@@ -247,9 +249,6 @@ def calibrate_materials(
         scene=building.with_materials(materials),
         settings=settings,
     )
-    for name in result.undetermined:
-        _log.warning("%s", _doubt(result, name))
-    return result
 
 
 @dataclass(frozen=True)
@@ -270,19 +269,18 @@ def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float,
     posteriors: dict[int, Posterior] = {}
     best = [begin]
     for number, which in enumerate(rounds):
-        advance = bind(_report_part, report, 0.3 + 0.6 * number / len(rounds), 0.6 / len(rounds))
+
+        def advance(fraction: float, message: str, number: int = number) -> None:
+            report(0.3 + 0.6 * (number + fraction) / len(rounds), message)
+
         best, posteriors[which] = search(target, best[0], which, start[which].thickness_m, frequency_hz, advance)
-    descents = [descend(target, each, bind(_report_part, report, 0.9, 0.1)) for each in best]
+    descents = [descend(target, each, lambda part, message: report(0.9 + 0.1 * part, message)) for each in best]
     steps, curvature = min(descents, key=lambda found: found[0][-1].loss)
     ordered = [posteriors[which] for which in range(len(start))]
     typical = [each.typical(material.thickness_m, frequency_hz) for each, material in zip(ordered, start, strict=True)]
     point = target.at(np.stack(typical, axis=1))
     shown = [begin, *(each for each in steps if each.loss < begin.loss)]
     return _Fit(shown, point, ordered, _deviations(point, ordered, curvature))
-
-
-def _report_part(report: Progress, start: float, length: float, fraction: float, message: str) -> None:
-    report(start + length * fraction, message)
 
 
 def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -304,28 +302,19 @@ def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: NDArra
     return np.maximum(own, together * (point.values - LOSSLESS))
 
 
-def _undetermined(start: Sequence[Material], fit: _Fit) -> tuple[str, ...]:
-    """Names of the parameters that the measurements tell little about."""
-    prior, names = prior_posterior(), []
+def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
+    """Parameters that the measurements hardly determine, and a message for each."""
+    prior, doubts = prior_posterior(), {}
     for which, (posterior, material) in enumerate(zip(fit.posteriors, start, strict=True)):
         offsets = {"permittivity": 0.0, "conductivity": 0.1 * lossless_scale_s_m(2.0, material.thickness_m)}
         for row, (name, offset) in enumerate(offsets.items()):
             before, after = (np.log(each.values[row] + offset) for each in (prior, posterior))
             spread = prior.deviation(before, float(prior.weight @ before))
             if posterior.deviation(after, math.log(fit.point.values[row, which] + offset)) > DETERMINED * spread:
-                names.append(name if len(start) == 1 else f"{name}[{which}]")
-    return tuple(names)
-
-
-def _doubt(result: MaterialCalibration, name: str) -> str:
-    """Message for a parameter that the measurements do not determine, with its 95 % interval."""
-    which = int(name.partition("[")[2].rstrip("]") or 0)
-    posterior = result.posteriors[which]
-    is_permittivity = name.startswith("permittivity")
-    values = posterior.permittivity if is_permittivity else posterior.conductivity_s_m
-    low, high = posterior.interval(values)
-    unit = "" if is_permittivity else " S/m"
-    return (
-        f"the measurements cannot determine the {name}: its 95 % interval is {low:.2g} to {high:.2g}{unit}. Do not "
-        "take its value for a property of the material."
-    )
+                low, high = posterior.interval(posterior.values[row])
+                full_name = name if len(start) == 1 else f"{name}[{which}]"
+                doubts[full_name] = (
+                    f"the measurements cannot determine the {full_name}: its 95 % interval is {low:.2g} to {high:.2g}"
+                    f"{' S/m' * row}. Do not take its value for a property of the material."
+                )
+    return doubts

@@ -213,7 +213,7 @@ class MaterialTarget:
 
     def points(self, values: NDArray[np.float64]) -> list[Point]:
         """Evaluate many materials (K, 2, M) together, which is quicker than one by one with `at`."""
-        found = []
+        found: list[Point] = []
         for start in range(0, len(values), self.paths.at_once):
             some = values[start : start + self.paths.at_once]
             found += map(self._point, some, self.paths.powers(some[:, 0], some[:, 1]))
@@ -281,7 +281,7 @@ def prior_posterior() -> Posterior:
     spread = np.linspace(-3.0, 3.0, 31)
     values = LOSSLESS + PRIOR_MEDIAN * np.exp(PRIOR_SPREAD * np.reshape(np.meshgrid(spread, spread), (2, -1)))
     weight = np.outer(np.exp(-0.5 * spread**2), np.exp(-0.5 * spread**2)).ravel()
-    return Posterior(*values, weight / weight.sum())
+    return Posterior(values[0], values[1], weight / weight.sum())
 
 
 def lossless_scale_s_m(index: float, thickness_m: float) -> float:
