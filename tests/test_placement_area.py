@@ -1,6 +1,9 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, use_fakes
+from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of
+from numpy.typing import NDArray
 from placement_cases import TWO_ROOMS, home
 
 from sionna_partial.constants import CellState
@@ -8,6 +11,15 @@ from sionna_partial.coverage import predict_map
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.settings import TraceSettings
+
+
+class IndoorBy(FakePredictor):
+    """Predicts the probability of being indoors by a function of the features."""
+
+    def __init__(self, predict_indoor: Callable[[LinkFeatures], NDArray[np.float64]]) -> None:
+        self.predict_indoor = predict_indoor  # type: ignore[method-assign]
 
 
 def two_rooms() -> PlacementArea:
@@ -73,10 +85,9 @@ class TestPositions:
 
 
 class TestReceivers:
-    def test_where_predict_map_has_valid_ones(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        use_fakes(monkeypatch)
-        partial = map_of(PICTURE)
-        coverage = predict_map(partial, TX, spacing_m=0.5)
+    def test_where_predict_map_has_valid_ones(self) -> None:
+        partial, settings = map_of(PICTURE), TraceSettings(max_depth=0, diffraction=False)
+        coverage = predict_map(partial, TX, spacing_m=0.5, predictor="paper", trace_settings=settings)
         rows, columns = np.nonzero(coverage["valid"].to_numpy())
         expected = np.column_stack([coverage["x"].to_numpy()[columns], coverage["y"].to_numpy()[rows]])
         found = placement_area(partial, 1.5, 1.2, FakePredictor()).rx_m
@@ -96,16 +107,15 @@ class TestReceivers:
         assert (partial.state_at(area.rx_m) == CellState.FREE).all()
         assert (area.weight == 1.0).all()
 
-    def test_those_hardly_indoors_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(FakePredictor, "predict_indoor", lambda self, phi: np.full(len(phi), 0.01))
+    def test_those_hardly_indoors_are_left_out(self) -> None:
         partial = map_of(PICTURE)
-        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        area = placement_area(partial, 1.5, 1.5, IndoorBy(lambda phi: np.full(len(phi), 0.01)))
         assert (partial.state_at(area.rx_m) == CellState.FREE).all()
 
-    def test_the_nearer_to_what_is_seen_the_more(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """P(indoor) is asked with lengths that grow with the distance from the free cells."""
-        monkeypatch.setattr(FakePredictor, "predict_indoor", lambda self, phi: np.exp(-phi.unobserved_distance_m))
-        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, FakePredictor())
+    def test_the_nearer_to_free_cells_the_more(self) -> None:
+        """P(indoor) is predicted for lengths that grow with the distance from the free cells."""
+        model = IndoorBy(lambda phi: np.exp(-phi.unobserved_distance_m))
+        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, model)
         order = np.argsort(area.rx_m[:, 0])
         assert (np.diff(area.weight[order][3:]) < 0.0).all()
 

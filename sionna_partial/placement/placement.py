@@ -145,7 +145,8 @@ def place_transmitter(
     progress : callable, optional
         Called as ``progress(fraction_done, message)``.
     **options
-        Fields of `PlacementSettings`: `objective`, `threshold_db`, `height_m`, `rx_height_m` and `seed`.
+        Fields of `sionna_partial.settings.PlacementSettings`: `objective` ("coverage", the default, or "percentile"),
+        `threshold_db` (-100 dB), `height_m` and `rx_height_m` (1.5 m), and `seed` (0).
 
     Returns
     -------
@@ -169,7 +170,7 @@ def place_transmitter(
     >>> import sionna_partial as sp
     >>> home = sp.make_home(7)
     >>> found = sp.place_transmitter(home, objective="coverage", threshold_db=-100.0)
-    >>> home.state_at(found.position_m) == sp.CellState.FREE
+    >>> bool(home.state_at(found.position_m) == sp.CellState.FREE)
     True
     """
     settings = PlacementSettings(**options)
