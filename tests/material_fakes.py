@@ -51,4 +51,4 @@ def quiet(share: float, message: str) -> None:
 
 
 def point(target: MaterialTarget, permittivity: float, conductivity_s_m: float) -> Point:
-    return target.at(np.array([permittivity]), np.array([conductivity_s_m]))
+    return target.at(np.array([[permittivity], [conductivity_s_m]]))

@@ -42,12 +42,9 @@ ROOMS = {
     ),
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "link_distribution", "path_power", "scene"),
-    "checkpoint": ("checkpoint",),
     "measurements": ("measurements",),
-    "calibration": (
-        *("gain_errors", "material_paths", "material_fit", "material_search", "measured_building", "calibration"),
-    ),
-    "placement": ("area", "objective", "climb", "state", "views", "placement"),
+    "calibration": (*("material_paths", "material_fit", "measured_building", "calibration"),),
+    "placement": ("area", "placement"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
@@ -60,7 +57,7 @@ ROOMS = {
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "checkpoint", "training", "results"}
+FILES = {"foundations", "coverage", "training", "results"}
 """Rooms whose modules are files of the package itself."""
 
 MODULES = tuple(

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sionna_partial.cli.shell import (
-    CheckpointOption,
     DiffractionOption,
     FrequencyOption,
     HeightBandOption,
@@ -48,7 +47,6 @@ def calibrate(
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     max_depth: MaxDepthOption = 6,
     diffraction: DiffractionOption = True,
-    checkpoint: CheckpointOption = None,
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
@@ -80,7 +78,6 @@ def calibrate(
             start=scene_settings.material if material else None,
             settings=settings,
             scene_settings=scene_settings,
-            checkpoint=checkpoint,
             progress=report,
         )
         with atomic_files(out) as folder:
@@ -95,26 +92,25 @@ def place(
     map_path: MapArgument,
     out: Annotated[Path, typer.Option(help="Folder for the numbers and a picture.", show_default=False)],
     objective: Annotated[
-        Objective, typer.Option(help="Mean predicted coverage, or the gain of the worst tenth of the places.")
+        Objective, typer.Option(help="Mean predicted coverage, or the gain of the worst tenth of the receivers.")
     ] = "coverage",
-    threshold: Annotated[float, typer.Option(help="Path gain above which a place is covered [dB].")] = -100.0,
+    threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
     height: Annotated[float, typer.Option(help="Height of the transmitter [m].")] = DEFAULT_HEIGHT_M,
     rx_height: Annotated[float, typer.Option(help="Height of the receivers [m].")] = DEFAULT_HEIGHT_M,
-    seed: Annotated[int, typer.Option(help="Seed of the places that are compared.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of the positions that are compared.")] = 0,
     frequency: FrequencyOption = CARRIER_FREQUENCY_HZ,
     material: MaterialOption = "",
     max_depth: MaxDepthOption = 6,
     diffraction: DiffractionOption = True,
     predictor: PredictorOption = "",
-    checkpoint: CheckpointOption = None,
     strict: StrictOption = False,
     height_band: HeightBandOption = None,
     up: UpOption = None,
     wall_height: WallHeightOption = None,
 ) -> None:
-    """Find a good place for a transmitter on a partial map.
+    """Find a good position for a transmitter on a partial map.
 
-    The folder --out gets the place and the way to it as JSON, and a picture.
+    The folder --out gets the position and the search as JSON, and a picture.
     """
     scene_settings = SceneSettings(material=parse_material(material))
     trace_settings = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
@@ -138,23 +134,22 @@ def place(
             predictor=predictor or None,
             scene_settings=scene_settings,
             trace_settings=trace_settings,
-            checkpoint=checkpoint,
             progress=report,
         )
         with atomic_files(out) as folder:
             result.save(folder / "placement.json")
             (folder / "placement.png").write_bytes(figure_png(plot_placement(result)))
-    typer.echo(_found_place(result))
+    typer.echo(_found_position(result))
     print_files([out / name for name in ("placement.json", "placement.png")])
 
 
-def _found_place(result: "TransmitterPlacement") -> str:
-    """Say where the transmitter goes, and how good that is."""
+def _found_position(result: "TransmitterPlacement") -> str:
+    """One line with the position of the transmitter and its score."""
     x, y, z = result.position_m
-    if result.objective.name == "coverage":
-        score = f"{result.score:.1%} of the places are predicted above {result.objective.threshold_db:g} dB"
+    if result.settings.objective == "coverage":
+        score = f"{result.score:.1%} of the receivers are predicted above {result.settings.threshold_db:g} dB"
     else:
-        score = f"the worst tenth of the places is predicted at {result.score:.1f} dB"
+        score = f"the worst tenth of the receivers is predicted at {result.score:.1f} dB"
     return f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {score}"
 
 

@@ -46,10 +46,6 @@ WallHeightOption = Annotated[
 ]
 MemoryOption = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
 PredictorOption = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
-CheckpointOption = Annotated[
-    Path | None, typer.Option(metavar="JSON", help="Keeps what has been found: a stopped run goes on from there.")
-]
-
 
 LINE_S = 60.0
 """Time between two lines of progress where there is no terminal [s]."""
