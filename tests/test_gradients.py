@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from meshes import room
 from numpy.typing import NDArray
+from pillar_room import RX_M, TX_M, small_room
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import BackendError, PositionError, SettingsError
 from sionna_partial.tracing import fixed_paths, gradients
 from sionna_partial.tracing.gradients import GainGradients, gain_gradients
-from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
 SLOPES = (
     *("tx_db_per_m", "relative_permittivity_db", "conductivity_db_per_s_m", "thickness_db_per_m"),

@@ -9,9 +9,9 @@ import trimesh
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 from numpy.typing import NDArray
 
+from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.candidates import mesh_candidates
-from sionna_partial.tracing.mesh.rays import shoot_rays
-from sionna_partial.tracing.plan.candidates import Candidates
+from sionna_partial.tracing.mesh.sequences import shoot_rays
 
 SIZE = np.array([8.0, 6.0, 3.0])
 TX = np.array([0.3, -0.2, 0.1])

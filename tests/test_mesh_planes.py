@@ -17,7 +17,7 @@ def fine_box(turn: NDArray[np.float64] | None = None) -> trimesh.Trimesh:
 
 
 def looked_up(planes: MeshPlanes, plane: NDArray[np.int32], points: NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.array([face_at(planes[5:], p, *point) for p, point in zip(plane, points, strict=True)])
+    return np.array([face_at(planes, p, *point) for p, point in zip(plane, points, strict=True)])
 
 
 class TestGroupPlanes:

@@ -2,8 +2,7 @@ import numpy as np
 import trimesh
 
 from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
-from sionna_partial.tracing.mesh.rays import Rays
-from sionna_partial.tracing.mesh.sequences import MARGIN, Chains, collect_chains, view_chains
+from sionna_partial.tracing.mesh.sequences import MARGIN, Rays, Sequences, collect_sequences, view_sequences
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -20,9 +19,9 @@ def rays_along(face: list[list[int]], leg_m: list[list[float]], direction: np.nd
     return Rays(np.array(face, np.int32), np.array(leg_m, np.float32), directions.astype(np.float32))
 
 
-def chain_planes(chains: Chains, node: int) -> list[int]:
-    before = chain_planes(chains, int(chains.parent[node])) if chains.parent[node] >= 0 else []
-    return [*before, int(chains.plane[node])]
+def sequence_planes(sequences: Sequences, node: int) -> list[int]:
+    before = sequence_planes(sequences, int(sequences.parent[node])) if sequences.parent[node] >= 0 else []
+    return [*before, int(sequences.plane[node])]
 
 
 class TestCollectChains:
@@ -32,24 +31,24 @@ class TestCollectChains:
         rays = rays_along(
             [[first[0], second[1]], [first[1], second[0]], [first[1], -1]], [[1, 2, 3], [2, 2, 1], [1, 9, 9]]
         )
-        chains = collect_chains([rays], planes)
-        assert [chain_planes(chains, node) for node in range(chains.size)] == [[0], [0, 1]]
-        assert chains.rays == 3
+        sequences = collect_sequences([rays], planes)
+        assert [sequence_planes(sequences, node) for node in range(sequences.size)] == [[0], [0, 1]]
+        assert sequences.rays == 3
 
     def test_reach_is_the_longest_unfolded_length(self) -> None:
         planes = box_planes()
         rays = rays_along([[0, 5], [0, 5], [0, -1]], [[1, 2, 3], [2, 2, 1], [1, np.inf, np.inf]])
-        chains = collect_chains([rays], planes)
-        assert chains.reach_m[:2].tolist() == [np.inf, 6.0]
+        sequences = collect_sequences([rays], planes)
+        assert sequences.reach_m[:2].tolist() == [np.inf, 6.0]
 
     def test_boxes_hold_the_directions_in_which_rays_left(self) -> None:
         direction = np.random.default_rng(0).normal(size=(50, 3, 3))
         direction /= np.linalg.norm(direction, axis=2, keepdims=True)
-        chains = collect_chains([rays_along([[0, 5]] * 50, [[1, 1, 1]] * 50, direction)], box_planes())
+        sequences = collect_sequences([rays_along([[0, 5]] * 50, [[1, 1, 1]] * 50, direction)], box_planes())
         for node in range(2):
             left = direction[:, node + 1].astype(np.float32)
-            np.testing.assert_array_equal(chains.low[node], left.min(axis=0))
-            np.testing.assert_array_equal(chains.high[node], left.max(axis=0))
+            np.testing.assert_array_equal(sequences.low[node], left.min(axis=0))
+            np.testing.assert_array_equal(sequences.high[node], left.max(axis=0))
 
     def test_as_many_chains_as_there_are(self) -> None:
         """More than the arrays hold at first, and the same for rays in parts."""
@@ -57,11 +56,11 @@ class TestCollectChains:
         first = np.array([np.flatnonzero(planes.plane == plane)[0] for plane in range(6)])
         face = first[np.stack(np.unravel_index(np.arange(6**5), (6,) * 5), axis=1)]
         rays = rays_along(face.tolist(), [[1.0] * 6] * len(face))
-        whole = collect_chains([rays], planes)
+        whole = collect_sequences([rays], planes)
         assert whole.size == sum(6**depth for depth in range(1, 6))
-        assert len({tuple(chain_planes(whole, node)) for node in range(whole.size)}) == whole.size
+        assert len({tuple(sequence_planes(whole, node)) for node in range(whole.size)}) == whole.size
         parts = [Rays(*(field[start : start + 1000] for field in rays)) for start in range(0, len(face), 1000)]
-        np.testing.assert_array_equal(collect_chains(parts, planes).plane[: whole.size], whole.plane[: whole.size])
+        np.testing.assert_array_equal(collect_sequences(parts, planes).plane[: whole.size], whole.plane[: whole.size])
 
 
 class TestViewChains:
@@ -69,7 +68,7 @@ class TestViewChains:
         planes = box_planes()
         face = [int(np.flatnonzero(planes.normal[planes.plane] @ axis)[0]) for axis in np.eye(3)]
         tx = np.array([1.0, 2.0, 0.5])
-        views = view_chains(collect_chains([rays_along([face], [[1, 1, 1, 1]])], planes), planes, tx)
+        views = view_sequences(collect_sequences([rays_along([face], [[1, 1, 1, 1]])], planes), planes, tx)
         walls = np.array(
             [planes.offset_m[planes.plane[f]] * planes.normal[planes.plane[f]][k] for k, f in enumerate(face)]
         )
@@ -82,23 +81,23 @@ class TestViewChains:
         planes = box_planes()
         first = [int(np.flatnonzero(planes.plane == plane)[0]) for plane in range(4)]
         face = [[first[0], first[1]], [first[2], first[1]], [first[0], first[3]], [first[2], first[0]]]
-        chains = collect_chains([rays_along(face, [[1, 1, 1]] * 4)], planes)
-        order = view_chains(chains, planes, np.zeros(3)).order
-        assert [chain_planes(chains, node) for node in order] == [[0], [0, 1], [0, 3], [2], [2, 1], [2, 0]]
+        sequences = collect_sequences([rays_along(face, [[1, 1, 1]] * 4)], planes)
+        order = view_sequences(sequences, planes, np.zeros(3)).order
+        assert [sequence_planes(sequences, node) for node in order] == [[0], [0, 1], [0, 3], [2], [2, 1], [2, 0]]
 
     def test_margin_is_no_more_than_a_small_plane_can_span(self) -> None:
         corners = np.array([[0, 0, 9], [0.1, 0, 9], [0, 0.1, 9], [-9, -9, -1], [9, -9, -1], [0, 9, -1]], float)
         planes = group_planes(corners, np.array([[0, 1, 2], [3, 4, 5]]))
         rays = rays_along([[0, 1], [1, -1]], [[9, 10, 1], [1, np.inf, np.inf]])
-        chains = collect_chains([rays], planes)
-        margin = view_chains(chains, planes, np.zeros(3)).margin
-        assert chain_planes(chains, 1) == [planes.plane[0], planes.plane[1]]
+        sequences = collect_sequences([rays], planes)
+        margin = view_sequences(sequences, planes, np.zeros(3)).margin
+        assert sequence_planes(sequences, 1) == [planes.plane[0], planes.plane[1]]
         assert 0.1 * np.sqrt(2) / 9 < margin[0] < 0.02
         assert margin[1] == margin[0]
         assert margin[2] > 1.0
         np.testing.assert_allclose(
-            view_chains(chains._replace(rays=10**6), planes, np.zeros(3)).margin[2], MARGIN * 3.545e-3, rtol=1e-3
+            view_sequences(sequences._replace(rays=10**6), planes, np.zeros(3)).margin[2], MARGIN * 3.545e-3, rtol=1e-3
         )
 
     def test_no_rays(self) -> None:
-        assert len(view_chains(collect_chains([], box_planes()), box_planes(), np.zeros(3)).order) == 0
+        assert len(view_sequences(collect_sequences([], box_planes()), box_planes(), np.zeros(3)).order) == 0

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 
-from sionna_partial.tracing.mesh import rays as module
-from sionna_partial.tracing.mesh.rays import Rays, shoot_rays
+from sionna_partial.tracing.mesh import sequences as module
+from sionna_partial.tracing.mesh.sequences import Rays, shoot_rays
 
 TX = np.array([0.3, -0.2, 0.1])
 

@@ -9,13 +9,13 @@ import pytest
 from extruded import ROOM, extrude
 
 from sionna_partial.scene.scene import write_scene
-from sionna_partial.tracing.sionna_rt import MITSUBA_VARIANT, load_sionna, open_scene
+from sionna_partial.tracing.engine import MITSUBA_VARIANT, load_sionna, open_scene
 
 WITH_VARIANT = """
 import sys
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
-from sionna_partial.tracing.sionna_rt import load_sionna
+from sionna_partial.tracing.engine import load_sionna
 load_llvm()
 import mitsuba
 mitsuba.set_variant(sys.argv[1])

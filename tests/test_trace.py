@@ -16,7 +16,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.sionna_rt import load_sionna
+from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9

@@ -14,8 +14,8 @@ from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.engine import SceneSolver
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.solver import SceneSolver
 from sionna_partial.tracing.trace import TracedLinks, trace_links
 
 MARGIN_M = 1e-3

@@ -1,8 +1,8 @@
-"""Candidates of the path solver in any mesh: chains of planes that rays have met, and the receivers they can reach.
+"""Candidates of meshes: sequences of planes that rays have met, and the receivers that each can reach.
 
-A specular path is a straight line from an image of the transmitter, reflected in the planes of its chain. Rays say
-which chains there are, and, seen from the image, in which directions their last leg goes and how far. A receiver that
-lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of every plane of the chain.
+A specular path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays
+determine which sequences there are, and, seen from the image, in which directions their last leg goes and how far. A
+receiver that lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of each plane.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,31 +13,22 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.scene.floor_plan import grow
-from sionna_partial.tracing.mesh.planes import face_at, group_planes
-from sionna_partial.tracing.mesh.rays import Rays
-from sionna_partial.tracing.mesh.sequences import collect_chains, view_chains
-from sionna_partial.tracing.plan.candidates import Candidates
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.mesh.planes import MeshPlanes, face_at, group_planes
+from sionna_partial.tracing.mesh.sequences import Rays, Sequences, Views, collect_sequences, view_sequences
 
 _REACH, _REACH_M = 1.1, 0.3
-"""Factor and length [m] by which receivers may lie farther than the chain's rays went."""
+"""Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
 
 _LEAF = 8
 """Largest number of receivers in a box that is not divided further."""
 
 
 class _Boxes(NamedTuple):
-    """Receivers in a tree of boxes; box 0 holds all.
+    """N receivers in a tree of K boxes; box 0 holds all.
 
-    Parameters
-    ----------
-    order : (N,) int64 array
-        Receivers in the order of their boxes.
-    start, stop : (K,) int64 arrays
-        Part of `order` that each box holds.
-    child : (K,) int64 array
-        First of the two boxes in it, or -1.
-    low_m, high_m : (K, 3) float64 arrays
-        Corners of the boxes [m].
+    Box k holds the part `start` to `stop` of the receivers in `order` (N,), and `child` is the first of the two boxes
+    in it, or -1. `low_m`, `high_m` (K, 3) are the corners of the boxes.
     """
 
     order: NDArray[np.int64]
@@ -46,6 +37,16 @@ class _Boxes(NamedTuple):
     child: NDArray[np.int64]
     low_m: NDArray[np.float64]
     high_m: NDArray[np.float64]
+
+
+class _Search(NamedTuple):
+    """What receivers (N, 3) are searched with: all sequences, their images, their planes, and boxes of receivers."""
+
+    sequences: Sequences
+    views: Views
+    planes: MeshPlanes
+    boxes: _Boxes
+    rx_m: NDArray[np.float64]
 
 
 def mesh_candidates(
@@ -58,44 +59,24 @@ def mesh_candidates(
     max_depth: int,
     candidates_per_block: int = 200_000,
 ) -> Iterator[tuple[Candidates, float]]:
-    """Find the paths that can exist, block by block: line of sight to every receiver, then chain after chain.
+    """Yield the paths that can exist, and the fraction of the work done: direct paths, then sequence after sequence.
 
-    Parameters
-    ----------
-    vertices_m : (V, 3) array
-        Vertices of the mesh [m].
-    triangles : (F, 3) array
-        Faces, as indices into `vertices_m`, in the order in which `rays` counts them.
-    rays : iterable of Rays
-        Rays in all directions from the transmitter, from `shoot_rays` with the same `max_depth`.
-    tx_m, rx_m : (3,) and (N, 3) arrays
-        Transmitter and receivers [m].
-    max_depth : int
-        Largest number of reflections of a path.
-    candidates_per_block : int
-        Number of candidates in a block, which bounds the memory. The line of sight to all receivers is one block.
-
-    Yields
-    ------
-    Candidates
-    float
-        Share of the work done with this block.
+    `rays` come from `shoot_rays`, with the same transmitter (3,) and `max_depth`, and count the faces like `triangles`.
     """
     if len(rx_m) == 0:
         return
-    none = np.zeros(0, np.int32)
     size = max(1, max_depth)
     direct = np.arange(len(rx_m), dtype=np.int32)
-    yield Candidates(direct, np.full((len(rx_m), size), -1, np.int32), np.zeros((len(rx_m), size, 3)), none), 0.0
+    yield Candidates(direct, np.full((len(rx_m), size), -1, np.int32), np.zeros((len(rx_m), size, 3))), 0.0
     planes = group_planes(vertices_m, triangles)
-    chains = collect_chains(rays, planes)
-    views = view_chains(chains, planes, np.asarray(tx_m, np.float64))
+    sequences = collect_sequences(rays, planes)
+    views = view_sequences(sequences, planes, np.asarray(tx_m, np.float64))
     rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
-    boxes = _divide(rx_m)
+    search = _Search(sequences, views, planes, _divide(rx_m), rx_m)
     done = 0
-    while done < chains.size:
-        rx, face, points_m, done = _next_block(done, chains, views, planes, boxes, rx_m, size, candidates_per_block)
-        yield Candidates(rx, face, points_m, none), done / chains.size
+    while done < sequences.size:
+        rx, face, points_m, done = _next_block(done, search, size, candidates_per_block)
+        yield Candidates(rx, face, points_m), done / sequences.size
 
 
 @njit(cache=True)
@@ -124,27 +105,29 @@ def _divide(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_block(first, chains, views, planes, boxes, rx, depth_size, block):  # type: ignore[no-untyped-def]
-    """Candidates of the chains from place `first` in the order on, until a block is full; and where to go on."""
-    out_rx, count, done = np.empty(1024, np.int32), 0, first
-    face, points = np.empty((1024, depth_size), np.int32), np.empty((1024, depth_size, 3))
-    found, stack, bounds = np.empty(len(rx), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+def _next_block(first, search, depth, block):  # type: ignore[no-untyped-def]
+    """Candidates of the sequences from number `first` in the order on, until a block is full; and where to go on."""
+    views, count, done = search.views, 0, first
+    rx, face, points = np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3))
+    found, stack, bounds = np.empty(len(search.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     while done < len(views.order) and count < block:
         node = views.order[done]
-        seen = _receivers_in_view(node, chains, views, planes, boxes, rx, found, stack, bounds)
-        out_rx, face, points = grow(out_rx, count + seen), grow(face, count + seen), grow(points, count + seen)
-        count = _fold(node, found[:seen], rx, chains, views, planes, out_rx, face, points, count)
+        seen = _receivers_in_view(node, search, found, stack, bounds)
+        rx, face, points = grow(rx, count + seen), grow(face, count + seen), grow(points, count + seen)
+        count = _fold(node, found[:seen], search, rx, face, points, count)
         done += 1
-    return out_rx[:count].copy(), face[:count].copy(), points[:count].copy(), done
+    return rx[:count].copy(), face[:count].copy(), points[:count].copy(), done
 
 
 @njit(cache=True)
-def _receivers_in_view(node, chains, views, planes, boxes, rx, found, stack, bounds):  # type: ignore[no-untyped-def]
-    """Write the receivers in view of a chain's image to `found` and count them."""
-    source, margin = views.source_m[node], views.margin[node]
-    low, high = chains.low[node], chains.high[node]
-    reach = _REACH * chains.reach_m[node] + _REACH_M
-    _bound_view(source, low, high, margin, min(reach, _farthest(source, boxes)), planes, chains.plane[node], bounds)
+def _receivers_in_view(node, search, found, stack, bounds):  # type: ignore[no-untyped-def]
+    """Write the receivers in view of a sequence's image to `found` and count them."""
+    sequences, boxes, rx = search.sequences, search.boxes, search.rx_m
+    source, margin = search.views.source_m[node], search.views.margin[node]
+    low, high = sequences.low[node], sequences.high[node]
+    reach = _REACH * sequences.reach_m[node] + _REACH_M
+    farthest = min(reach, _farthest(source, boxes))
+    _bound_view(source, low, high, margin, farthest, search.planes, sequences.plane[node], bounds)
     count, stack[0], top = 0, 0, 1
     while top > 0:
         top -= 1
@@ -221,15 +204,17 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fold(node, found, rx, chains, views, planes, out_rx, face, points, count):  # type: ignore[no-untyped-def]
-    """Append the candidates among the receivers found for a chain, and return the new number of candidates.
+def _fold(node, found, search, rx, face, points, count):  # type: ignore[no-untyped-def]
+    """Append the candidates among the receivers found for a sequence, and return the new number of candidates.
 
-    The line from the image to a candidate, folded back at every plane of the chain, meets a face of each.
+    The line from the image to a candidate, folded back at every plane of the sequence, meets a face of each.
     """
-    parent, plane, sources = chains.parent, chains.plane, views.source_m
-    normals, offsets, bins = planes.normal, planes.offset_m, planes[5:]
+    parent, plane, sources = search.sequences.parent, search.sequences.plane, search.views.source_m
+    planes, depth = search.planes, search.views.depth[node]
+    normals, offsets = planes.normal, planes.offset_m
     for target in found:
-        x, y, z, at, k = rx[target, 0], rx[target, 1], rx[target, 2], node, views.depth[node] - 1
+        x, y, z = search.rx_m[target, 0], search.rx_m[target, 1], search.rx_m[target, 2]
+        at, k = node, depth - 1
         while k >= 0:
             p = plane[at]
             nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
@@ -237,16 +222,16 @@ def _fold(node, found, rx, chains, views, planes, out_rx, face, points, count): 
             behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
             if behind * before >= 0.0:
                 break
-            share = behind / (behind - before)
-            x, y, z = sx + share * (x - sx), sy + share * (y - sy), sz + share * (z - sz)
+            fraction = behind / (behind - before)
+            x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
             points[count, k, 0], points[count, k, 1], points[count, k, 2] = x, y, z
-            face[count, k] = face_at(bins, p, x, y, z)
+            face[count, k] = face_at(planes, p, x, y, z)
             if face[count, k] < 0:
                 break
             at, k = parent[at], k - 1
         if k < 0:
-            out_rx[count] = target
-            face[count, views.depth[node] :] = -1
-            points[count, views.depth[node] :] = 0.0
+            rx[count] = target
+            face[count, depth:] = -1
+            points[count, depth:] = 0.0
             count += 1
     return count

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_scene
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.engine import SceneSolver, _to_device
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.plan.candidates import Candidates
 from sionna_partial.tracing.plan.diffraction import find_wedges
-from sionna_partial.tracing.solver import SceneSolver, _to_device
 
 TX = np.array([1.07, 1.93, 1.2])
 RX = np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4], [5.2, 3.4, 1.9], [4.1, 0.3, 1.1]])
