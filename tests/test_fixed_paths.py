@@ -422,8 +422,8 @@ class TestErrors:
         assert paths._scene.settings.diffraction is True
 
     def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: False)
-        message = r'Gradients need .* that the fast engine has: run pip install "sionna-rt=='
+        monkeypatch.setattr(fixed_paths, "engine_fault", lambda: "sionna-rt 3.0 is not of the release 2.2")
+        message = r'Gradients need the fast engine, and .* 2.2: run pip install "sionna-rt=='
         with pytest.raises(BackendError, match=message):
             PathScene(FIELD)
 

@@ -34,10 +34,7 @@ def candidates_of(
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    fields = (
-        np.concatenate([getattr(part, name) for part, _ in parts]) for name in ("rx", "face", "vertices_m", "wedge")
-    )
-    return Candidates(*fields)
+    return Candidates.concatenate([part for part, _ in parts])
 
 
 def lengths_m(candidates: Candidates, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> NDArray[np.float64]:

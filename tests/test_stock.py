@@ -60,18 +60,6 @@ class TestStockPaths:
         np.testing.assert_allclose(paths.departure_rad[0], [np.pi / 2, np.arctan2(1.5, 2.0)], atol=1e-6)
         np.testing.assert_allclose(paths.arrival_rad[1, 0], np.pi, atol=1e-6)
 
-    def test_one_mirror_image(self, tmp_path: Path) -> None:
-        state = np.full((60, 100), CellState.FREE, np.uint8)
-        state[50, :] = CellState.WALL
-        xml = _write(PartialMap(state, 0.1), tmp_path, NO_FLOOR)
-        settings = TraceSettings(max_depth=2, samples_per_tx=10_000)
-        paths = _solve(xml, settings, np.array([1.0, 2.0, 1.5]), np.array([[5.0, 3.0, 1.5]]))
-        lengths = np.hypot(4.0, [1.0, 3.05 + 2.05])
-        np.testing.assert_allclose(paths.delay_s * SPEED_OF_LIGHT_M_S, lengths, rtol=1e-6)
-        assert paths.interactions.tolist() == [[0, 0], [1, 0]]
-        np.testing.assert_allclose(paths.vertices_m[1, 0], [1.0 + 4.0 * 3.05 / 5.1, 5.05, 1.5], atol=1e-4)
-        assert np.isnan(paths.vertices_m[1, 1]).all()
-
     def test_finds_the_paths_of_exact_beams(self, room_xml: Path) -> None:
         settings = TraceSettings(max_depth=2, samples_per_tx=100_000)
         geometry, solver = build_scene(_room()), SceneSolver(room_xml, SHAPES, settings)

@@ -58,12 +58,12 @@ class PlanScene:
         """
         material = next(iter(solver.materials.values()), np.array([2.0, 0.0, 1.0]))  # none is needed without surfaces
         bounds = strengths_of(material, self.settings.frequency_hz, len(rx_m))
-        tolerance_db, candidates = self.settings.power_tolerance_db, _PlanCandidates(self, tx_m, rx_m)
+        tolerance_db, kinds = self.settings.power_tolerance_db, self._kinds(Room.of(self.geometry, tx_m, rx_m))
         if tolerance_db == 0.0:
-            yield from _verified(solver, candidates.blocks(bounds), tx_m, rx_m, report)
+            yield from _verified(solver, _listed(kinds, bounds), tx_m, rx_m, report)
             return
         nothing = np.ones(len(rx_m), np.int64)
-        for _, fraction, _ in candidates.blocks(bounds._replace(first=nothing, last=nothing)):
+        for _, fraction, _ in _listed(kinds, bounds._replace(first=nothing, last=nothing)):
             report(0.4 * fraction, "listing paths")
         power, listed = np.zeros(len(rx_m)), bounds.first
         expected = expected_power(bounds.power, bounds.reflected)
@@ -73,11 +73,28 @@ class PlanScene:
             if not more.any():
                 return
             strengths = bounds._replace(first=listed, last=np.where(more, needed, 0), power=bounds.power[:0])
-            for found in _verified(solver, candidates.blocks(strengths), tx_m, rx_m, part_of(report, low, high)):
+            for found in _verified(solver, _listed(kinds, strengths), tx_m, rx_m, part_of(report, low, high)):
                 indirect = ~found.paths.is_direct
                 np.add.at(power, found.paths.path_rx[indirect], np.abs(found.paths.a[indirect]) ** 2)
                 yield found
             listed, expected = needed, power
+
+    def _kinds(self, room: Room) -> dict[str, SpecularCandidates | DiffractionCandidates]:
+        """Kinds of candidates, by what is done with them."""
+        geometry, settings = self.geometry, self.settings
+        specular = SpecularCandidates(geometry, room, settings.max_depth)
+        if not settings.diffraction:
+            return {"verifying reflections": specular}
+        diffracted = DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, settings.diffraction_walls)
+        return {"verifying reflections": specular, "verifying diffractions": diffracted}
+
+
+def _listed(kinds: dict[str, SpecularCandidates | DiffractionCandidates], strengths: Strengths) -> _Blocks:
+    """List candidates of a floor plan, kind after kind."""
+    ends = (0.0, 1.0) if len(kinds) == 1 else (0.0, 0.2, 1.0)
+    for (message, kind), (low, high) in zip(kinds.items(), itertools.pairwise(ends), strict=True):
+        for candidates, fraction in kind.blocks(strengths):
+            yield candidates, low + (high - low) * fraction, message
 
 
 @dataclass(frozen=True)
@@ -122,29 +139,6 @@ def write_scene_of(
 def part_of(report: Progress, low: float, high: float) -> Progress:
     """Return what reports a part of the work, from one fraction to another."""
     return lambda fraction, message: report(low + (high - low) * fraction, message)
-
-
-class _PlanCandidates:
-    """Exact candidates of an extruded floor plan: specular ones, then those over edges."""
-
-    def __init__(self, scene: PlanScene, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
-        geometry, settings = scene.geometry, scene.settings
-        room = Room.of(geometry, tx_m, rx_m)
-        self._specular = SpecularCandidates(geometry, room, settings.max_depth)
-        self._diffracted = None
-        if settings.diffraction:
-            self._diffracted = DiffractionCandidates(
-                geometry, scene.wedges, room, settings.max_depth, settings.diffraction_walls
-            )
-
-    def blocks(self, strengths: Strengths) -> _Blocks:
-        """List those that are asked for."""
-        part = 1.0 if self._diffracted is None else 0.2
-        for candidates, fraction in self._specular.blocks(strengths):
-            yield candidates, part * fraction, "verifying reflections"
-        if self._diffracted is not None:
-            for candidates, fraction in self._diffracted.blocks(strengths):
-                yield candidates, part + (1.0 - part) * fraction, "verifying diffractions"
 
 
 def _verified(

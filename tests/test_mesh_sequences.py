@@ -1,8 +1,37 @@
-import numpy as np
-import trimesh
+"""Rays against geometry and Sionna RT, and the sequences of planes that they meet."""
 
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from mesh_rays import TURN, joined, load_meshes, shapes_of
+
+from sionna_partial.tracing.mesh import sequences as module
 from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
-from sionna_partial.tracing.mesh.sequences import MARGIN, Rays, Sequences, collect_sequences, view_sequences
+from sionna_partial.tracing.mesh.sequences import (
+    MARGIN,
+    Rays,
+    Sequences,
+    collect_sequences,
+    shoot_rays,
+    view_sequences,
+)
+
+TX = np.array([0.3, -0.2, 0.1])
+
+
+def shoot(folder: Path, *meshes: trimesh.Trimesh, count: int = 2000, max_depth: int = 3) -> Rays:
+    scene = load_meshes(folder, *meshes)
+    parts = list(shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), TX, count, max_depth))
+    return Rays(*(np.concatenate(field) for field in zip(*parts, strict=True)))
+
+
+def points(rays: Rays, depth: int) -> np.ndarray:
+    """Where the rays met their faces (R, depth, 3)."""
+    steps = rays.leg_m[:, :depth, None].astype(float) * rays.direction[:, :depth]
+    return TX + np.cumsum(steps, axis=1)
+
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -22,6 +51,72 @@ def rays_along(face: list[list[int]], leg_m: list[list[float]], direction: np.nd
 def sequence_planes(sequences: Sequences, node: int) -> list[int]:
     before = sequence_planes(sequences, int(sequences.parent[node])) if sequences.parent[node] >= 0 else []
     return [*before, int(sequences.plane[node])]
+
+
+class TestShootRays:
+    def test_faces_are_counted_through_the_shapes(self, tmp_path: Path) -> None:
+        meshes = trimesh.creation.icosphere(2, 0.3), trimesh.creation.box((8, 6, 3))
+        meshes[0].apply_translation((-1.0, 1.0, 0.5))
+        meshes[1].apply_transform(TURN)
+        rays = shoot(tmp_path, *meshes)
+        vertices, triangles = joined(*meshes)
+        normal = trimesh.Trimesh(vertices, triangles, process=False).face_normals
+        assert len(np.unique(rays.face)) > 20
+        away = ((points(rays, 3) - vertices[triangles[rays.face, 0]]) * normal[rays.face]).sum(axis=2)
+        np.testing.assert_allclose(away, 0.0, atol=1e-3)  # Mitsuba moves a ray off its face
+        before, after = rays.direction[:, :3], rays.direction[:, 1:]
+        mirrored = before - 2.0 * (before * normal[rays.face]).sum(axis=2)[:, :, None] * normal[rays.face]
+        np.testing.assert_allclose(after, mirrored, atol=1e-5)
+
+    def test_lengths_in_a_box_are_those_of_the_unfolded_ray(self, tmp_path: Path) -> None:
+        """A ray in a box is a straight line in the lattice of its images: it has crossed as many walls as it met."""
+        size = np.array([8.0, 6.0, 3.0])
+        rays = shoot(tmp_path, trimesh.creation.box(size))
+        ahead = np.concatenate([rays.leg_m[:, :3].sum(axis=1), rays.leg_m.sum(axis=1)]).reshape(2, -1).mean(axis=0)
+        end = TX + ahead[:, None] * rays.direction[:, 0]
+        crossed = np.abs(np.rint(end / size)).sum(axis=1)
+        assert (crossed == 3).mean() > 0.998  # single precision sends a ray through a corner the other way
+
+    def test_directions_are_those_of_sionna_rt(self, tmp_path: Path) -> None:
+        rays = shoot(tmp_path, trimesh.creation.box((8, 6, 3)), max_depth=0)
+        import mitsuba as mi
+        from sionna.rt.utils import fibonacci_lattice
+
+        stock = mi.warp.square_to_uniform_sphere(fibonacci_lattice(2000)).numpy().T
+        np.testing.assert_allclose(rays.direction[:, 0], stock, atol=1e-6)
+
+    def test_no_reflection_is_one_leg(self, tmp_path: Path) -> None:
+        rays = shoot(tmp_path, trimesh.creation.box((8, 6, 3)), max_depth=0)
+        assert rays.face.shape == (2000, 0)
+        assert rays.leg_m.shape == (2000, 1)
+        assert np.isfinite(rays.leg_m).all()
+
+    def test_rays_escape_for_good(self, tmp_path: Path) -> None:
+        triangle = trimesh.Trimesh([[2, -2, -2], [2, 2, -2], [2, 0, 3]], [[0, 1, 2]])
+        rays = shoot(tmp_path, triangle)
+        hit = rays.face[:, 0] >= 0
+        assert 0 < hit.sum() < 500
+        np.testing.assert_allclose(TX[0] + rays.leg_m[hit, 0] * rays.direction[hit, 0, 0], 2.0, atol=1e-5)
+        assert (rays.face[:, 1:] == -1).all()
+        assert np.isinf(rays.leg_m[:, 1:]).all()
+        assert np.isinf(rays.leg_m[~hit, 0]).all()
+
+    def test_an_empty_scene_stops_no_ray(self, tmp_path: Path) -> None:
+        rays = shoot(tmp_path)
+        assert (rays.face == -1).all()
+
+    @pytest.mark.parametrize("count", [0, 1])
+    def test_few_rays(self, tmp_path: Path, count: int) -> None:
+        scene = load_meshes(tmp_path, trimesh.creation.box((8, 6, 3)))
+        parts = list(shoot_rays(scene.mi_scene, shapes_of(scene, 1), TX, count, 2))
+        assert [part.face.shape for part in parts] == [(1, 2)] * count
+
+    def test_parts_join_to_the_same_bytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        box = trimesh.creation.box((8, 6, 3))
+        whole = shoot(tmp_path, box)
+        monkeypatch.setattr(module, "_RAYS_PER_CHUNK", 300)
+        for one, other in zip(whole, shoot(tmp_path, box), strict=True):
+            assert one.tobytes() == other.tobytes()
 
 
 class TestCollectChains:
