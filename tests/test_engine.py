@@ -17,7 +17,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing import engine
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault, load_sionna, open_scene
+from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault, open_scene
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.diffraction import find_wedges
 
@@ -164,10 +164,6 @@ class TestLoadSionna:
 
     def test_our_variant_may_be_set_already(self) -> None:
         assert _load_after(MITSUBA_VARIANT) == "sionna.rt"
-
-    def test_gives_the_module(self) -> None:
-        assert load_sionna() is load_sionna()
-        assert load_sionna().__name__ == "sionna.rt"
 
 
 class TestEngineFault:
