@@ -1,4 +1,4 @@
-"""The solver's verdict depends on a candidate alone, and nothing is compiled twice."""
+"""The engine: its verdict depends on a candidate alone, nothing is compiled twice, and Sionna RT is the tested one."""
 
 import dataclasses
 import logging
@@ -38,11 +38,6 @@ def _diffracted(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np
     return diffracted_blocks(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth)[0][0]
 
 
-def _rows(candidates: Candidates, rows: NDArray[np.intp]) -> Candidates:
-    names = ("rx", "face", "vertices_m") + ("wedge",) * (candidates.wedge is not None)
-    return dataclasses.replace(candidates, **{name: getattr(candidates, name)[rows] for name in names})
-
-
 def _sorted(paths: SolvedPaths) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Delays and gains, each in order within a receiver: rounding may swap paths of equal delay."""
     delay_s, gain = paths.delay_s, np.abs(paths.a)
@@ -60,7 +55,7 @@ class TestVerify:
         candidates = _specular(geometry, tx, rx, 6)
         solver = _solver(geometry, tmp_path)
         order = np.random.default_rng(0).permutation(len(candidates.rx))
-        shuffled = _rows(candidates, order)
+        shuffled = candidates.rows(order)
         counts = [
             np.bincount(solver.verify(each, tx, rx)[0].path_rx, minlength=len(rx)) for each in (candidates, shuffled)
         ]
@@ -98,7 +93,7 @@ class TestVerify:
 
     def test_no_candidates_give_no_paths(self, tmp_path: Path) -> None:
         geometry = extrude(ROOM)
-        none = _rows(_specular(geometry, TX, RX, 2), np.zeros(0, np.intp))
+        none = _specular(geometry, TX, RX, 2).rows(np.zeros(0, np.intp))
         paths = _solver(geometry, tmp_path).verify(none, TX, RX)[0]
         assert paths.a.shape == paths.path_rx.shape == (0,)
         assert paths.vertices_m.shape == (0, 2, 3)
@@ -117,7 +112,7 @@ class TestCompiling:
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
             for skip in range(1, 8):
-                fewer = _rows(_elsewhere(candidates, skip), np.arange(skip, len(candidates.rx)))
+                fewer = _elsewhere(candidates, skip).rows(np.arange(skip, len(candidates.rx)))
                 solver.verify(fewer, TX + 0.01 * skip, RX)[0]
             kernels = dr.kernel_history([dr.KernelType.JIT])
         assert len(kernels) >= 7

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.mesh.planes import MeshPlanes, face_at, group_planes
-from sionna_partial.tracing.mesh.sequences import Rays, Sequences, Views, collect_sequences, view_sequences
+from sionna_partial.tracing.mesh.planes import face_at, group_planes
+from sionna_partial.tracing.mesh.sequences import Rays, collect_sequences, view_sequences
 
 _REACH, _REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
@@ -39,14 +39,22 @@ class _Boxes(NamedTuple):
     high_m: NDArray[np.float64]
 
 
-class _Search(NamedTuple):
-    """What receivers (N, 3) are searched with: all sequences, their images, their planes, and boxes of receivers."""
+class _View(NamedTuple):
+    """Where receivers of one sequence are: image (3,), box of directions, width by which it is enlarged, and reach."""
 
-    sequences: Sequences
-    views: Views
-    planes: MeshPlanes
-    boxes: _Boxes
-    rx_m: NDArray[np.float64]
+    source: NDArray[np.float64]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    margin: float
+    reach: float
+
+
+class _Found(NamedTuple):
+    """Columns of candidates, as in `Candidates`."""
+
+    rx: NDArray[np.int32]
+    face: NDArray[np.int32]
+    points: NDArray[np.float64]
 
 
 def mesh_candidates(
@@ -72,11 +80,10 @@ def mesh_candidates(
     sequences = collect_sequences(rays, planes)
     views = view_sequences(sequences, planes, np.asarray(tx_m, np.float64))
     rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
-    search = _Search(sequences, views, planes, _divide(rx_m), rx_m)
-    done = 0
+    boxes, done = _divide(rx_m), 0
     while done < sequences.size:
-        rx, face, points_m, done = _next_block(done, search, size, candidates_per_block)
-        yield Candidates(rx, face, points_m), done / sequences.size
+        *columns, done = _next_block(done, sequences, views, planes, boxes, rx_m, size, candidates_per_block)
+        yield Candidates(*columns), done / sequences.size
 
 
 @njit(cache=True)
@@ -105,29 +112,29 @@ def _divide(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_block(first, search, depth, block):  # type: ignore[no-untyped-def]
+def _next_block(first, sequences, views, planes, boxes, rx_m, depth, block):  # type: ignore[no-untyped-def]
     """Candidates of the sequences from number `first` in the order on, until a block is full; and where to go on."""
-    views, count, done = search.views, 0, first
-    rx, face, points = np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3))
-    found, stack, bounds = np.empty(len(search.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    out = _Found(np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3)))
+    seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    count, done = 0, first
     while done < len(views.order) and count < block:
         node = views.order[done]
-        seen = _receivers_in_view(node, search, found, stack, bounds)
-        rx, face, points = grow(rx, count + seen), grow(face, count + seen), grow(points, count + seen)
-        count = _fold(node, found[:seen], search, rx, face, points, count)
+        reach = _REACH * sequences.reach_m[node] + _REACH_M
+        view = _View(views.source_m[node], sequences.low[node], sequences.high[node], views.margin[node], reach)
+        _bound_view(view, _farthest(view.source, boxes), planes, sequences.plane[node], bounds)
+        number = _receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
+        if number > 0:
+            size = count + number
+            out = _Found(grow(out.rx, size), grow(out.face, size), grow(out.points, size))
+            count = _fold(node, seen[:number], sequences, views, planes, rx_m, out, count)
         done += 1
-    return rx[:count].copy(), face[:count].copy(), points[:count].copy(), done
+    return out.rx[:count].copy(), out.face[:count].copy(), out.points[:count].copy(), done
 
 
 @njit(cache=True)
-def _receivers_in_view(node, search, found, stack, bounds):  # type: ignore[no-untyped-def]
+def _receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no-untyped-def]
     """Write the receivers in view of a sequence's image to `found` and count them."""
-    sequences, boxes, rx = search.sequences, search.boxes, search.rx_m
-    source, margin = search.views.source_m[node], search.views.margin[node]
-    low, high = sequences.low[node], sequences.high[node]
-    reach = _REACH * sequences.reach_m[node] + _REACH_M
-    farthest = min(reach, _farthest(source, boxes))
-    _bound_view(source, low, high, margin, farthest, search.planes, sequences.plane[node], bounds)
+    source, low, high, margin, reach = view
     count, stack[0], top = 0, 0, 1
     while top > 0:
         top -= 1
@@ -163,13 +170,15 @@ def _farthest(source, boxes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _bound_view(source, low, high, margin, reach, planes, p, bounds):  # type: ignore[no-untyped-def]
-    """Write what bounds the points in view of an image and beyond its last plane.
+def _bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-def]
+    """Write what bounds the points in view of an image and beyond its last plane, no receiver being farther away.
 
     Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
     the largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from
     the image lies within r times that distance of r times the middle.
     """
+    source, low, high, margin, reach = view
+    reach = min(reach, farthest)
     width, away, slope = 0.0, -planes.offset_m[p], 0.0
     for axis in range(3):
         width += (0.5 * (high[axis] - low[axis]) + margin) ** 2
@@ -204,16 +213,16 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fold(node, found, search, rx, face, points, count):  # type: ignore[no-untyped-def]
+def _fold(node, found, sequences, views, planes, rx_m, out, count):  # type: ignore[no-untyped-def]
     """Append the candidates among the receivers found for a sequence, and return the new number of candidates.
 
     The line from the image to a candidate, folded back at every plane of the sequence, meets a face of each.
     """
-    parent, plane, sources = search.sequences.parent, search.sequences.plane, search.views.source_m
-    planes, depth = search.planes, search.views.depth[node]
-    normals, offsets = planes.normal, planes.offset_m
+    parent, plane, sources, depth = sequences.parent, sequences.plane, views.source_m, views.depth[node]
+    normals, offsets, bins = planes.normal, planes.offset_m, planes.bins
+    rx, face, points = out
     for target in found:
-        x, y, z = search.rx_m[target, 0], search.rx_m[target, 1], search.rx_m[target, 2]
+        x, y, z = rx_m[target, 0], rx_m[target, 1], rx_m[target, 2]
         at, k = node, depth - 1
         while k >= 0:
             p = plane[at]
@@ -225,7 +234,7 @@ def _fold(node, found, search, rx, face, points, count):  # type: ignore[no-unty
             fraction = behind / (behind - before)
             x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
             points[count, k, 0], points[count, k, 1], points[count, k, 2] = x, y, z
-            face[count, k] = face_at(planes, p, x, y, z)
+            face[count, k] = face_at(bins, p, x, y, z)
             if face[count, k] < 0:
                 break
             at, k = parent[at], k - 1

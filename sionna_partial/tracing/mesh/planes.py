@@ -22,22 +22,15 @@ _FACE_TOLERANCE_M = 1e-3
 """Distance beyond a face [m] up to which a point counts as on it."""
 
 
-class MeshPlanes(NamedTuple):
-    """F faces of a mesh, grouped by P planes, with the faces of each plane sorted into B square bins.
+class FaceBins(NamedTuple):
+    """F faces of P planes, sorted into B square bins of each plane.
 
-    `plane` (F,) is that of every face; one without area has a plane of its own. A point lies in a plane where
-    ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold the faces of each plane. `axes` (P, 2)
-    are the two coordinates in which the faces of a plane are told apart, in which `low_m` (P, 2) is the corner of its
-    bins and `edge_m` (P,) their size [m]; `columns` (P,) is their number in a row, and `first_bin` (P + 1,) the first
-    bin. `start` (B + 1,) and `face` are the faces that reach into each bin, one bin after the other, and `corner_m`
-    (F, 3, 2) the corners of the faces in the coordinates of their planes [m].
+    `axes` (P, 2) are the two coordinates in which the faces of a plane are told apart, in which `low_m` (P, 2) is the
+    corner of its bins and `edge_m` (P,) their size; `columns` (P,) is their number in a row, and `first_bin` (P + 1,)
+    the first bin. `start` (B + 1,) and `face` are the faces that reach into each bin, one bin after the other, and
+    `corner_m` (F, 3, 2) the corners of the faces in the coordinates of their planes.
     """
 
-    plane: NDArray[np.int32]
-    normal: NDArray[np.float64]
-    offset_m: NDArray[np.float64]
-    centre_m: NDArray[np.float64]
-    radius_m: NDArray[np.float64]
     axes: NDArray[np.int64]
     low_m: NDArray[np.float64]
     edge_m: NDArray[np.float64]
@@ -46,6 +39,21 @@ class MeshPlanes(NamedTuple):
     start: NDArray[np.int64]
     face: NDArray[np.int32]
     corner_m: NDArray[np.float64]
+
+
+class MeshPlanes(NamedTuple):
+    """F faces of a mesh, grouped by P planes.
+
+    `plane` (F,) is that of every face; one without area has a plane of its own. A point lies in a plane where
+    ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold the faces of each plane.
+    """
+
+    plane: NDArray[np.int32]
+    normal: NDArray[np.float64]
+    offset_m: NDArray[np.float64]
+    centre_m: NDArray[np.float64]
+    radius_m: NDArray[np.float64]
+    bins: FaceBins
 
 
 def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> MeshPlanes:
@@ -70,21 +78,9 @@ def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) 
     first_bin = np.concatenate([[0], np.cumsum(columns * rows)])
     flat_m = np.take_along_axis(corner_m, axes[plane][:, None], 2)
     start, face = _fill_bins(plane, flat_m, low_m, edge_m, columns, first_bin)
-    return MeshPlanes(
-        plane=plane,
-        normal=normal,
-        offset_m=offset_m,
-        centre_m=0.5 * (low + high),
-        radius_m=0.5 * np.linalg.norm(high - low, axis=1),
-        axes=axes,
-        low_m=low_m,
-        edge_m=edge_m,
-        columns=columns,
-        first_bin=first_bin,
-        start=start,
-        face=face,
-        corner_m=flat_m,
-    )
+    bins = FaceBins(axes, low_m, edge_m, columns, first_bin, start, face, flat_m)
+    radius_m = 0.5 * np.linalg.norm(high - low, axis=1)
+    return MeshPlanes(plane, normal, offset_m, 0.5 * (low + high), radius_m, bins)
 
 
 @njit(cache=True)
@@ -176,10 +172,10 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
 
 
 @njit(cache=True)
-def face_at(planes, p, x, y, z):  # type: ignore[no-untyped-def]
+def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
     """Face of plane p at a point of it, or -1."""
-    low, edge, columns, first_bin = planes.low_m, planes.edge_m, planes.columns, planes.first_bin
-    u, v = planes.axes[p, 0], planes.axes[p, 1]
+    low, edge, columns, first_bin = bins.low_m, bins.edge_m, bins.columns, bins.first_bin
+    u, v = bins.axes[p, 0], bins.axes[p, 1]
     x, y = (x if u == 0 else y if u == 1 else z), (x if v == 0 else y if v == 1 else z)
     right, up, tolerance = x - low[p, 0], y - low[p, 1], _FACE_TOLERANCE_M
     rows = (first_bin[p + 1] - first_bin[p]) // columns[p]
@@ -187,9 +183,9 @@ def face_at(planes, p, x, y, z):  # type: ignore[no-untyped-def]
         return -1
     column, row = min(max(int(right / edge[p]), 0), columns[p] - 1), min(max(int(up / edge[p]), 0), rows - 1)
     b = first_bin[p] + row * columns[p] + column
-    for k in range(planes.start[b], planes.start[b + 1]):
-        if _inside(planes.corner_m, planes.face[k], x, y):
-            return planes.face[k]
+    for k in range(bins.start[b], bins.start[b + 1]):
+        if _inside(bins.corner_m, bins.face[k], x, y):
+            return bins.face[k]
     return -1
 
 

@@ -251,20 +251,11 @@ def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-
 @njit(cache=True)
 def _clip_cells(plan, beam, own, corner, count, scratch):  # type: ignore[no-untyped-def]
     """Clip the walls in the cells of a strip which were not clipped before, and give their number with the others."""
-    x0, y0, edge, columns, rows = plan.cells.grid
-    columns, rows, visit = int(columns), int(rows), scratch.visit[-1]
-    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
-    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
-    first, last = max(0, int(np.floor((low - y0) / edge))), min(rows - 1, int(np.floor((high - y0) / edge)))
-    for row in range(first, last + 1):
-        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
-        if left > right:
-            continue
-        start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
-        stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
-        if start > stop:
-            continue
-        for entry in range(plan.cells.start[row * columns + start], plan.cells.start[row * columns + stop + 1]):
+    visit = scratch.visit[-1]
+    first, last = _rows(corner, plan.cells)
+    for row in range(first, last):
+        begin, end = _entries(corner, plan.cells, row)
+        for entry in range(begin, end):
             wall = plan.cells.piece[entry]
             if scratch.visit[wall] == visit:
                 continue
@@ -283,6 +274,27 @@ def _clip_cells(plan, beam, own, corner, count, scratch):  # type: ignore[no-unt
                 scratch.order[k] = count
                 count += 1
     return count
+
+
+@njit(cache=True)
+def _rows(corner, bins):  # type: ignore[no-untyped-def]
+    """First row of square bins that a quadrilateral reaches, and the one after the last."""
+    y0, edge, rows = bins.grid[1], bins.grid[2], (len(bins.start) - 1) // int(bins.grid[3])
+    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
+    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
+    return max(0, int(np.floor((low - y0) / edge))), min(rows, int(np.floor((high - y0) / edge)) + 1)
+
+
+@njit(cache=True)
+def _entries(corner, bins, row):  # type: ignore[no-untyped-def]
+    """First entry of the bins of a row that a convex quadrilateral reaches, and the one after the last."""
+    x0, y0, edge, columns = bins.grid[0], bins.grid[1], bins.grid[2], int(bins.grid[3])
+    left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
+    if left > right:
+        return 0, 0
+    start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
+    stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
+    return (bins.start[row * columns + start], bins.start[row * columns + stop + 1]) if start <= stop else (0, 0)
 
 
 @njit(cache=True)
@@ -362,22 +374,12 @@ def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _add_points(beam, reflected, piece, receivers, node, pair, pairs):  # type: ignore[no-untyped-def]
     """Pair a node with the points between the window of its beam and one piece of its view."""
-    points, bins, grid = receivers.points_m, receivers.start, receivers.grid
-    x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
-    rows = (len(bins) - 1) // columns
-    corner = _corners(beam, reflected, piece)
+    points, corner = receivers.points_m, _corners(beam, reflected, piece)
     normal, offset = _inward_edges(corner)
-    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
-    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
-    first = max(0, int(np.floor((low - y0) / edge)))
-    last = min(rows - 1, int(np.floor((high - y0) / edge)))
-    for row in range(first, last + 1):
-        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
-        start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
-        stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
-        if start > stop:
-            continue
-        for i in range(bins[row * columns + start], bins[row * columns + stop + 1]):
+    first, last = _rows(corner, receivers)
+    for row in range(first, last):
+        begin, end = _entries(corner, receivers, row)
+        for i in range(begin, end):
             inside = True
             for k in range(4):
                 side = normal[k, 0] * points[i, 0] + normal[k, 1] * points[i, 1] - offset[k]
