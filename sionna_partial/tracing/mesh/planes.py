@@ -174,8 +174,8 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
 @njit(cache=True)
 def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
     """Face of plane p at a point of it, or -1."""
-    low, edge, columns, first_bin = bins.low_m, bins.edge_m, bins.columns, bins.first_bin
-    u, v = bins.axes[p, 0], bins.axes[p, 1]
+    axes, low, edge, columns, first_bin, start, face, corner = bins
+    u, v = axes[p, 0], axes[p, 1]
     x, y = (x if u == 0 else y if u == 1 else z), (x if v == 0 else y if v == 1 else z)
     right, up, tolerance = x - low[p, 0], y - low[p, 1], _FACE_TOLERANCE_M
     rows = (first_bin[p + 1] - first_bin[p]) // columns[p]
@@ -183,9 +183,9 @@ def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
         return -1
     column, row = min(max(int(right / edge[p]), 0), columns[p] - 1), min(max(int(up / edge[p]), 0), rows - 1)
     b = first_bin[p] + row * columns[p] + column
-    for k in range(bins.start[b], bins.start[b + 1]):
-        if _inside(bins.corner_m, bins.face[k], x, y):
-            return bins.face[k]
+    for k in range(start[b], start[b + 1]):
+        if _inside(corner, face[k], x, y):
+            return face[k]
     return -1
 
 
