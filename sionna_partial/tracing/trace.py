@@ -169,8 +169,8 @@ def trace_links(
             columns = PathFiles(max(1, settings.max_depth), files)
             link_state, gain_db = tracer.fill(columns, tx_m.reshape(shape), rx_m, report)
             columns.close()
-            links = {"tx": tx_m.reshape(shape), "rx": rx_m, "link_state": link_state, "gain_db": gain_db}
-            for name, values in links.items():
+            ends = ("tx", tx_m.reshape(shape)), ("rx", rx_m)
+            for name, values in (*ends, ("link_state", link_state), ("gain_db", gain_db)):
                 np.save(files / f"{name}.npy", values)
     names = [field.name for field in fields(TracedLinks) if not field.name.endswith("settings")]
     stored = {name: np.load(Path(folder) / f"{name}.npy", mmap_mode="r") for name in names}
@@ -227,10 +227,10 @@ class Tracer:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3)."""
         columns = PathColumns(max(1, self.settings.max_depth))
         link_state, gain_db = self.fill(columns, tx_m, rx_m, report)
-        paths = columns.paths()
-        found = {field.name: getattr(paths, field.name) for field in fields(SolvedPaths)}
-        settings = {"settings": self.settings, "scene_settings": self.scene_settings}
-        return TracedLinks(tx_m, rx_m, link_state, gain_db, **found, **settings)
+        found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
+        return TracedLinks(
+            tx_m, rx_m, link_state, gain_db, **found, settings=self.settings, scene_settings=self.scene_settings
+        )
 
     def fill(
         self, columns: PathColumns | PathFiles, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
