@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.generator import DIFFRACTION
+from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
-from sionna_partial.tracing.sionna_rt import load_sionna
 from sionna_partial.tracing.stock import listed_before
 
 Paths = dict[str, NDArray[Any]]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.tracing.generator import DIFFRACTION
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.trace import TracedLinks, trace_each
 
 STATES = {sp.LinkState.OUTAGE: "outage", sp.LinkState.LOS: "LOS", sp.LinkState.NLOS: "NLOS"}

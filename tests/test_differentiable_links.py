@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from pillar_room import TX_M, small_room
 from predictor_links import QUIET
 
 import sionna_partial as sp
@@ -16,8 +17,8 @@ from sionna_partial.differentiable import scene as differentiable_links
 from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.tracing.finder import PlanScene
 from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
-from sionna_partial.tracing.probe import TX_M, small_room
 
 pytestmark = QUIET
 
@@ -238,13 +239,13 @@ class TestSlopes:
 class TestSecondUse:
     def test_nothing_is_traced_again(self, tf, monkeypatch):
         scene = scene_of("partial")
-        written, calls = scene.paths.written, []
+        paths, calls = PlanScene.paths, []
 
         def counted(*arguments):
             calls.append(1)
-            return written.paths(*arguments)
+            return paths(*arguments)
 
-        monkeypatch.setattr(scene.paths, "written", replace(written, paths=counted))
+        monkeypatch.setattr(PlanScene, "paths", counted)
         links = scene.links(TX_M, RX_M)
         assert len(calls) == 1
         variable = tf.Variable(TX_M)

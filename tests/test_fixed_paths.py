@@ -4,11 +4,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from meshes import box
 from numpy.typing import ArrayLike, NDArray
+from pillar_room import RX_M, TX_M, small_room
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
@@ -17,7 +19,6 @@ from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.tracing import fixed_paths
 from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS, FixedPaths, PathParameters, PathScene
-from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
 SETTINGS = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1)
 FIELD = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.1)
@@ -348,14 +349,15 @@ class TestNothingIsLeftBehind:
         code = (
             "import sionna_partial as sp\n"
             "from sionna_partial.tracing.fixed_paths import PathScene\n"
-            "from sionna_partial.tracing.probe import RX_M, TX_M, small_room\n"
+            "from pillar_room import RX_M, TX_M, small_room\n"
             "scene = PathScene(small_room(), settings=sp.TraceSettings(power_tolerance_db=0.0, max_depth=1))\n"
             "paths = scene.paths(TX_M, RX_M)\n"
             "slopes = paths.slopes(paths.base)\n"
             "passes = paths._passes(paths.base, ('tx_m',))\n"
             "held = next(passes)\n"
         )
-        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        command, folder = [sys.executable, "-c", code], Path(__file__).parent
+        result = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120)
         assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 
@@ -420,8 +422,8 @@ class TestErrors:
         assert paths._scene.settings.diffraction is True
 
     def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: False)
-        message = r'Gradients need .* that the fast engine has: run pip install "sionna-rt=='
+        monkeypatch.setattr(fixed_paths, "engine_fault", lambda: "sionna-rt 3.0 is not of the release 2.2")
+        message = r'Gradients need the fast engine, and .* 2.2: run pip install "sionna-rt=='
         with pytest.raises(BackendError, match=message):
             PathScene(FIELD)
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from meshes import room
 from numpy.typing import NDArray
+from pillar_room import RX_M, TX_M, small_room
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import BackendError, PositionError, SettingsError
 from sionna_partial.tracing import fixed_paths, gradients
 from sionna_partial.tracing.gradients import GainGradients, gain_gradients
-from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
 SLOPES = (
     *("tx_db_per_m", "relative_permittivity_db", "conductivity_db_per_s_m", "thickness_db_per_m"),
@@ -245,13 +245,13 @@ class TestErrors:
             gain_gradients(FIELD, TX, RX, scene_settings=sp.SceneSettings(material=sp.Material(itu="wet_ground")))
 
     def test_places_are_checked_before_the_scene_is_opened(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: pytest.fail("opened"))
+        monkeypatch.setattr(fixed_paths, "engine_fault", lambda: pytest.fail("opened"))
         with pytest.raises(PositionError, match="rx"):
             gain_gradients(FIELD, TX, [(99.0, 1.0, 1.0)])
         assert len(gain_gradients(FIELD, TX, []).gain_db) == 0
 
     def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: False)
-        message = r'Gradients need .* that the fast engine has: run pip install "sionna-rt=='
+        monkeypatch.setattr(fixed_paths, "engine_fault", lambda: "sionna-rt 3.0 is not of the release 2.2")
+        message = r'Gradients need the fast engine, and .* 2.2: run pip install "sionna-rt=='
         with pytest.raises(BackendError, match=message):
             gain_gradients(FIELD, TX, RX)

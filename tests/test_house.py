@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
-    "foundations": ("constants", "errors", "resources", "settings", "files", "planar", "cores", "llvm", "llvm_probe"),
+    "foundations": ("constants", "errors", "resources", "settings", "files", "planar", "cores", "llvm"),
     "maps": (
         *("mesh.cut", "mesh.mesh", "partial_map", "map_turn", "ros_map"),
         *("mesh.files", "mesh.mitsuba_xml", "mesh.cells", "map_files"),
@@ -31,9 +31,9 @@ ROOMS = {
         *("floor_plan", "scene_xml", "scene"),
     ),
     "tracing": (
-        *("slab", "plan.bounds", "plan.beams", "plan.candidates", "plan.diffraction"),
-        *("mesh.rays", "mesh.planes", "mesh.sequences", "mesh.candidates"),
-        *("paths", "sionna_rt", "contract", "stock", "chain", "solver", "generator", "probe", "trace"),
+        *("candidates", "paths", "engine", "slab"),
+        *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
+        *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "stock", "trace"),
         *("fixed_paths", "gradients"),
     ),
     "prediction": (

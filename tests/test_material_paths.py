@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from meshes import OBSERVED, room
 from numpy.typing import NDArray
+from pillar_room import RX_M, TX_M, small_room
 
 import sionna_partial as sp
 from sionna_partial.calibration import material_paths
@@ -13,7 +14,6 @@ from sionna_partial.calibration.material_paths import MaterialPaths, find_materi
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh, merged_mesh
 from sionna_partial.tracing.fixed_paths import PathScene
-from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 from sionna_partial.tracing.trace import trace_links
 
 SETTINGS = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)

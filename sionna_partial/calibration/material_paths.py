@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from sionna_partial.files import temporary_folder
 from sionna_partial.prediction.link_context import path_unobserved_m
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.engine import SceneSolver, Variables, VerifiedPaths, forward_passes
+from sionna_partial.tracing.finder import write_scene_of
 from sionna_partial.tracing.fixed_paths import PATHS_PER_BLOCK, PathScene
-from sionna_partial.tracing.generator import write_scene_of
-from sionna_partial.tracing.plan.candidates import Candidates
 from sionna_partial.tracing.slab import VACUUM_F_M
-from sionna_partial.tracing.solver import SceneSolver, Variables, VerifiedPaths, forward_passes
 from sionna_partial.tracing.trace import Progress
 
 KEPT_SHARE = 0.96
@@ -217,7 +217,11 @@ def find_material_paths(
     kept, new = nothing, nothing
     for number, place in enumerate(places):
         links = np.flatnonzero(index.ravel() == number)
-        for block, share, _ in scene.blocks(place, rx[links]):
+
+        def traced(fraction: float, message: str, number: int = number) -> None:
+            progress((number + fraction) / len(places), f"tracing transmitter {number + 1} of {len(places)}")
+
+        for block in scene.blocks(place, rx[links], traced):
             start_m, end_m = np.broadcast_to(place, (len(block), 3)), block.rx_m[block.rx_of_path]
             length_m = path_unobserved_m(scene.partial, start_m, block.interactions, block.vertices_m, end_m)
             parts = [
@@ -227,7 +231,6 @@ def find_material_paths(
             new = _joined(new, replace(nothing, parts=tuple(parts), unobserved_m=length_m))
             if len(new) > PATHS_PER_BLOCK:
                 kept, new = _joined(kept, new.kept(new.strong())), nothing
-            progress((number + share) / len(places), f"tracing transmitter {number + 1} of {len(places)}")
     return _joined(kept, new.kept(new.strong()))
 
 

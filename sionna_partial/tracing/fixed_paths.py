@@ -17,12 +17,10 @@ from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, require
-from sionna_partial.tracing.contract import contract_remedy
-from sionna_partial.tracing.generator import write_scene_of
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.engine import REMEDY, SceneSolver, Variables, engine_fault, forward_passes
+from sionna_partial.tracing.finder import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.plan.candidates import Candidates
-from sionna_partial.tracing.probe import fast_engine_works
-from sionna_partial.tracing.solver import SceneSolver, Variables, forward_passes
 from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
@@ -79,7 +77,7 @@ class PathScene:
     ----------
     shift_m : (3,) float64 array
         Where the origin of scene coordinates is [m].
-    written : WrittenScene
+    written : PlanScene or MeshScene
     solver : SceneSolver
     """
 
@@ -92,10 +90,8 @@ class PathScene:
     ) -> None:
         self.partial = partial
         self.settings, self.scene_settings = fixed_path_settings(partial, settings, scene_settings)
-        if not fast_engine_works():
-            raise BackendError(
-                f"Gradients need the internal parts of Sionna RT that the fast engine has: {contract_remedy()}"
-            )
+        if engine_fault():
+            raise BackendError(f"Gradients need the fast engine, and {engine_fault()}: {REMEDY}")
         self.shift_m = np.array([*partial.origin_m, 0.0])
         with temporary_folder() as folder:
             self.written = write_scene_of(partial, folder, self.settings, self.scene_settings)
@@ -137,35 +133,16 @@ class PathScene:
             transmitter, or several transmitters.
         """
         tx_m, rx_m = checked_ends(self.partial, tx, rx, self.settings.frequency_hz)
-        parts = []
-        for part, share, message in self.blocks(tx_m, rx_m):
-            parts += part.parts
-            if progress is not None:
-                progress(share, message)
-        if progress is not None:
-            progress(1.0, "traced")
+        report = progress or (lambda fraction, message: None)
+        parts = [each for part in self.blocks(tx_m, rx_m, report) for each in part.parts]
+        report(1.0, "traced")
         return FixedPaths(self, self.parameters(tx_m), rx_m, parts)
 
-    def blocks(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> Iterator[tuple["FixedPaths", float, str]]:
-        """Find the same paths block by block, which bounds the memory.
-
-        Parameters
-        ----------
-        tx_m, rx_m : (3,) and (N, 3) float64 arrays
-            Positions where they may be (see `checked_ends`) [m].
-
-        Yields
-        ------
-        FixedPaths
-            Some of the paths.
-        float
-            Share of the work done.
-        str
-            What is being done.
-        """
+    def blocks(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator["FixedPaths"]:
+        """Find the same paths block by block, which bounds the memory; positions come from `checked_ends`."""
         base, (tx, rx) = self.parameters(tx_m), (tx_m - self.shift_m, rx_m - self.shift_m)
-        for candidates, paths, share, message in self.written.paths(self.solver, tx, rx) if len(rx) else ():
-            yield FixedPaths(self, base, rx_m, [(candidates, paths)]), share, message
+        for found in self.written.paths(self.solver, tx, rx, report) if len(rx) else ():
+            yield FixedPaths(self, base, rx_m, [found])
 
 
 class FixedPaths:

@@ -131,9 +131,12 @@ def gain_gradients(
     total = _Sums(len(rx_m))
     if len(rx_m):
         paths = PathScene(partial, settings=settings, scene_settings=scene_settings)
-        for block, share, message in paths.blocks(tx_m, rx_m):
+
+        def differentiating(fraction: float, message: str) -> None:
+            report(0.1 + 0.9 * fraction, message.replace("verifying", "differentiating"))
+
+        for block in paths.blocks(tx_m, rx_m, differentiating):
             total.add(block)
-            report(0.1 + 0.9 * share, message.replace("verifying", "differentiating"))
     link_state, gain_db = link_summary(total.power, total.is_direct)
     slopes_db = total.slopes_db()
     return GainGradients(

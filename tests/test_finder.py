@@ -13,8 +13,9 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.tracing import trace
-from sionna_partial.tracing.generator import bends_at, write_scene_of
+from sionna_partial.tracing.finder import PlanScene, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.stock import diffracted_as_exact
 
 TX = np.array([1.03, 1.52, 1.4])
 RX = np.array([[1.47, 2.51, 1.7], [4.35, 0.61, 1.2], [3.82, 3.57, 1.3], [2.02, 0.33, 2.2]])
@@ -99,7 +100,7 @@ def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
 def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, samples_per_tx=20_000)
     exact = sp.trace_links(_plan(), TX, RX[:2], settings=settings)
-    monkeypatch.setattr(trace, "fast_engine_works", lambda: False)
+    monkeypatch.setattr(trace, "engine_fault", lambda: "broken")
     public = sp.trace_links(_plan(), TX, RX[:2], settings=settings)
     np.testing.assert_array_equal(public.link_state, exact.link_state)
     bent = (public.interactions == 8).any(axis=1)
@@ -115,7 +116,7 @@ def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.Monkey
 
 def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
     scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(power_tolerance_db=0.0), sp.SceneSettings())
-    assert scene.wedges is not None
+    assert isinstance(scene, PlanScene)
     edge_x, edge_y = scene.wedges.edge_m[0]
     kinds = np.array([[8, 0, 0, 0], [8, 0, 0, 0], [8, 0, 0, 0], [1, 8, 1, 1], [1, 8, 4, 1], [1, 1, 1, 1]], np.uint8)
     vertices = np.full((6, 4, 3), 1.0)
@@ -125,7 +126,7 @@ def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
     paths = SolvedPaths.of_vertices(
         zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
     )
-    assert bends_at(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
+    assert diffracted_as_exact(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
 
 
 @pytest.mark.parametrize(
@@ -137,7 +138,7 @@ def test_bends_count_with_so_many_walls_on_each_side(
 ) -> None:
     """Floor and ceiling are no walls."""
     scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(power_tolerance_db=0.0), sp.SceneSettings())
-    assert scene.wedges is not None
+    assert isinstance(scene, PlanScene)
     kinds = np.array([[8, 0, 0], [1, 8, 0], [8, 1, 0], [1, 1, 8], [1, 8, 1], [1, 8, 1]], np.uint8)
     vertices = np.full((6, 3, 3), 1.0)
     vertices[4, [0, 2], 2] = 0.0, scene.wedges.height_m
@@ -147,7 +148,7 @@ def test_bends_count_with_so_many_walls_on_each_side(
     paths = SolvedPaths.of_vertices(
         zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
     )
-    assert tuple(bends_at(scene.wedges, paths, walls_a_side).tolist()) == expected
+    assert tuple(diffracted_as_exact(scene.wedges, paths, walls_a_side).tolist()) == expected
 
 
 def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:

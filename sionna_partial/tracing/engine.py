@@ -1,27 +1,172 @@
-"""Where Sionna RT's internals are leaned on, here and in `chain`: candidates in, verified paths out.
+"""Everything that leans on Sionna RT's internals: candidates in, verified paths out.
 
-Sionna RT's `PathSolver` is a chain of a candidate generator, `ImageMethod` and `FieldCalculator`. Here the same chain
-runs on our candidates: `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go
-in as plain arrays: `Scene.targets()`, which compiles a kernel for each receiver, is left out. `contract` names every
-internal part that is used.
+Sionna RT's `PathSolver` runs a candidate generator, `ImageMethod` and `FieldCalculator`. Here the latter two run on our
+candidates: `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go in as plain
+arrays: `Scene.targets()`, which compiles a kernel for each receiver, is left out.
 
-Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a chain of each kind.
+Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a verification with each kind.
 """
 
+import functools
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.errors import BackendError
+from sionna_partial.llvm import load_llvm
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.chain import Chain
+from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges, in_copies_of_scene
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.plan.candidates import EDGE, Candidates, Wedges, in_copies_of_scene
-from sionna_partial.tracing.sionna_rt import load_sionna, open_scene
+
+MITSUBA_VARIANT = "llvm_ad_mono_polarized"
+"""Mitsuba variant of Sionna RT on a CPU."""
+
+TESTED_VERSION = "2.2"
+"""Release of Sionna RT whose internals this module leans on."""
+
+REMEDY = f"""run pip install "sionna-rt=={TESTED_VERSION}.*" to have the fast engine back."""
+
+_BUFFER_FIELDS = {
+    *("_vertices_x", "_vertices_y", "_vertices_z", "_shapes", "_primitives", "_interaction_types"),
+    *("_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"),
+}
+"""Private fields of Sionna RT's `PathsBuffer` that are filled here."""
+
+_log = logging.getLogger(__name__)
+
+
+def load_sionna() -> ModuleType:
+    """Import Sionna RT on the CPU, with a working LLVM; raise a BackendError that says what to do if that fails."""
+    load_llvm()
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant(MITSUBA_VARIANT)
+    if mi.variant() != MITSUBA_VARIANT:
+        raise BackendError(
+            f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
+            "before the first trace, or import sionna_partial in a process of its own."
+        )
+    import sionna.rt
+
+    return sionna.rt
+
+
+@functools.cache
+def engine_fault() -> str:
+    """Return why this module cannot run on the installed Sionna RT, "" if it can; a fault is logged once."""
+    rt, version = load_sionna(), metadata.version("sionna-rt")
+    missing = _BUFFER_FIELDS - vars(rt.path_solvers.paths_buffer.PathsBuffer(1, 1, True)).keys()
+    if missing:
+        fault = f"sionna-rt {version} has no PathsBuffer.{min(missing)}, which the fast engine fills"
+    elif not version.startswith(f"{TESTED_VERSION}."):
+        fault = f"sionna-rt {version} is not of the release {TESTED_VERSION}, for which the fast engine was made"
+    else:
+        return ""
+    message = "%s. Its public path solver is used, which finds most paths and takes seconds for each receiver: %s"
+    _log.warning(message, fault, REMEDY)
+    return fault
+
+
+def open_scene(scene_xml: Path, frequency_hz: float) -> Any:
+    """Load a scene into Sionna RT, its shapes kept apart, with isotropic, vertically polarised antennas."""
+    rt = load_sionna()
+    scene = rt.load_scene(str(scene_xml), merge_shapes=False)
+    scene.frequency = frequency_hz
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
+    )
+    return scene
+
+
+class _IncoherentScene:
+    """A Mitsuba scene that traces every ray for itself.
+
+    `ImageMethod` tells Embree that its rays are coherent. Neighbours in a packet then decide whether a wall is hit: one
+    path in 600 was lost, and which ones depended on the other receivers.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        self._scene = scene
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scene, name)
+
+    def ray_intersect(self, ray: Any, **options: Any) -> Any:
+        return self._scene.ray_intersect(ray, **{**options, "coherent": False})
+
+
+class _Verification:
+    """Sionna RT's image method and field calculator, with loops of one kind."""
+
+    def __init__(self, loop_mode: str) -> None:
+        solvers = load_sionna().path_solvers
+        self._image_method = solvers.image_method.ImageMethod()
+        self._field_calculator = solvers.field_calculator.FieldCalculator()
+        self._image_method.loop_mode = self._field_calculator.loop_mode = loop_mode
+
+    def verify(self, scene: Any, buffer: Any, source: Any, targets: Any, diffraction: bool) -> Any:
+        """Verify the candidates in a buffer, and return it with their vertices."""
+        buffer = self._image_method(
+            scene=_IncoherentScene(scene.mi_scene),
+            paths=buffer,
+            src_positions=source,
+            tgt_positions=targets,
+            diffraction=diffraction,
+            diffraction_lit_region=True,
+        )
+        if diffraction:
+            _end_at_targets(buffer, targets)
+        return buffer
+
+    def evaluate(
+        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
+    ) -> Any:
+        """Return a buffer of verified candidates with their coefficients."""
+        import drjit as dr
+        import mitsuba as mi
+
+        still = dr.zeros(mi.Point3f, dr.width(source)), dr.zeros(mi.Point3f, dr.width(targets))
+        dr.make_opaque(*still)
+        patterns = scene.tx_array.antenna_pattern.patterns
+        return self._field_calculator(
+            wavelength=scene.wavelength,
+            paths=buffer,
+            samples_per_src=samples_per_tx,
+            diffraction=diffraction,
+            src_positions=source,
+            tgt_positions=targets,
+            src_orientations=still[0],
+            tgt_orientations=still[1],
+            src_antenna_patterns=patterns,
+            tgt_antenna_patterns=patterns,
+        )
+
+
+def _end_at_targets(buffer: Any, targets: Any) -> None:
+    """Put the receiver where a path has no more interactions.
+
+    There `ImageMethod` leaves images of the edge, and `FieldCalculator` 2.2 takes the first of them for a point of the
+    path after the edge: a path with fewer interactions than others in its buffer came out longer, and some dB weaker.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.constants import InteractionType
+
+    kind = buffer.interaction_types
+    target = dr.gather(mi.Point3f, targets, dr.repeat(buffer.target_indices, kind.shape[1]))
+    for name, position in zip(("_vertices_x", "_vertices_y", "_vertices_z"), target, strict=True):
+        beyond = dr.select(kind.array == InteractionType.NONE, position, getattr(buffer, name).array)
+        setattr(buffer, name, type(getattr(buffer, name))(beyond, kind.shape))
+
 
 _ALIGNMENT_BYTES = 64
 """Alignment of Dr.Jit's own arrays [bytes]."""
@@ -88,13 +233,7 @@ class VerifiedPaths:
 class SceneSolver:
     """Verifies candidates in one exported scene.
 
-    Parameters
-    ----------
-    scene_xml : Path
-        Exported scene.
-    shapes : tuple of str
-        Names of its shapes in the order in which faces are counted; those that the scene lacks count none.
-    settings : TraceSettings
+    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none.
     """
 
     def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
@@ -110,7 +249,7 @@ class SceneSolver:
         self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last stands for no face, -1
         primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
         self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
-        self._symbolic, self._evaluated = Chain("symbolic"), Chain("evaluated")
+        self._symbolic, self._evaluated = _Verification("symbolic"), _Verification("evaluated")
 
     @property
     def materials(self) -> dict[str, NDArray[np.float64]]:
@@ -127,24 +266,11 @@ class SceneSolver:
         return self._scene.mi_scene
 
     def verify(
-        self,
-        candidates: Candidates,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        self, candidates: Candidates, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
     ) -> tuple[SolvedPaths, NDArray[np.intp]]:
-        """Verify candidates and compute their coefficients.
+        """Verify candidates and compute their coefficients: the paths, and the candidate (P,) that each was.
 
-        Parameters
-        ----------
-        candidates : Candidates
-        tx_m, rx_m : (3,) and (N, 3) arrays
-            Transmitter and receivers, in scene coordinates [m].
-
-        Returns
-        -------
-        SolvedPaths
-        (P,) intp array
-            The candidate that each path was.
+        The transmitter (3,) and the receivers (N, 3) are in scene coordinates [m].
         """
         if len(candidates.rx) == 0:
             return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
@@ -303,11 +429,11 @@ class SceneSolver:
                 material.relative_permittivity = permittivity
                 material.conductivity, material.thickness = conductivity, thickness
 
-    def _solve(self, chain: Chain, candidates: Candidates, source: Any, targets: Any) -> Any:
-        """Verify candidates with one of the chains, in a buffer that keeps their order."""
-        diffraction = candidates.wedges is not None
-        samples = self._settings.samples_per_tx
-        return chain(self._scene, self._buffer(candidates), source, targets, samples, diffraction)
+    def _solve(self, verification: _Verification, candidates: Candidates, source: Any, targets: Any) -> Any:
+        """Verify candidates in a buffer that keeps their order, and compute their coefficients."""
+        diffraction, samples = candidates.wedges is not None, self._settings.samples_per_tx
+        buffer = verification.verify(self._scene, self._buffer(candidates), source, targets, diffraction)
+        return verification.evaluate(self._scene, buffer, source, targets, samples, diffraction)
 
     def _buffer(self, candidates: Candidates) -> Any:
         """Fill one of Sionna RT's path buffers with unverified candidates."""
@@ -324,7 +450,7 @@ class SceneSolver:
         shape, primitive = self._shape_of_face[face], self._primitive_of_face[face]
         buffer = PathsBuffer(*face.shape, candidates.wedges is not None)
         buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (
-            _to_device(mi.TensorXf, place.astype(np.float32)) for place in np.moveaxis(candidates.vertices_m, 2, 0)
+            _to_device(mi.TensorXf, axis.astype(np.float32)) for axis in np.moveaxis(candidates.vertices_m, 2, 0)
         )
         buffer._shapes, buffer._primitives = _to_device(mi.TensorXu, shape), _to_device(mi.TensorXu, primitive)
         buffer._interaction_types = _to_device(mi.TensorXu, kind)
@@ -371,12 +497,12 @@ def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
         yield dr.grad(results)
 
 
-def _points(places_m: NDArray[np.float64]) -> Any:
-    """Hand places (N, 3) over to Dr.Jit."""
+def _points(positions_m: NDArray[np.float64]) -> Any:
+    """Hand positions (N, 3) over to Dr.Jit."""
     import drjit as dr
     import mitsuba as mi
 
-    points = mi.Point3f(*(_to_device(mi.Float, column.astype(np.float32)) for column in places_m.T))
+    points = mi.Point3f(*(_to_device(mi.Float, column.astype(np.float32)) for column in positions_m.T))
     dr.make_opaque(points)
     return points
 

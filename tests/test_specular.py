@@ -9,7 +9,8 @@ from extruded import ROOM, extrude, specular_blocks, specular_lengths_m
 from numpy.typing import NDArray
 
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
-from sionna_partial.tracing.plan.candidates import BEND, CEILING, EDGE, FLOOR, Candidates, faces_of
+from sionna_partial.tracing.candidates import EDGE, Candidates
+from sionna_partial.tracing.plan.specular import CEILING, DIFFRACTED, FLOOR, faces_of
 
 TX = np.array([1.1, 0.7, 1.2])
 RX = np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4]])
@@ -107,7 +108,7 @@ class TestSpecularCandidates:
     def test_blocks_together_hold_what_one_block_holds(self) -> None:
         geometry = PARTS["floor and ceiling"]
         whole = _candidates(geometry)
-        parts, shares = zip(*specular_blocks(geometry, TX, RX, 3, pairs_per_block=3), strict=True)
+        parts, shares = zip(*specular_blocks(geometry, TX, RX, 3, pairs_at_once=3), strict=True)
         assert len(parts) > 3
         assert list(shares) == sorted(shares)
         assert shares[-1] == 1.0
@@ -135,7 +136,7 @@ class TestSpecularCandidates:
 class TestFacesOf:
     def test_names_each_surface_by_its_first_face(self) -> None:
         geometry = extrude(ROOM, floor_m=((0, 0, 6, 4), (6, 1, 7, 2)))
-        surface = np.array([[0, 5, FLOOR], [CEILING, BEND, -1]], dtype=np.int32)
+        surface = np.array([[0, 5, FLOOR], [CEILING, DIFFRACTED, -1]], dtype=np.int32)
         triangles = len(geometry.floor_mesh[1])
         assert triangles > 2
         faces = faces_of(surface, geometry)
