@@ -1,19 +1,16 @@
-"""Layouts of large buildings, up to 100 x 60 m: office floors along corridors, halls, and warehouses with shelves.
-
-A layout is rooms, whose outlines run through the middle of the walls, and fixtures that stand in them: columns,
-machines, shelves. Doors, furniture and the cells are those of all procedural homes (`homes.py`).
-"""
+"""Layouts of large buildings, up to 100 x 60 m: office floors along corridors, halls, and warehouses with shelves."""
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split
 
-from sionna_partial.simulation.furniture import parts_of, union_of
+from sionna_partial.simulation.furniture import log_uniform, parts_of, union_of
 
 LARGEST_M = (100.0, 60.0)
 """Length and width of the largest building [m]."""
@@ -25,12 +22,12 @@ _MODULE_M = (2.4, 4.0)
 _HALL_M2 = (60.0, 1200.0)
 _SERVICE_M2 = 20.0
 _COLUMNED_ROOM_M2 = 120.0
+_BAY_M = 2.4
 _FAR_M = 1e3
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Rooms, through the middle of their walls, and what stands fixed in them [m]."""
+class Layout(NamedTuple):
+    """Rooms, through the middle of their walls, and what stands fixed in them: columns, machines, shelves [m]."""
 
     rooms: list[Polygon]
     fixtures: list[Polygon]
@@ -57,38 +54,33 @@ def floor_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> La
     for part in [part for slab in slabs for part in parts_of(rest.intersection(slab))]:
         x0, y0, x1, y1 = part.bounds
         if min(x1 - x0, y1 - y0) > _BROAD_M:
-            rooms += _halved(rng, part, _log_uniform(rng, _HALL_M2))
+            rooms += _halved(rng, part, log_uniform(rng, _HALL_M2))
         else:
             rooms += _row(rng, part, room_m2)
     return Layout(rooms, _columns(rng, rooms, 0.5))
 
 
-def hall_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> Layout:
-    """Production hall: one or a few large rooms with columns and machines, some with a row of offices."""
+def _hall_layout(
+    rng: np.random.Generator,
+    area_m2: float,
+    room_m2: float,
+    *,
+    hall_fraction: tuple[float, float],
+    fill: Callable[[np.random.Generator, Polygon], Iterator[Polygon]],
+    columned: float,
+) -> Layout:
+    """One or a few large rooms with columns and what fills them; most have a row of offices."""
     length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
     halls, offices = _hall_and_offices(rng, _notched(rng, box(0, 0, length_m, width_m)), room_m2)
-    halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * _log_uniform(rng, (0.15, 3.0)))]
-    machines = [machine for hall in halls for machine in _machines(rng, hall)]
-    return Layout(halls + offices, _columns(rng, halls, 0.7) + machines)
-
-
-def warehouse_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> Layout:
-    """Warehouse: a hall or two with aisles between shelves, and columns; most have a row of offices."""
-    length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
-    halls, offices = _hall_and_offices(rng, _notched(rng, box(0, 0, length_m, width_m)), room_m2)
-    halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * _log_uniform(rng, (0.5, 3.0)))]
-    shelves = [shelf for hall in halls for shelf in _shelves(rng, hall)]
-    return Layout(halls + offices, _columns(rng, halls, 0.4) + shelves)
+    halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * log_uniform(rng, hall_fraction))]
+    things = [thing for hall in halls for thing in fill(rng, hall)]
+    return Layout(halls + offices, _columns(rng, halls, columned) + things)
 
 
 def _sides(rng: np.random.Generator, area_m2: float, aspect: tuple[float, float]) -> tuple[float, float]:
     """Length and width [m] of about the wanted area."""
-    length_m = min(LARGEST_M[0], math.sqrt(area_m2 * _log_uniform(rng, aspect)))
+    length_m = min(LARGEST_M[0], math.sqrt(area_m2 * log_uniform(rng, aspect)))
     return length_m, min(LARGEST_M[1], area_m2 / length_m)
-
-
-def _log_uniform(rng: np.random.Generator, between: tuple[float, float]) -> float:
-    return float(np.exp(rng.uniform(*np.log(between))))
 
 
 def _notched(rng: np.random.Generator, outline: Polygon) -> Polygon:
@@ -102,7 +94,7 @@ def _notched(rng: np.random.Generator, outline: Polygon) -> Polygon:
 
 def _corridors(rng: np.random.Generator, length_m: float, width_m: float) -> tuple[list[Polygon], list[Polygon]]:
     """Corridors along and across a floor, and the blocks of services beside those across."""
-    wide_m = _log_uniform(rng, _CORRIDOR_M)
+    wide_m = log_uniform(rng, _CORRIDOR_M)
     ends = [rng.choice([0.0, rng.uniform(3.0, 8.0)]) for _ in range(2)]
     if width_m > 2 * (_BAND_M[0] + wide_m) + _BROAD_M:
         deep_m = [rng.uniform(_BAND_M[0], min(_BAND_M[1], (width_m - _BROAD_M) / 2 - wide_m)) for _ in range(2)]
@@ -126,12 +118,9 @@ def _sections(rng: np.random.Generator, corridor: shapely.Geometry) -> list[Poly
     """Parts of the corridors, some of which have doors across."""
     x0, y0, x1, y1 = corridor.bounds
     for x in rng.uniform(x0, x1, rng.choice(3, p=[0.6, 0.25, 0.15])):
+        cut = LineString([(x, y0 - 1), (x, y1 + 1)])
         corridor = shapely.GeometryCollection(
-            [
-                piece
-                for part in parts_of(corridor)
-                for piece in parts_of(split(part, LineString([(x, y0 - 1), (x, y1 + 1)])))
-            ]
+            [piece for part in parts_of(corridor) for piece in parts_of(split(part, cut))]
         )
     return parts_of(corridor)
 
@@ -183,9 +172,7 @@ def _columns(rng: np.random.Generator, rooms: list[Polygon], chance: float) -> l
         return []
     large = union_of([room.buffer(-1.0) for room in rooms if room.area > _COLUMNED_ROOM_M2])
     half_m, apart_m, start_m = rng.uniform(0.12, 0.4), rng.uniform(4.0, 12.0, 2), rng.uniform(0.0, 12.0, 2)
-    x, y = np.meshgrid(
-        *(np.arange(first, side, step) for first, side, step in zip(start_m, LARGEST_M, apart_m, strict=True))
-    )
+    x, y = np.meshgrid(*map(np.arange, start_m, LARGEST_M, apart_m))
     inside = shapely.contains_xy(large, x, y)
     return list(shapely.box(x - half_m, y - half_m, x + half_m, y + half_m)[inside])
 
@@ -195,12 +182,12 @@ def _machines(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
     clear_m = rng.uniform(0.9, 2.5)
     placed: list[Polygon] = []
     x0, y0, x1, y1 = hall.bounds
-    for _ in range(rng.poisson(hall.area / _log_uniform(rng, (15.0, 300.0)))):
+    for _ in range(rng.poisson(hall.area / log_uniform(rng, (15.0, 300.0)))):
         x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
         if rng.random() < 0.15:
             thing = shapely.Point(x, y).buffer(rng.uniform(0.3, 2.0), quad_segs=4)
         else:
-            long_m, deep_m = _log_uniform(rng, (0.3, 3.5)), _log_uniform(rng, (0.3, 1.5))
+            long_m, deep_m = log_uniform(rng, (0.3, 3.5)), log_uniform(rng, (0.3, 1.5))
             thing = affinity.rotate(box(x - long_m, y - deep_m, x + long_m, y + deep_m), rng.choice([0, 90]))
         if rng.random() < 0.3:
             thing = affinity.rotate(thing, rng.uniform(0, 90))
@@ -232,10 +219,16 @@ def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
 def _legs(rng: np.random.Generator, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
     """Legs along both sides of a shelf, and pallets below it."""
     x0, y0, x1, y1 = block.bounds
-    bay_m = 2.4
-    xs, ys = (np.linspace(low, high, max(2, round((high - low) / bay_m) + 1)) for low, high in ((x0, x1), (y0, y1)))
+    xs, ys = (np.linspace(low, high, max(2, round((high - low) / _BAY_M) + 1)) for low, high in ((x0, x1), (y0, y1)))
     for x in xs:
         for y in ys:
             yield box(x - half_leg_m, y - half_leg_m, x + half_leg_m, y + half_leg_m)
             if rng.random() < 0.4 and x < x1 and y < y1:
                 yield box(x + 0.2, y + 0.2, min(x + rng.uniform(0.8, 2.2), x1), min(y + rng.uniform(0.8, 2.2), y1))
+
+
+hall_layout = partial(_hall_layout, hall_fraction=(0.15, 3.0), fill=_machines, columned=0.7)
+"""Production hall, with machines."""
+
+warehouse_layout = partial(_hall_layout, hall_fraction=(0.5, 3.0), fill=_shelves, columned=0.4)
+"""Warehouse: aisles between shelves."""

@@ -1,4 +1,4 @@
-"""The robot's camera: readings of the walls, their errors, and the map that they add up to."""
+"""The robot's camera: range readings of the walls, their errors, and the map that they add up to."""
 
 import math
 from typing import NamedTuple
@@ -15,35 +15,19 @@ MISSED_PATCH_M = 0.5
 """Edge of the squares [m] whose walls are missed together, as a pane or a mirror is."""
 
 HIT_LOG_ODDS, MISS_LOG_ODDS = 0.85, -0.4
-"""What a look adds to the log odds of a wall where it reports one, and where it reports free space [1].
-
-Those of OctoMap (Hornung et al., Autonomous Robots 34, 2013, Section 5).
-"""
+"""Change of a cell's log odds where a picture reports a wall, and free space (Hornung et al., 2013, Section 5)."""
 
 LOG_ODDS_LIMITS = (-2.0, 3.5)
-"""Least and greatest log odds of a wall [1] (OctoMap, as above), so that a map can still change."""
+"""Least and greatest log odds of a wall (as above), so that a map can still change."""
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 _NO_ECHO, _WALL_ECHO, _FAR = 0, 1, 2
 
 
 class Camera:
-    """Sees a home from where the robot is, and maps it where the robot believes to be.
+    """Sees a home (ny, nx), with unknown cells all around, from where the robot is; maps it where it believes to be.
 
-    Parameters
-    ----------
-    truth : (ny, nx) uint8 array of CellState
-        The home, with unknown cells all around.
-    resolution_m : float
-        Edge of a cell [m].
-    sensor : SensorSettings
-    rng : numpy.random.Generator
-        Draws the errors.
-
-    Attributes
-    ----------
-    seen : (ny, nx) uint8 array of CellState
-        The map.
+    The map is `seen` (ny, nx). Positions are in cells, x along columns and y along rows.
     """
 
     def __init__(
@@ -59,18 +43,9 @@ class Camera:
         self.seen = np.full_like(self._truth, _UNKNOWN)
 
     def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: NDArray[np.intp]) -> None:
-        """Add one picture to the map.
+        """Add one picture to the map, taken at x, y but believed to be taken `shift` from there.
 
-        Parameters
-        ----------
-        x, y : float
-            Where the robot is, along columns and rows [cells].
-        heading_deg : float
-            Where it looks, from x towards y [degree].
-        shift : (float, float)
-            How far from there, along columns and rows, it believes to be [cells].
-        under : (N, 2) int array
-            Cells that it believes to stand on, which therefore are free: row and column.
+        The cells `under` the robot (N, 2), rows and columns where it believes to be, are free.
         """
         angles = _ray_angles(heading_deg, self._view_deg, self._reach)
         noise = self._noise * self._rng.standard_normal(len(angles))
@@ -93,20 +68,7 @@ class Camera:
 
 
 def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
-    """Outline what the camera has in view: as far as it reaches, and no farther than the first wall.
-
-    Parameters
-    ----------
-    home : PartialMap
-    pose : (3,) array
-        World x, y [m], and heading from x towards y [degree].
-    sensor : SensorSettings
-
-    Returns
-    -------
-    (N, 2) array
-        World x and y of the corners of a polygon [m], the first of them the camera.
-    """
+    """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
     reach = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
@@ -123,18 +85,18 @@ def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> NDArray[np
 
 
 def _missed_walls(
-    truth: NDArray[np.uint8], resolution_m: float, share: float, rng: np.random.Generator
+    truth: NDArray[np.uint8], resolution_m: float, fraction: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """Draw the squares of the floor plan whose walls return nothing; return them cell by cell (ny, nx)."""
+    """Draw the squares of the floor plan whose walls return no reading, as cells (ny, nx)."""
     rows, columns = (np.arange(size) * resolution_m // MISSED_PATCH_M for size in truth.shape)
-    squares = rng.random((int(rows[-1]) + 1, int(columns[-1]) + 1)) < share
+    squares = rng.random((int(rows[-1]) + 1, int(columns[-1]) + 1)) < fraction
     return squares[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
 
 
 class _Rays(NamedTuple):
-    """Rays of one look: angles [radian]; start, how far from there the robot believes to be, errors, range [cells]."""
+    """Rays of one picture: angles [radian]; start, where the robot believes to be less start, errors, range [cells]."""
 
-    place: tuple[float, float]
+    start: tuple[float, float]
     shift: tuple[float, float]
     angles: NDArray[np.float64]
     noise: NDArray[np.float64]
@@ -142,42 +104,31 @@ class _Rays(NamedTuple):
 
 
 @njit(cache=True)
-def _cast_rays(
-    truth: NDArray[np.uint8],
-    missed: NDArray[np.bool_],
-    view: NDArray[np.uint8],
-    corner: tuple[int, int],
-    rays: _Rays,
-) -> None:
-    """Write what one picture reports into `view`: free up to the reading, a wall there.
+def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-def]
+    """Write what one picture reports into `view`, whose first cell is `corner` of the home: free up to the reading.
 
-    The first cell of `view` is row and column `corner` of the home. Where several rays disagree about a cell, a wall
-    counts (as in OctoMap).
+    Where rays disagree about a cell, a wall counts (as in OctoMap).
     """
     (x, y), shift, angles, noise, reach = rays
     for ray in range(len(angles)):
         echo, reading = _read(truth, missed, x, y, angles[ray], reach)
         reading += noise[ray]
-        walk = _start(x + shift[0], y + shift[1], angles[ray])
-        row, column = walk.row - corner[0], walk.column - corner[1]
-        while 0 <= row < view.shape[0] and 0 <= column < view.shape[1]:
-            if echo != _FAR and walk.leaves > reading:
+        cells, ends = _cells_along(x + shift[0], y + shift[1], angles[ray], reach)
+        for k in range(len(cells)):
+            row, column = cells[k, 0] - corner[0], cells[k, 1] - corner[1]
+            if not (0 <= row < view.shape[0] and 0 <= column < view.shape[1]):
+                break
+            if echo != _FAR and ends[k] > reading:
                 if echo == _WALL_ECHO:
                     view[row, column] = _WALL
                 break
-            if walk.enters > reach:
-                break
-            if view[row, column] == _UNKNOWN:
+            if view[row, column] == _UNKNOWN and k < len(cells) - 1:
                 view[row, column] = _FREE
-            walk = _next(walk)
-            row, column = walk.row - corner[0], walk.column - corner[1]
 
 
 @njit(cache=True)
-def _ranges(
-    truth: NDArray[np.uint8], x: float, y: float, angles: NDArray[np.float64], reach: float
-) -> NDArray[np.float64]:
-    """Return how far each ray gets [cells]."""
+def _ranges(truth, x, y, angles, reach):  # type: ignore[no-untyped-def]
+    """Length of each ray [cells]."""
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
         ranges[ray] = _read(truth, missed, x, y, angles[ray], reach)[1]
@@ -185,58 +136,38 @@ def _ranges(
 
 
 @njit(cache=True)
-def _read(
-    truth: NDArray[np.uint8], missed: NDArray[np.bool_], x: float, y: float, angle: float, reach: float
-) -> tuple[int, float]:
-    """Return what ends a ray, and a distance within that cell: a wall that is noticed, one that is not, or nothing."""
-    walk = _start(x, y, angle)
-    while walk.enters <= reach:
-        if truth[walk.row, walk.column] != _FREE:
-            noticed = truth[walk.row, walk.column] == _WALL and not missed[walk.row, walk.column]
-            return (_WALL_ECHO if noticed else _NO_ECHO), (walk.enters + walk.leaves) / 2
-        walk = _next(walk)
+def _read(truth, missed, x, y, angle, reach):  # type: ignore[no-untyped-def]
+    """Return what ends a ray (a wall that is noticed, one that is not, or nothing), and a distance within that cell."""
+    cells, ends = _cells_along(x, y, angle, reach)
+    for k in range(len(cells) - 1):
+        row, column = cells[k]
+        if truth[row, column] != _FREE:
+            noticed = truth[row, column] == _WALL and not missed[row, column]
+            return (_WALL_ECHO if noticed else _NO_ECHO), ((ends[k - 1] if k > 0 else 0.0) + ends[k]) / 2
     return _FAR, reach
 
 
-class _Walk(NamedTuple):
-    """A ray in one of the cells along it, and where it enters and leaves the cell [cells].
-
-    A ray through a corner takes one of the two cells beside it, so that it never slips between two walls. Each cell
-    keeps a piece of the ray to itself, a billionth of a cell at least, so that a distance names one cell.
-    """
-
-    row: int
-    column: int
-    enters: float
-    leaves: float
-    step_x: int
-    step_y: int
-    pace_x: float
-    pace_y: float
-    next_x: float
-    next_y: float
-
-
 @njit(cache=True)
-def _start(x: float, y: float, angle: float) -> _Walk:
-    """Return a ray in the cell where it starts."""
+def _cells_along(x, y, angle, reach):  # type: ignore[no-untyped-def]
+    """Cells (n, 2) along a ray, row and column, and where it leaves them (n,) [cells]; the last is beyond its reach.
+
+    A ray through a corner crosses one of the two cells beside it, so that it never slips between two walls. It is
+    at least a billionth of a cell long in each cell, so that a distance belongs to one cell.
+    """
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
-    step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
     pace_x, pace_y = 1.0 / max(abs(along_x), 1e-12), 1.0 / max(abs(along_y), 1e-12)
     next_x = pace_x * (column + 1 - x if along_x > 0 else x - column)
     next_y = pace_y * (row + 1 - y if along_y > 0 else y - row)
-    leaves = max(min(next_x, next_y), 1e-9)
-    return _Walk(row, column, 0.0, leaves, step_x, step_y, pace_x, pace_y, next_x, next_y)
-
-
-@njit(cache=True)
-def _next(walk: _Walk) -> _Walk:
-    """Return the ray in the next cell."""
-    row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
-    if next_x < next_y:
-        column, next_x = column + walk.step_x, next_x + walk.pace_x
-    else:
-        row, next_y = row + walk.step_y, next_y + walk.pace_y
-    leaves = max(min(next_x, next_y), walk.leaves + 1e-9)
-    return _Walk(row, column, walk.leaves, leaves, walk.step_x, walk.step_y, walk.pace_x, walk.pace_y, next_x, next_y)
+    size = int(reach * (abs(along_x) + abs(along_y))) + 8
+    cells, ends = np.empty((size, 2), np.int64), np.empty(size)
+    count, start, end = 0, 0.0, 0.0
+    while start <= reach and count < size:
+        start, end = end, max(min(next_x, next_y), end + 1e-9)
+        cells[count, 0], cells[count, 1], ends[count] = row, column, end
+        count += 1
+        if next_x < next_y:
+            column, next_x = column + (1 if along_x > 0 else -1), next_x + pace_x
+        else:
+            row, next_y = row + (1 if along_y > 0 else -1), next_y + pace_y
+    return cells[:count], ends[:count]
