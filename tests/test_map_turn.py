@@ -12,9 +12,9 @@ from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps import map_turn
-from sionna_partial.maps.map_turn import turn_grid
+from sionna_partial.maps import ros_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.ros_map import turn_grid
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 GRID = np.array([[0, 1, 2], [0, 0, 1]], dtype=np.uint8)
@@ -125,7 +125,7 @@ def test_turning_is_logged(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(map_turn, "MAX_CELLS", 30)
+    monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
     with pytest.raises(
         MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells, more"
     ):

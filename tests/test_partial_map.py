@@ -207,7 +207,7 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
         ({"state": np.zeros((0, 3), int)}, "state has shape (0, 3): give a two-dimensional array"),
         ({"state": [[0, 3]]}, "state has values 0 to 3: use CellState integers FREE 0, WALL 1, UNK"),
         ({"state": [[-1]]}, "values -1 to -1: use CellState integers"),
-        ({"state": [[0.0]]}, "state has dtype float64: use CellState integers"),
+        ({"state": [[0.0]]}, "state has dtype float64: give CellState integers"),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
         ({"resolution_m": 50}, "resolution_m = 50 is not allowed"),
         ({"resolution_m": np.nan}, "resolution_m = nan is not allowed"),

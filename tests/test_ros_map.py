@@ -14,8 +14,8 @@ from PIL import Image
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.ros_map import MapWarning, states_from_percent
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.ros_map import states_from_percent
 
 SHEET: dict[str, Any] = {
     "image": "map.pgm",

@@ -1,5 +1,6 @@
 """ROS map_server maps: a YAML file and an image, read as nav2_map_server reads them, and written."""
 
+import logging
 import math
 import reprlib
 import warnings
@@ -12,16 +13,20 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.ndimage import affine_transform, binary_dilation
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.map_turn import turn_grid
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.mesh.files import read_exported_mesh
+from sionna_partial.maps.mesh.mesh import material_records
+from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap
 from sionna_partial.settings import Material
 
+logger = logging.getLogger(__name__)
+
 MODES = ("trinary", "scale", "raw")
-"""Ways in which map_server reads an image."""
+"""How map_server may read an image."""
 
 UNKNOWN_SHADE = 205
 """Shade that map savers give to unknown cells [of 255]."""
@@ -39,10 +44,6 @@ _short = reprlib.Repr()
 _short.maxstring, _short.maxother, _short.maxlevel = 200, 200, 2
 
 
-class MapWarning(UserWarning):
-    """A map file that was not read to the letter, because unknown cells would have read as free or wall."""
-
-
 @dataclass(frozen=True)
 class _Sheet:
     """The checked content of a map YAML."""
@@ -50,14 +51,9 @@ class _Sheet:
     source: Path
     image: Path
     mode: str
-    resolution_m: float
-    origin: tuple[float, float, float]
     negate: bool
     occupied_thresh: float
     free_thresh: float
-    wall_height_m: float
-    interior_cells: int | None
-    material: Material | None
 
 
 @dataclass(frozen=True)
@@ -77,60 +73,36 @@ class _Pixels:
         return 255 * self.per_shade + self.opaque
 
 
-def read_ros_map(
-    path: Path, *, strict: bool = False, wall_height_m: float | None = None, confined: bool = False
-) -> PartialMap:
-    """Read a ROS map_server YAML and its image.
+def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) -> PartialMap:
+    """Read a ROS map_server YAML and its image, and the mesh of the exported scene that the YAML is part of.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The YAML file.
-    strict : bool
-        Read every pixel as map_server does, even where unknown cells become free or wall that way.
-    wall_height_m : float or None
-        Wall height [m] in place of the YAML's `wall_height`.
-    confined : bool
-        Refuse an image outside the YAML's folder.
-
-    Returns
-    -------
-    PartialMap
-
-    Raises
-    ------
-    MapError
-        For a YAML or an image that is missing, damaged, or out of range.
+    `strict` reads every pixel as map_server does, even where unknown cells become free or wall that way; `confined`
+    refuses an image outside the YAML's folder.
     """
-    sheet = _read_sheet(path, confined=confined)
+    raw = _read_yaml(path)
+    sheet = _read_sheet(path, raw, confined=confined)
+    resolution_m = _number(path, raw, "resolution", 1e-3, 10.0, "metres per cell (not cells per metre)")
+    origin = _origin(path, _required(path, raw, "origin"))
+    height_m = _number(path, {"wall_height": DEFAULT_WALL_HEIGHT_M, **raw}, "wall_height", 0.1, 100.0, "metres")
+    interior = raw.get("interior_cells")
+    if interior is not None and (not isinstance(interior, int) or isinstance(interior, bool) or interior < 0):
+        raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
+    material = _material(path, raw.get("material"))
     pixels = _read_pixels(sheet)
     state = _classify(pixels, sheet)
     if sheet.mode == "trinary" and not strict:
         _keep_unknown(state, pixels, sheet)
-    placed, resolution_m, origin_m = turn_grid(np.flipud(state), sheet.resolution_m, sheet.origin)
-    height = sheet.wall_height_m if wall_height_m is None else wall_height_m
-    interior = sheet.interior_cells
+    state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
-        interior *= round(sheet.resolution_m / resolution_m) ** 2
-    return PartialMap(placed, resolution_m, origin_m, height, interior, material=sheet.material)
+        interior *= round(resolution_m / cell_m) ** 2
+    mesh = read_exported_mesh(path.parent, raw["mesh"], raw.get("scene_offset")) if "mesh" in raw else None
+    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material)
 
 
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
-    """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map.
+    """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map, or neither.
 
-    Parameters
-    ----------
-    partial : PartialMap
-        The map.
-    path : pathlib.Path
-        The YAML file.
-    extra : mapping or None
-        Further keys for the YAML.
-
-    Raises
-    ------
-    OutputError
-        If writing fails; both files are then as they were before.
+    Of a mesh, the YAML has what the exported scene beside it does not.
     """
     image = path.with_suffix(".pgm")
     sheet: dict[str, object] = {
@@ -147,31 +119,73 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         sheet["interior_cells"] = int(partial.interior_cells)
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
+    sheet |= extra or {}
+    if partial.mesh is not None:
+        sheet["mesh"] = {"height_range": [*partial.height_range_m], "materials": material_records(partial.mesh)}
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     ny, nx = partial.shape
     with atomic_write(path, "w") as text, atomic_write(image) as picture:
-        yaml.safe_dump({**sheet, **(extra or {})}, text, sort_keys=False, default_flow_style=None)
+        yaml.safe_dump(sheet, text, sort_keys=False, default_flow_style=None)
         text.flush()
         picture.write(b"P5\n%d %d\n255\n" % (nx, ny))
         picture.write(np.flipud(shades[partial.state]).tobytes())
 
 
+def turn_grid(
+    state: NDArray[np.uint8], resolution_m: float, origin: tuple[float, float, float]
+) -> tuple[NDArray[np.uint8], float, tuple[float, float]]:
+    """Turn a grid (ny, nx) by the yaw of its origin (x, y, yaw), onto the world axes; UNKNOWN outside it.
+
+    Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is below the map's
+    resolution and left out. Any other yaw puts the grid onto cells of half the size, each with the state found at its
+    centre: a wall of one cell stays at least two new cells thick, more than a diagonal step needs (sqrt 2), so that no
+    wall gets holes. Where walls met at a corner alone, the gap is closed; a complete map stays complete.
+
+    Returns the state, the edge of its cells [m], and the world x and y of its lower-left corner [m].
+    """
+    x, y, yaw = origin
+    ny, nx = state.shape
+    turns = round(yaw / (math.pi / 2))
+    if abs(yaw - turns * math.pi / 2) * math.hypot(ny, nx) <= 0.5:
+        left, down = ((0, 0), (ny, 0), (nx, ny), (0, nx))[turns % 4]
+        return np.rot90(state, -turns), resolution_m, (x - left * resolution_m, y - down * resolution_m)
+    cell_m = resolution_m / 2
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])  # acts on (y, x)
+    corners = np.array([(0, 0), (ny, 0), (0, nx), (ny, nx)]) @ turn.T * resolution_m
+    low = corners.min(axis=0)
+    rows, columns = (int(n) for n in np.ceil((corners.max(axis=0) - low) / cell_m - 1e-9))
+    if rows * columns > MAX_CELLS:
+        raise MapError(
+            f"origin = {list(origin)} has a yaw for which the map needs {rows} x {columns} cells, "
+            f"more than {MAX_CELLS:,}: set the yaw to 0, or cut or coarsen the map."
+        )
+    logger.warning("origin yaw %g rad: the map is turned onto cells of %g m.", yaw, cell_m)
+    first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
+
+    def turned(grid: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Sample a grid of the map's shape at the centres of the new cells."""
+        shape, unknown = (rows, columns), CellState.UNKNOWN
+        return affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
+
+    result = turned(state)
+    frontier = binary_dilation(_touches_unknown(state), np.ones((3, 3)))
+    result[_touches_unknown(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
+    return result, cell_m, (x + float(low[1]), y + float(low[0]))
+
+
+def _touches_unknown(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
+    near: NDArray[np.bool_] = binary_dilation(state == CellState.UNKNOWN, border_value=1)
+    return near & (state == CellState.FREE)
+
+
 def states_from_percent(
     percent: NDArray[np.integer], occupied_percent: float, free_percent: float
 ) -> NDArray[np.uint8]:
-    """CellState of ROS occupancy values, as nav2's map_saver draws them.
+    """CellState of ROS occupancy values, as nav2's map_saver draws them: 0 to 100 percent, any other is unknown.
 
-    Parameters
-    ----------
-    percent : integer array
-        0 to 100; any other value is unknown.
-    occupied_percent, free_percent : float
-        From this value a cell is wall; up to this value it is free.
-
-    Returns
-    -------
-    uint8 array of CellState, of the same shape
+    From `occupied_percent` a cell is wall; up to `free_percent` it is free.
     """
     state = np.full(percent.shape, CellState.UNKNOWN, dtype=np.uint8)
     state[(percent >= 0) & (percent <= free_percent)] = CellState.FREE
@@ -183,8 +197,7 @@ def _refuse(sheet: Path, field: str, value: object, remedy: str) -> MapError:
     return MapError(f"{sheet}: {field} = {_short.repr(value)} is not allowed: {remedy}")
 
 
-def _read_sheet(path: Path, *, confined: bool) -> _Sheet:
-    raw = _read_yaml(path)
+def _read_sheet(path: Path, raw: Mapping[Any, Any], *, confined: bool) -> _Sheet:
     occupied = _number(path, raw, "occupied_thresh", 0.0, 1.0)
     free = _number(path, raw, "free_thresh", 0.0, 1.0)
     if free >= occupied:
@@ -195,23 +208,8 @@ def _read_sheet(path: Path, *, confined: bool) -> _Sheet:
     negate = _required(path, raw, "negate")
     if not isinstance(negate, int) or negate not in (0, 1):
         raise _refuse(path, "negate", negate, "give 0 (dark is wall) or 1 (bright is wall).")
-    interior = raw.get("interior_cells")
-    if interior is not None and (not isinstance(interior, int) or isinstance(interior, bool) or interior < 0):
-        raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
-    height = {"wall_height": DEFAULT_WALL_HEIGHT_M, **raw}
-    return _Sheet(
-        source=path,
-        image=_image_path(path, _required(path, raw, "image"), confined=confined),
-        mode=mode.lower(),
-        resolution_m=_number(path, raw, "resolution", 1e-3, 10.0, "metres per cell (not cells per metre)"),
-        origin=_origin(path, _required(path, raw, "origin")),
-        negate=bool(negate),
-        occupied_thresh=occupied,
-        free_thresh=free,
-        wall_height_m=_number(path, height, "wall_height", 0.1, 100.0, "metres"),
-        interior_cells=interior,
-        material=_material(path, raw.get("material")),
-    )
+    image = _image_path(path, _required(path, raw, "image"), confined=confined)
+    return _Sheet(path, image, mode.lower(), bool(negate), occupied, free)
 
 
 def _material(path: Path, value: object) -> Material | None:
@@ -253,8 +251,7 @@ def _number(path: Path, raw: Mapping[Any, Any], key: str, low: float, high: floa
     value = _required(path, raw, key)
     number = _float(value)
     if not low <= number <= high:
-        what = f" of {unit}" if unit else ""
-        raise _refuse(path, key, value, f"give a number{what} in [{low:g}, {high:g}].")
+        raise _refuse(path, key, value, f"give a number{unit and f' of {unit}'} in [{low:g}, {high:g}].")
     return number
 
 
@@ -364,4 +361,4 @@ def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> N
 
 def _warn(sheet: _Sheet, what: str) -> None:
     message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
-    warnings.warn(message, MapWarning, stacklevel=6)
+    warnings.warn(message, MapWarning, stacklevel=5)

@@ -16,7 +16,6 @@ from scipy import ndimage
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.mesh.mitsuba_xml import exported_record
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
@@ -209,10 +208,9 @@ def _export_mesh_scene(
         used.require_frequency(frequency_hz)
     x0, y0, x1, y1 = partial.bounds_m
     offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]
-    extra = {"scene_offset": offset_m, "mesh": exported_record(mesh)}
     with atomic_folder(folder) as place:
         write_mesh_scene(mesh, place, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz)
-        write_ros_map(partial, place / "map.yaml", extra)
+        write_ros_map(partial, place / "map.yaml", {"scene_offset": offset_m})
     return Path(folder)
 
 
