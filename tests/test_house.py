@@ -23,10 +23,7 @@ ROOMS = {
     "foundations": ("constants", "errors", "resources", "settings", "files", "planar", "cores", "llvm", "llvm_probe"),
     "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
-    "scene": (
-        *("lines", "wall_cells", "polylines", "graph", "outlines", "lattice"),
-        *("floor_plan", "scene_xml", "scene"),
-    ),
+    "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
         *("slab", "plan.bounds", "plan.beams", "plan.candidates", "plan.diffraction"),
         *("mesh.rays", "mesh.planes", "mesh.sequences", "mesh.candidates"),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.lattice import lattice_outlines
+from sionna_partial.scene.outlines import lattice_outlines
 from sionna_partial.scene.scene import build_scene
 from sionna_partial.settings import SceneSettings
 

@@ -105,10 +105,8 @@ def load_map(
         elif suffix == ".npz":
             partial = _read_npz(source)
         elif suffix in (".pgm", ".png", ".bmp"):
-            raise MapError(
-                f"path = '{source}' is a bare image without resolution and origin: "
-                f"give its YAML, such as '{source.with_suffix('.yaml')}'."
-            )
+            remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
+            raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
         else:
             raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
     if wall_height_m is None:
@@ -254,10 +252,8 @@ def map_from_occupancy(
     if outside.any():
         raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
     if not 0 <= free_percent < occupied_percent <= 100:
-        raise MapError(
-            f"free_percent = {free_percent!r} and occupied_percent = {occupied_percent!r} are not allowed: "
-            "give 0 <= free_percent < occupied_percent <= 100."
-        )
+        given = f"free_percent = {free_percent!r} and occupied_percent = {occupied_percent!r}"
+        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100.")
     state = states_from_percent(values, occupied_percent, free_percent)
     return PartialMap(state, resolution_m, origin_m, wall_height_m)
 
@@ -376,9 +372,8 @@ def _read_scene(source: Path, reading: MeshReading) -> PartialMap:
         reading.require_unused(source, "an exported map (remove its map.yaml to read the meshes of its scene alone)")
         return read_ros_map(folder / "map.yaml", confined=True)
     if len(scenes) != 1:
-        raise MapError(
-            f"path = '{source}' is no scene: it has {len(scenes)} .xml files; give the path of one, or {ACCEPTED}."
-        )
+        remedy = f"give the path of one, or {ACCEPTED}."
+        raise MapError(f"path = '{source}' is no scene: it has {len(scenes)} .xml files; {remedy}")
     return mesh_map(read_mitsuba_scene(scenes[0]), reading)
 
 
@@ -405,7 +400,6 @@ def _read_npz(source: Path) -> PartialMap:
     except MapError:
         raise
     except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files
-        raise MapError(
-            f"path = '{source}' is damaged or was not written by save_map ({error}): save it again."
-        ) from error
+        what = f"is damaged or was not written by save_map ({error})"
+        raise MapError(f"path = '{source}' {what}: save it again.") from error
     return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material)

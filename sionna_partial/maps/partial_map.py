@@ -247,10 +247,8 @@ def _checked_state(values: ArrayLike) -> NDArray[np.uint8]:
     wanted = "CellState integers FREE 0, WALL 1, UNKNOWN 2"
     state = grid_array("state", values, "iub", wanted)
     if state.size > MAX_CELLS:
-        ny, nx = state.shape
-        raise MapError(
-            f"state has {ny} x {nx} cells, more than {MAX_CELLS:,}: cut the map to the building or coarsen it."
-        )
+        cells = f"{state.shape[0]} x {state.shape[1]} cells, more than {MAX_CELLS:,}"
+        raise MapError(f"state has {cells}: cut the map to the building or coarsen it.")
     if state.min() < 0 or state.max() > max(CellState):
         raise MapError(f"state has values {state.min()} to {state.max()}: use {wanted}.")
     state = np.array(state, dtype=np.uint8)

@@ -2,12 +2,13 @@
 
 import logging
 import math
+import os
 import reprlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
@@ -18,7 +19,7 @@ from scipy.ndimage import affine_transform, binary_dilation
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.mesh.files import read_exported_mesh
+from sionna_partial.maps.mesh.files import read_bytes, read_exported_mesh
 from sionna_partial.maps.mesh.mesh import material_records
 from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap
 from sionna_partial.settings import Material
@@ -44,9 +45,8 @@ _short = reprlib.Repr()
 _short.maxstring, _short.maxother, _short.maxlevel = 200, 200, 2
 
 
-@dataclass(frozen=True)
-class _Sheet:
-    """The checked content of a map YAML."""
+class _Sheet(NamedTuple):
+    """How the image of a map YAML is to be read."""
 
     source: Path
     image: Path
@@ -56,21 +56,16 @@ class _Sheet:
     free_thresh: float
 
 
-@dataclass(frozen=True)
-class _Pixels:
+class _Pixels(NamedTuple):
     """A decoded image, row 0 at the top.
 
-    An opaque pixel of grey shade s (0 to 255) has the level s * `per_shade` + `opaque`, at most `full`.
+    An opaque pixel of grey shade s (0 to 255) has the level s * `per_shade` + `opaque`.
     """
 
     level: NDArray[np.uint16]
     per_shade: int = 1
     opaque: int = 0
     alpha: NDArray[np.uint8] | None = None
-
-    @property
-    def full(self) -> int:
-        return 255 * self.per_shade + self.opaque
 
 
 def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) -> PartialMap:
@@ -156,10 +151,8 @@ def turn_grid(
     low = corners.min(axis=0)
     rows, columns = (int(n) for n in np.ceil((corners.max(axis=0) - low) / cell_m - 1e-9))
     if rows * columns > MAX_CELLS:
-        raise MapError(
-            f"origin = {list(origin)} has a yaw for which the map needs {rows} x {columns} cells, "
-            f"more than {MAX_CELLS:,}: set the yaw to 0, or cut or coarsen the map."
-        )
+        what = f"has a yaw for which the map needs {rows} x {columns} cells, more than {MAX_CELLS:,}"
+        raise MapError(f"origin = {list(origin)} {what}: set the yaw to 0, or cut or coarsen the map.")
     logger.warning("origin yaw %g rad: the map is turned onto cells of %g m.", yaw, cell_m)
     first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
 
@@ -222,22 +215,13 @@ def _material(path: Path, value: object) -> Material | None:
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
     try:
-        with path.open("rb") as stream:
-            text = stream.read(MAX_YAML_BYTES + 1)
-    except OSError as error:
-        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
-    if len(text) > MAX_YAML_BYTES:
-        raise MapError(f"path = '{path}' has more than {MAX_YAML_BYTES:,} bytes: give the YAML of a ROS map.")
-    try:
-        raw = yaml.safe_load(text)
+        raw = yaml.safe_load(read_bytes(path, MAX_YAML_BYTES, "give the YAML of a ROS map."))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise MapError(f"path = '{path}' is not valid YAML ({reason}): correct it or save the map again.") from error
     if not isinstance(raw, dict):
-        raise MapError(
-            f"path = '{path}' holds {_short.repr(raw)} in place of keys such as image, resolution and origin: "
-            "give the YAML that a ROS map_saver wrote."
-        )
+        what = f"holds {_short.repr(raw)} in place of keys such as image, resolution and origin"
+        raise MapError(f"path = '{path}' {what}: give the YAML that a ROS map_saver wrote.")
     return raw
 
 
@@ -279,11 +263,7 @@ def _image_path(path: Path, value: object, *, confined: bool) -> Path:
     if confined and (Path(value).is_absolute() or ".." in Path(value).parts):
         raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
     image = path.parent / value
-    try:
-        found = image.is_file()
-    except OSError:
-        found = False
-    if not found:
+    if not os.path.isfile(image):
         raise _refuse(path, "image", value, f"there is no file '{image}'; put the image there or correct the name.")
     return image
 
@@ -326,7 +306,8 @@ def _decode(sheet: _Sheet) -> Image.Image:
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> NDArray[np.uint8]:
     """Read every pixel to the letter of nav2's loadMapFromFile; what lies between the thresholds is unknown."""
-    shade = np.arange(pixels.full + 1) / pixels.full
+    full = 255 * pixels.per_shade + pixels.opaque
+    shade = np.arange(full + 1) / full
     if sheet.mode == "raw":
         occupied, free = np.rint(100 * sheet.occupied_thresh), np.rint(100 * sheet.free_thresh)
         table = states_from_percent(np.rint(255 * shade).astype(int), occupied, free)
@@ -347,18 +328,17 @@ def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> N
     With a free_thresh above 0.196 (older nav2 wrote 0.25), or with an alpha channel, 205 reads as free. It is
     kept unknown where more cells would be lost that way than would be unknown.
     """
-    shade = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE
+    shade, warned = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, []
     lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)
     if lost.sum() > (state == CellState.UNKNOWN).sum():
         state[lost] = CellState.UNKNOWN
-        _warn(sheet, f"{int(lost.sum())} cells of shade {shade} would read as free (free_thresh {sheet.free_thresh:g})")
+        count = f"{int(lost.sum())} cells of shade {shade}"
+        warned.append(f"{count} would read as free (free_thresh {sheet.free_thresh:g})")
     if pixels.alpha is not None:
         clear = (pixels.alpha == 0) & (state != CellState.UNKNOWN)
         if clear.any():
             state[clear] = CellState.UNKNOWN
-            _warn(sheet, f"{int(clear.sum())} transparent cells would read as free or wall")
-
-
-def _warn(sheet: _Sheet, what: str) -> None:
-    message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
-    warnings.warn(message, MapWarning, stacklevel=5)
+            warned.append(f"{int(clear.sum())} transparent cells would read as free or wall")
+    for what in warned:
+        message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
+        warnings.warn(message, MapWarning, stacklevel=4)

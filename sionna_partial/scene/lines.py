@@ -18,29 +18,18 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 
 
 def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Split a polyline of straight elements into few straight runs.
+    """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` of the middle of every unit edge, measured along x or y
-    (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
+    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, measured along x or
+    y (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
     lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
     more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
     notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
     residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a
     ragged one is parallel to an axis where that moves its ends by half a cell at most.
 
-    Parameters
-    ----------
-    points : (n, 2) float64 array
-        Corners of the polyline [cells].
-    tolerance : float
-        Largest deviation where the polyline is not ragged [cells].
-
-    Returns
-    -------
-    starts : (r,) int64 array
-        Index of the corner where every run begins.
-    lines : (r, 4) float64 array
-        Point x, y on and direction x, y of every run's line.
+    Returns the index of the corner where every run begins (r,), and a point x, y on and the direction x, y of its line
+    (r, 4).
     """
     points, tolerance = np.ascontiguousarray(points), tolerance + 1e-6
     previous, along_y = np.zeros(len(points), np.int64), np.zeros(len(points), np.bool_)
@@ -106,7 +95,11 @@ def _line(points, start, end, tolerance, swap):  # type: ignore[no-untyped-def]
     if ragged and abs(slope * (points[end, int(swap)] - points[start, int(swap)])) <= _LEVEL_CELLS:
         slope = 0.0
     offset = mean_y - slope * mean_x
-    if size > 0 and not _fits(points, start, end, tolerance, swap, slope, offset):
+    fits = True
+    for k in range(start, end):
+        x0, y0, x1, y1, _ = _middles(points, start, k, swap)
+        fits = fits and max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) <= tolerance
+    if size > 0 and not fits:
         slope, offset = 0.0, 0.0
         for k in range(size):
             slope, offset = slope + polygon[k, 0], offset + polygon[k, 1]
@@ -139,15 +132,6 @@ def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped
     if size > 0 and steps > 1:
         size = _clip(polygon, size, x1, y1, tolerance)
     return size
-
-
-@njit(cache=True)
-def _fits(points, start, end, tolerance, swap, slope, offset):  # type: ignore[no-untyped-def]
-    for k in range(start, end):
-        x0, y0, x1, y1, _ = _middles(points, start, k, swap)
-        if max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) > tolerance:
-            return False
-    return True
 
 
 @njit(cache=True)
@@ -213,9 +197,9 @@ def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
                 kept[count, 0], kept[count, 1] = slope, offset
                 count += 1
             if inside * next_inside < 0.0:
-                share = inside / (inside - next_inside)
-                kept[count, 0] = slope + (next_slope - slope) * share
-                kept[count, 1] = offset + (next_offset - offset) * share
+                fraction = inside / (inside - next_inside)
+                kept[count, 0] = slope + (next_slope - slope) * fraction
+                kept[count, 1] = offset + (next_offset - offset) * fraction
                 count += 1
             if count > _CORNERS - 2:
                 return 0

@@ -24,7 +24,6 @@ DEFAULT_BAND_M = (1.0, 1.8)
 DEFAULT_RESOLUTION_M = 0.05
 """Edge of the cells of a mesh's map [m], as robots have them."""
 
-
 RIM_M = 0.3
 """Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
 

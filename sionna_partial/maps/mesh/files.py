@@ -10,6 +10,7 @@ import os
 import warnings
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -73,6 +74,18 @@ def read_mesh(path: Path, up: str | None = None) -> SceneMesh:
     return _joined(path, [(vertices, triangles)], [0], (None,))
 
 
+def read_bytes(path: Path, most: int, remedy: str) -> bytes:
+    """Return the content of a file of at most so many bytes."""
+    try:
+        with path.open("rb") as stream:
+            content = stream.read(most + 1)
+    except OSError as error:
+        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
+    if len(content) > most:
+        raise MapError(f"path = '{path}' has more than {most:,} bytes: {remedy}")
+    return content
+
+
 def confined_path(folder: Path, name: str, what: str) -> Path:
     """Return the path of a file that another one names, or raise a MapError (`what` ...) if it is not in the folder."""
     inside = bool(name) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts
@@ -98,16 +111,13 @@ def _read_triangles(path: Path, kind: str) -> Triangles:
     except MapError:
         raise
     except Exception as error:  # decoders fail in many ways on damaged files
-        raise MapError(
-            f"path = '{path}' is damaged or no {kind.upper()} mesh ({error}): export the mesh again."
-        ) from error
+        raise MapError(f"path = '{path}' is damaged or no {kind.upper()} mesh ({error}): export it again.") from error
     if not any(len(triangles) for _, triangles in parts):
         raise MapError(f"path = '{path}' holds 0 triangles: give a mesh with surfaces, not points or lines alone.")
     vertices, triangles = _concatenated(parts)
     if len(triangles) > MAX_TRIANGLES:
-        raise MapError(
-            f"path = '{path}' holds {len(triangles):,} triangles, more than {MAX_TRIANGLES:,}: cut or simplify it."
-        )
+        count = f"{len(triangles):,} triangles, more than {MAX_TRIANGLES:,}"
+        raise MapError(f"path = '{path}' holds {count}: cut or simplify it.")
     return vertices, triangles
 
 
@@ -121,10 +131,8 @@ def _placed_parts(path: Path, scene: Any) -> Iterator[Triangles]:
         vertices, triangles = np.asarray(part.vertices, dtype=np.float64), np.asarray(part.faces, dtype=np.int64)
         wrong = (triangles < 0) | (triangles >= len(vertices))
         if wrong.any():
-            raise MapError(
-                f"path = '{path}' has a triangle with vertex {triangles[wrong][0]}, but {len(vertices)} vertices: "
-                "export the mesh again."
-            )
+            count = f"vertex {triangles[wrong][0]}, but {len(vertices)} vertices"
+            raise MapError(f"path = '{path}' has a triangle with {count}: export the mesh again.")
         yield vertices @ transform[:3, :3].T + transform[:3, 3], triangles
 
 
@@ -190,32 +198,23 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
         low, high = (float(value) for value in record["height_range"])
         shift = np.array(offset_m, dtype=np.float64).reshape(3)
     except (KeyError, TypeError, ValueError) as error:
-        raise MapError(
-            f"path = '{folder / 'map.yaml'}' has a damaged mesh entry ({error}): export it again."
-        ) from error
+        sheet = folder / "map.yaml"
+        raise MapError(f"path = '{sheet}' has a damaged mesh entry ({error}): export it again.") from error
     _, shapes = _read_shapes(path)
-    index, names = [], [f"part{number}" for number in range(len(materials))]
-    for shape in shapes:
-        if _name(shape.element) not in names:
-            raise MapError(
-                f"path = '{path}' has a shape {_name(shape.element)!r} that was not exported: export the scene again."
-            )
-        index.append(names.index(_name(shape.element)))
+    names = [_name(shape.element) for shape in shapes]
+    index = {f"part{number}": number for number in range(len(materials))}
+    for name in names:
+        if name not in index:
+            raise MapError(f"path = '{path}' has a shape {name!r} that was not exported: export the scene again.")
     if not shapes:
         return SceneMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0, np.uint8), materials, (low, high))
-    mesh = _joined(path, [(shape.triangles[0] + shift, shape.triangles[1]) for shape in shapes], index, materials)
-    return SceneMesh(mesh.vertices_m, mesh.triangles, mesh.material, materials, (low, high))
+    parts = [(shape.triangles[0] + shift, shape.triangles[1]) for shape in shapes]
+    return replace(_joined(path, parts, [index[name] for name in names], materials), height_range_m=(low, high))
 
 
 def _read_shapes(path: Path) -> tuple[ET.Element, list[_Shape]]:
     """Read a scene file and its shapes; a document type, which entities need, and other files are refused."""
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(MAX_XML_BYTES + 1)
-    except OSError as error:
-        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
-    if len(content) > MAX_XML_BYTES:
-        raise MapError(f"path = '{path}' has more than {MAX_XML_BYTES:,} bytes: split the scene.")
+    content = read_bytes(path, MAX_XML_BYTES, "split the scene.")
     try:
         root: ET.Element = defusedxml.ElementTree.fromstring(content, forbid_dtd=True)
     except defusedxml.DefusedXmlException as error:
@@ -230,10 +229,8 @@ def _read_shapes(path: Path) -> tuple[ET.Element, list[_Shape]]:
     elements = root.findall("./shape")
     others = sorted({str(element.get("type")) for element in elements} - {*SHAPE_TYPES})
     if others:
-        raise MapError(
-            f"path = '{path}' has shapes of type {', '.join(others)}: give {', '.join(SHAPE_TYPES)}; "
-            "Mitsuba writes other meshes as PLY (mesh.write_ply)."
-        )
+        remedy = f"give {', '.join(SHAPE_TYPES)}; Mitsuba writes other meshes as PLY (mesh.write_ply)."
+        raise MapError(f"path = '{path}' has shapes of type {', '.join(others)}: {remedy}")
     return root, [_Shape(element, _shape_triangles(path, element)) for element in elements]
 
 
@@ -250,10 +247,9 @@ def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
         try:
             matrix = _step(step) @ matrix
         except (KeyError, ValueError) as error:
-            raise MapError(
-                f"path = '{path}': shape {_name(shape)!r} has a to_world with <{step.tag} {step.attrib}>, which cannot "
-                "be read: give matrix, translate, scale or rotate."
-            ) from error
+            what = f"shape {_name(shape)!r} has a to_world with <{step.tag} {step.attrib}>"
+            remedy = "give matrix, translate, scale or rotate."
+            raise MapError(f"path = '{path}': {what}, which cannot be read: {remedy}") from error
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles
 
 
@@ -288,10 +284,8 @@ def _material_of(path: Path, shape: ET.Element, named: Mapping[str | None, Mater
         return _material(path, bsdf)
     for ref in shape.findall("ref"):
         if ref.get("id") not in named:
-            raise MapError(
-                f"path = '{path}': shape {_name(shape)!r} refers to {ref.get('id')!r}, which is no bsdf of the scene: "
-                "add it, or correct the id."
-            )
+            what = f"shape {_name(shape)!r} refers to {ref.get('id')!r}, which is no bsdf of the scene"
+            raise MapError(f"path = '{path}': {what}: add it, or correct the id.")
         return named[ref.get("id")]
     _warn(path, f"shape {_name(shape)!r} has no bsdf")
     return None

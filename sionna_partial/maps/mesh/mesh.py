@@ -64,9 +64,8 @@ class SceneMesh:
         vertices = _vertices(self.vertices_m)
         triangles = _indices("triangles", self.triangles, (3,), len(vertices), "vertices_m")
         if len(triangles) > MAX_TRIANGLES:
-            raise MapError(
-                f"triangles has {len(triangles):,} rows, more than {MAX_TRIANGLES:,}: cut or simplify the mesh."
-            )
+            rows = f"{len(triangles):,} rows, more than {MAX_TRIANGLES:,}"
+            raise MapError(f"triangles has {rows}: cut or simplify the mesh.")
         materials = _materials(self.materials)
         material = _indices("material", self.material, (), len(materials), "materials")
         if len(material) != len(triangles):
