@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from meshes import OBSERVED, room, scene_mesh, surface_m2
 from scipy.ndimage import distance_transform_edt
-from scipy.spatial.distance import pdist
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SettingsError
@@ -98,16 +97,6 @@ def test_nothing_is_seen_before_the_first_step():
     (partial,) = explore(plan(CLOSET), (0,))
     assert (partial.state == CellState.UNKNOWN).all()
     assert partial.observed_fraction == 0.0
-
-
-def test_one_step_sees_a_quarter_of_a_disc():
-    hall = PartialMap(np.zeros((301, 301), dtype=np.uint8), 0.05)
-    for seed in range(5):
-        (partial,) = explore(hall, (1,), seed)
-        rows, columns = np.nonzero(partial.state == CellState.FREE)
-        spread_m = pdist(np.stack([rows, columns], axis=1)).max() * 0.05
-        assert spread_m <= math.sqrt(2) * (SensorSettings.range_m + FORWARD_M) + 0.2
-        assert len(rows) * 0.05**2 <= math.pi / 4 * SensorSettings.range_m**2 * 1.4
 
 
 def test_closed_closet_is_never_seen():

@@ -44,36 +44,19 @@ partials = st.builds(
 SMALL = PartialMap(np.array([[0, 1], [2, 0]]), 0.05, (1.5, -2.0), 2.5, 3)
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suffix", [".yaml", ".yml", ".YAML", ".npz", ".NPZ"])
 @given(partial=partials)
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, suffix: str, partial: PartialMap) -> None:
     folder = tmp_path_factory.mktemp("map")
     save_map(partial, folder / f"home{suffix}")
-    read = load_map(folder / f"home{suffix}")
-    assert read == partial
+    assert load_map(folder / f"home{suffix}") == partial
+    assert load_map(f"{folder}/home{suffix}", wall_height_m=4.0) == replace(partial, wall_height_m=4.0)
     assert len(list(folder.iterdir())) == (1 if "NPZ" in suffix.upper() else 2)
 
 
-def test_paths_may_be_texts(tmp_path: Path) -> None:
-    save_map(SMALL, f"{tmp_path}/home.npz")
-    assert load_map(f"{tmp_path}/home.npz") == SMALL
-
-
-def test_npz_wall_height_can_be_given(tmp_path: Path) -> None:
-    save_map(SMALL, tmp_path / "home.npz")
-    assert load_map(tmp_path / "home.npz", wall_height_m=4.0).wall_height_m == 4.0
-
-
-def test_no_map_is_not_written(tmp_path: Path) -> None:
+def test_what_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"partial is of type ndarray: give a PartialMap, such as load_map returns\."):
         save_map(SMALL.state, tmp_path / "home.npz")  # type: ignore[arg-type]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_other_suffix_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"home.pgm' has the suffix '.pgm': choose .yaml, .yml or .npz"):
         save_map(SMALL, tmp_path / "home.pgm")
     assert list(tmp_path.iterdir()) == []
@@ -85,17 +68,6 @@ def test_material_comes_back(tmp_path: Path, name: str, material: Material) -> N
     partial = replace(SMALL, material=material)
     save_map(partial, tmp_path / name)
     assert load_map(tmp_path / name) == load_map(tmp_path / name, wall_height_m=2.5) == partial
-
-
-@pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
-def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", fail)
-    with pytest.raises(OutputError, match=r"No space left on device\): the disk is full"):
-        save_map(SMALL, tmp_path / "new" / name)
-    assert list(tmp_path.iterdir()) == []
 
 
 def export(folder: Path, image: str = "map.pgm") -> Path:
@@ -144,26 +116,23 @@ def test_no_such_file(tmp_path: Path, name: str) -> None:
         load_map(path)
 
 
-@pytest.mark.parametrize("name", ["map.pgm", "map.png", "map.bmp"])
-def test_bare_image(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("map.png", r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"),
+        ("map.dae", r"map\.dae' is of no known kind: give a ROS map YAML"),
+    ],
+)
+def test_other_files(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / name).write_bytes(b"P5\n1 1\n255\n\x00")
-    with pytest.raises(MapError, match=r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"):
+    with pytest.raises(MapError, match=message):
         load_map(tmp_path / name)
 
 
-def test_unknown_kind(tmp_path: Path) -> None:
-    (tmp_path / "map.dae").write_bytes(b"dae")
-    with pytest.raises(MapError, match=r"map\.dae' is of no known kind: give a ROS map YAML"):
-        load_map(tmp_path / "map.dae")
-
-
-@pytest.mark.parametrize("path", [None, 3, SMALL, ["map.yaml"]])
+@pytest.mark.parametrize("path", [None, SMALL])
 def test_not_a_path(path: object) -> None:
     with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
         load_map(path)  # type: ignore[arg-type]
-
-
-# --- meshes -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -237,9 +206,6 @@ def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
         load_map(folder, up="z")
 
 
-# --- damaged npz ------------------------------------------------------------------------------------------------------
-
-
 def npz_bytes(**arrays: object) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
@@ -271,14 +237,6 @@ def test_damaged_npz(tmp_path: Path, content: bytes) -> None:
         MapError, match=rf"path = '{re.escape(str(path))}' is damaged or was not written by save_map \(.*save"
     ):
         load_map(path)
-
-
-def test_every_truncation_of_an_npz(tmp_path: Path) -> None:
-    content = npz_bytes(**WHOLE)
-    for size in range(0, len(content), 37):
-        (tmp_path / "home.npz").write_bytes(content[:size])
-        with pytest.raises(MapError, match="is damaged"):
-            load_map(tmp_path / "home.npz")
 
 
 @pytest.mark.parametrize(
@@ -315,9 +273,6 @@ def test_npz_with_a_lying_header(tmp_path: Path) -> None:
             target.writestr(name, header.getvalue() if name == "state.npy" else source.read(name))
     with pytest.raises(MapError, match="is damaged"):
         load_map(lying)
-
-
-# --- arrays -----------------------------------------------------------------------------------------------------------
 
 
 def test_array_row_0_is_the_smallest_y() -> None:
@@ -377,9 +332,6 @@ def test_wrong_occupancy(data: object, options: dict[str, float], message: str) 
         map_from_occupancy(data, 0.05, **options)  # type: ignore[arg-type]
 
 
-# --- Habitat ----------------------------------------------------------------------------------------------------------
-
-
 def test_habitat_with_border() -> None:
     """Row 0 is the largest y; revealed border is wall; nothing else that is hidden is known."""
     top_down = [[0, 2, 2, 2], [0, 2, 1, 1], [0, 0, 2, 2]]
@@ -427,9 +379,6 @@ def test_wrong_habitat(top_down: object, seen: object, message: str) -> None:
         map_from_habitat(top_down, seen, 0.05)  # type: ignore[arg-type]
 
 
-# --- Active Neural SLAM -----------------------------------------------------------------------------------------------
-
-
 def test_slam_channels() -> None:
     """An obstacle that was not explored is unknown; row 0 is the smallest y."""
     obstacle, explored = [[0.0, 0.9, 0.9], [0.5, 0.49, 0.0]], [[1.0, 1.0, 0.2], [0.5, 0.6, 0.49]]
@@ -456,9 +405,6 @@ def test_wrong_slam(obstacle: object, explored: object, options: dict[str, float
         map_from_slam(obstacle, explored, 0.05, **options)  # type: ignore[arg-type]
 
 
-# --- real maps --------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="the Gibson plans are not here")
 def test_every_gibson_plan_loads(tmp_path: Path) -> None:
     sheets = sorted((SHARED / "gibson").glob("*/map.yaml"))
@@ -467,14 +413,11 @@ def test_every_gibson_plan_loads(tmp_path: Path) -> None:
         partial = load_map(sheet)
         assert partial.shape == (480, 480)
         assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
-        assert partial.is_complete == (sheet.parent.name != "Kerrtown"), (
-            "that of Kerrtown is cut off at its right border"
-        )
+        assert partial.is_complete == (sheet.parent.name != "Kerrtown"), "Kerrtown is cut off at its right border"
         save_map(partial, tmp_path / "copy.yaml")
         assert load_map(tmp_path / "copy.yaml") == partial
-        assert (tmp_path / "copy.pgm").read_bytes()[-partial.state.size :] == (sheet.parent / "map.pgm").read_bytes()[
-            -partial.state.size :
-        ]
+        written, shipped = (path.read_bytes() for path in (tmp_path / "copy.pgm", sheet.parent / "map.pgm"))
+        assert written[-partial.state.size :] == shipped[-partial.state.size :]
 
 
 @pytest.mark.skipif(not (SHARED / "ros").is_dir(), reason="the ROS maps are not here")

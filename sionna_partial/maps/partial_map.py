@@ -47,9 +47,9 @@ class PartialMap:
     wall_height_m : float
         Height of walls and ceiling of a plan [m]. A mesh has its own (`height_range_m`).
     interior_cells : int or None
-        Number of free cells of the complete home, where a simulation knows it.
+        Number of free cells of the complete home, where a simulation gives it.
     mesh : SceneMesh or None
-        What is known of the building, in place of walls extruded from the cells. Its z is the world's.
+        What has been observed of the building, in place of walls extruded from the cells. Its z is the world's.
     material : Material or None
         Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
         SceneSettings.

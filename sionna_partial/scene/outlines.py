@@ -191,7 +191,7 @@ def _wall_graph(wall: NDArray[np.bool_], *, cut_spurs: bool) -> _Graph:
 
 
 def _indexed(ends: NDArray[np.int64]) -> _Graph:
-    """Graph of edges given by the places of their ends (E, 2, 2)."""
+    """Graph of edges given by the points of their ends (E, 2, 2)."""
     unique, inverse = np.unique(ends[..., 1].ravel() * _KEY + ends[..., 0].ravel(), return_inverse=True)
     edges = np.sort(inverse.reshape(-1, 2), axis=1)
     edges = np.unique(edges, axis=0) if len(edges) else edges
@@ -228,8 +228,8 @@ def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
         used.update(pairwise(points))
         used.update(pairwise(points[::-1]))
         if points[0] == points[-1]:
-            places = graph.points[points[:-1]]
-            start = int(np.argmax(((places - places.mean(axis=0)) ** 2).sum(axis=1)))
+            loop = graph.points[points[:-1]]
+            start = int(np.argmax(((loop - loop.mean(axis=0)) ** 2).sum(axis=1)))
             points = points[start:-1] + points[: start + 1]
         chains.append(np.array(points))
     return chains
@@ -294,7 +294,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
     lines, runs = [], []
     for chain in chains:
         (before, after), plain, last = chain.beside, chain.plain, len(chain.points) - 1
-        places = graph.points[chain.points] / 2.0
+        positions = graph.points[chain.points] / 2.0
         fixed = graph.degree[chain.points] != 2
         breaks = fixed.copy()
         breaks[chain.corners[plain[after[chain.corners]]]] = True
@@ -305,9 +305,9 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
             if fixed[k]:
                 route.append(nodes[int(chain.points[k])][None])
             elif plain[before[k]] or plain[after[k]]:
-                route.append(places[k][None])
+                route.append(positions[k][None])
             else:
-                route.append(_meeting(chain.lines[[before[k], after[k]]], places[k]))
+                route.append(_meeting(chain.lines[[before[k], after[k]]], positions[k]))
             owner += [before[k]] * (len(route[-1]) - 1) + [after[k]]
         if chain.closed and not fixed[-1]:
             owner = owner[len(route[0]) - 1 :]
@@ -330,27 +330,27 @@ def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points
                 pinned.add(point)
     nodes = {}
     for point, through in lines.items():
-        place = graph.points[point] / 2.0
-        nodes[point] = place if point in pinned else _closest(np.array(through), place)
+        position = graph.points[point] / 2.0
+        nodes[point] = position if point in pinned else _closest(np.array(through), position)
     return nodes
 
 
-def _closest(lines: NDArray[np.float64], place: Points) -> Points:
-    """Point of least squared distance to lines (k, 4), or the middle of the feet of `place` if that is far away."""
+def _closest(lines: NDArray[np.float64], near: Points) -> Points:
+    """Point of least squared distance to lines (k, 4), or the middle of the feet of `near` if that is far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
-    offset = (normal * (lines[:, :2] - place)).sum(axis=1)
+    offset = (normal * (lines[:, :2] - near)).sum(axis=1)
     moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
-    return place + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
+    return near + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
 
 
-def _meeting(pair: NDArray[np.float64], place: Points) -> Points:
+def _meeting(pair: NDArray[np.float64], near: Points) -> Points:
     """Vertices (1 or 2, 2) where two runs with lines (2, 4) meet near a point."""
     direction = pair[:, 2:]
-    feet = pair[:, :2] + ((place - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
+    feet = pair[:, :2] + ((near - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
     if abs(cross(direction[0], direction[1])) > 0.05:
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
         meeting = np.linalg.solve(normal, (normal * pair[:, :2]).sum(axis=1))
-        if np.hypot(*(meeting - place)) <= _REACH_CELLS:
+        if np.hypot(*(meeting - near)) <= _REACH_CELLS:
             return np.asarray(meeting[None])
     if np.hypot(*(feet[1] - feet[0])) > _OFFSET_CELLS:
         return feet

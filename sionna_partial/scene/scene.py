@@ -1,4 +1,4 @@
-"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one place that writes scenes."""
+"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one module that writes scenes."""
 
 import os
 import xml.etree.ElementTree as ET
