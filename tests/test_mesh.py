@@ -98,7 +98,7 @@ class TestSceneMesh:
             ({"material": [0]}, "material has 1 entries for 2 triangles: give one for each."),
             ({"materials": ("brick", None)}, "materials = ('brick', None) is not allowed: give Material(...) or None"),
             ({"materials": (None,) * 257}, "materials has 257 entries, more than 256: give like ones the same"),
-            ({"height_range_m": (3, 3)}, "height_range_m = (3, 3) is not allowed: give (low, high) in metres"),
+            ({"height_range_m": (3, 3)}, "height_range_m = (3, 3) is not allowed: give (low, high), z in metres"),
             ({"height_range_m": (3, None)}, "height_range_m = (3, None) is not allowed"),
         ],
     )

@@ -123,10 +123,7 @@ class PartialMap:
         What lies beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
         out of a larger one. A map without free cells is not complete.
         """
-        free = self.state == CellState.FREE
-        reached = np.pad(self.state == CellState.UNKNOWN, 1, constant_values=True)
-        touches = reached[2:, 1:-1] | reached[:-2, 1:-1] | reached[1:-1, 2:] | reached[1:-1, :-2]
-        return bool(free.any() and not (free & touches).any())
+        return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
 
     @cached_property
     def alike_cells(self) -> NDArray[np.int32]:
@@ -187,7 +184,7 @@ class PartialMap:
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         flat = points.reshape(-1, 3)
-        finite = np.isfinite(flat).all(axis=1)
+        finite: NDArray[np.bool_] = np.isfinite(flat).all(axis=1)
         x, y, z = np.where(finite[:, None], flat, 0.0).T
         state = self.state_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1)]))
         faults = (
@@ -211,6 +208,20 @@ class PartialMap:
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
+
+
+def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
+    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(step == 1)
+    return row, start, np.nonzero(step == -1)[1]
+
+
+def frontier_cells(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
+    unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
+    touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
+    return np.asarray(touches & (state == CellState.FREE))
 
 
 def alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:

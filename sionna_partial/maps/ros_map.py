@@ -21,7 +21,7 @@ from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.mesh.files import read_bytes, read_exported_mesh
 from sionna_partial.maps.mesh.mesh import material_records
-from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap
+from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, frontier_cells
 from sionna_partial.settings import Material
 
 logger = logging.getLogger(__name__)
@@ -162,15 +162,9 @@ def turn_grid(
         return affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
 
     result = turned(state)
-    frontier = binary_dilation(_touches_unknown(state), np.ones((3, 3)))
-    result[_touches_unknown(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
+    frontier = binary_dilation(frontier_cells(state), np.ones((3, 3)))
+    result[frontier_cells(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
     return result, cell_m, (x + float(low[1]), y + float(low[0]))
-
-
-def _touches_unknown(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
-    near: NDArray[np.bool_] = binary_dilation(state == CellState.UNKNOWN, border_value=1)
-    return near & (state == CellState.FREE)
 
 
 def states_from_percent(

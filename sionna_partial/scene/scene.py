@@ -17,11 +17,10 @@ from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.maps.partial_map import PartialMap, require_map, row_runs
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
 from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
-from sionna_partial.scene.wall_cells import row_runs
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, settings_or_default
 
 SHAPES = ("walls", "floor", "ceiling")

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, row_runs
 
 MAX_GAP_CELLS = 2
 """Longest gap of FREE cells in a wall that is closed, and longest bump or notch that is levelled [cells]."""
@@ -110,13 +110,6 @@ def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longes
     filled &= ~wall
     wall |= filled
     return filled
-
-
-def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
-    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    row, start = np.nonzero(step == 1)
-    return row, start, np.nonzero(step == -1)[1]
 
 
 def _orientations(*masks: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], ...]]:

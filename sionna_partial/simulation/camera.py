@@ -34,7 +34,9 @@ class Camera:
         self, truth: NDArray[np.uint8], resolution_m: float, sensor: SensorSettings, rng: np.random.Generator
     ) -> None:
         self._truth = np.ascontiguousarray(truth)
-        self._missed = _missed_walls(truth, resolution_m, sensor.missed_wall_share, rng)
+        rows, columns = ((np.arange(size) * resolution_m // MISSED_PATCH_M).astype(np.intp) for size in truth.shape)
+        missed = rng.random((rows[-1] + 1, columns[-1] + 1)) < sensor.missed_wall_share
+        self._missed = missed[np.ix_(rows, columns)]
         self._reach = sensor.range_m / resolution_m
         self._view_deg = sensor.field_of_view_deg
         self._noise = sensor.range_noise_m / resolution_m
@@ -82,15 +84,6 @@ def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> NDArray[np
     """Directions of the rays [radian], at most half a cell apart where they end."""
     rays = int(2 * math.radians(view_deg) * reach) + 2
     return math.radians(heading_deg) + math.radians(view_deg) * (np.arange(rays) / (rays - 1) - 0.5)
-
-
-def _missed_walls(
-    truth: NDArray[np.uint8], resolution_m: float, fraction: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """Draw the squares of the floor plan whose walls return no reading, as cells (ny, nx)."""
-    rows, columns = (np.arange(size) * resolution_m // MISSED_PATCH_M for size in truth.shape)
-    squares = rng.random((int(rows[-1]) + 1, int(columns[-1]) + 1)) < fraction
-    return squares[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
 
 
 class _Rays(NamedTuple):

@@ -6,7 +6,7 @@ walls and furniture swell a little, as on maps of robots and scanners. `docs/hom
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -179,8 +179,9 @@ def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Pla
     """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
     area_m2 = log_uniform(rng, style.area)
+    fixtures: list[Polygon] = []
     if style.layout is None:
-        pieces, fixtures = _rooms(rng, _outline(rng, area_m2), style), []
+        pieces: Iterable[Polygon] = _rooms(rng, _outline(rng, area_m2), style)
     else:
         pieces, fixtures = style.layout(rng, area_m2, log_uniform(rng, style.room_area))
     rooms = [core for piece in pieces for core in _cores(piece)]

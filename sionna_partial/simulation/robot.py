@@ -209,7 +209,7 @@ class Robot:
         rows, columns = self._cells_around(y, x, reach)
         self._bumps[rows, columns] |= np.hypot(rows + 0.5 - y, columns + 0.5 - x) < reach / 2
         if self._distances_to(goal) < 2 * reach:
-            rows, columns = self._cells_around(*goal, reach)
+            rows, columns = self._cells_around(int(goal[0]), int(goal[1]), reach)
             self._given_up[rows, columns] |= np.hypot(rows - goal[0], columns - goal[1]) <= reach
         self._route = None
 

@@ -14,8 +14,8 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
-from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, row_runs
 from sionna_partial.planar import span_in_strip
 
 DEFAULT_BAND_M = (1.0, 1.8)
@@ -74,8 +74,7 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
     """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left."""
     if partial.mesh is None:
         return partial
-    step = np.diff(np.pad(partial.state != CellState.UNKNOWN, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, start), (_, end) = np.nonzero(step == 1), np.nonzero(step == -1)
+    row, start, end = row_runs(partial.state != CellState.UNKNOWN)
     cells = shapely.union_all(shapely.box(start, row, end, row + 1))
     # The lattice lines are multiples of the resolution, so that walls on them are on the border exactly.
     first = np.rint(np.array(partial.origin_m) / partial.resolution_m)
@@ -117,12 +116,7 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
     if given is None:
         lowest = float(mesh.bounds_m[0, 2])
         return lowest + DEFAULT_BAND_M[0], lowest + DEFAULT_BAND_M[1]
-    try:
-        low, high = (float(value) for value in given)
-    except (TypeError, ValueError):
-        low, high = math.nan, math.nan
-    if not -math.inf < low < high < math.inf:
-        raise MapError(f"height_band_m = {given!r} is not allowed: give (low, high), z in metres, low < high.")
+    low, high = height_pair("height_band_m", given)
     lowest, highest = (float(value) for value in mesh.bounds_m[:, 2])
     if high < lowest or low > highest:
         raise MapError(f"height_band_m = {given!r} is outside the mesh, which spans z {lowest:g} to {highest:g} m.")

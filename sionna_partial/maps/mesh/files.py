@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import defusedxml.ElementTree
 import numpy as np
@@ -165,13 +165,6 @@ def _looks_y_up(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -
     return bool(LOWEST_CEILING_M <= extent[1] < min(extent[0], extent[2]) and facing[1] > facing[2])
 
 
-class _Shape(NamedTuple):
-    """A shape of a Mitsuba scene: its element, and its triangles in the axes of the scene."""
-
-    element: ET.Element
-    triangles: Triangles
-
-
 def read_mitsuba_scene(path: Path) -> SceneMesh:
     """Read the meshes of a Mitsuba scene file, which lie in its folder or below, with their radio materials.
 
@@ -182,9 +175,9 @@ def read_mitsuba_scene(path: Path) -> SceneMesh:
     if not shapes:
         raise MapError(f"path = '{path}' holds no shape: give a Mitsuba scene with meshes.")
     named = {bsdf.get("id"): _material(path, bsdf) for bsdf in root.findall("./bsdf")}
-    used = [_material_of(path, shape.element, named) for shape in shapes]
+    used = [_material_of(path, element, named) for element, _ in shapes]
     materials = tuple(dict.fromkeys(used))
-    return _joined(path, [shape.triangles for shape in shapes], [*map(materials.index, used)], materials)
+    return _joined(path, [triangles for _, triangles in shapes], [*map(materials.index, used)], materials)
 
 
 def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object) -> SceneMesh:
@@ -201,18 +194,18 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
         sheet = folder / "map.yaml"
         raise MapError(f"path = '{sheet}' has a damaged mesh entry ({error}): export it again.") from error
     _, shapes = _read_shapes(path)
-    names = [_name(shape.element) for shape in shapes]
+    names = [_name(element) for element, _ in shapes]
     index = {f"part{number}": number for number in range(len(materials))}
     for name in names:
         if name not in index:
             raise MapError(f"path = '{path}' has a shape {name!r} that was not exported: export the scene again.")
     if not shapes:
         return SceneMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0, np.uint8), materials, (low, high))
-    parts = [(shape.triangles[0] + shift, shape.triangles[1]) for shape in shapes]
+    parts = [(vertices + shift, triangles) for _, (vertices, triangles) in shapes]
     return replace(_joined(path, parts, [index[name] for name in names], materials), height_range_m=(low, high))
 
 
-def _read_shapes(path: Path) -> tuple[ET.Element, list[_Shape]]:
+def _read_shapes(path: Path) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
     """Read a scene file and its shapes; a document type, which entities need, and other files are refused."""
     content = read_bytes(path, MAX_XML_BYTES, "split the scene.")
     try:
@@ -231,7 +224,7 @@ def _read_shapes(path: Path) -> tuple[ET.Element, list[_Shape]]:
     if others:
         remedy = f"give {', '.join(SHAPE_TYPES)}; Mitsuba writes other meshes as PLY (mesh.write_ply)."
         raise MapError(f"path = '{path}' has shapes of type {', '.join(others)}: {remedy}")
-    return root, [_Shape(element, _shape_triangles(path, element)) for element in elements]
+    return root, [(element, _shape_triangles(path, element)) for element in elements]
 
 
 def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:

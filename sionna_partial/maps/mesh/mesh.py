@@ -202,10 +202,15 @@ def _height_range(given: tuple[float, float] | None, vertices_m: NDArray[np.floa
         z = vertices_m[:, 2] if len(vertices_m) else np.zeros(1)
         low, high = float(z.min()), float(z.max())
         return low, high if high - low >= FLAT_M else low + DEFAULT_WALL_HEIGHT_M
+    return height_pair("height_range_m", given)
+
+
+def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
+    """Return two heights as numbers, or raise a MapError."""
     try:
         low, high = (float(value) for value in given)
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
     if not -MAX_COORDINATE_M <= low < high <= MAX_COORDINATE_M:
-        raise MapError(f"height_range_m = {given!r} is not allowed: give (low, high) in metres, low < high.")
+        raise MapError(f"{name} = {given!r} is not allowed: give (low, high), z in metres, low < high.")
     return low, high
