@@ -392,11 +392,11 @@ def _read_npz(source: Path) -> PartialMap:
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
             mesh = None
             if "mesh_triangles" in content:
-                arrays = (content[f"mesh_{name}"] for name in ("vertices_m", "triangles", "material"))
+                vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
                 records = json.loads(str(content["mesh_materials"]))
                 materials = tuple(None if record is None else Material(**record) for record in records)
                 low, high = content["mesh_height_range_m"].tolist()
-                mesh = SceneMesh(*arrays, materials, (low, high))
+                mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
     except MapError:
         raise
     except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files

@@ -184,21 +184,16 @@ class PartialMap:
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         flat = points.reshape(-1, 3)
-        finite: NDArray[np.bool_] = np.isfinite(flat).all(axis=1)
+        finite = np.asarray(np.isfinite(flat).all(axis=1))
         x, y, z = np.where(finite[:, None], flat, 0.0).T
         state = self.state_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1)]))
+        outside = (x < x0) | (x > x1) | (y < y0) | (y > y1)
+        beyond = f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m"
+        too_high = f"is not between floor and ceiling ({low:g} to {high:g} m)"
         faults = (
             (~finite, "is not finite", "give finite numbers in metres."),
-            (
-                (x < x0) | (x > x1) | (y < y0) | (y > y1),
-                f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m",
-                "move it inside, or extend the map with unknown cells.",
-            ),
-            (
-                (z <= low) | (z >= high),
-                f"is not between floor and ceiling ({low:g} to {high:g} m)",
-                "change its height z or the map's wall_height_m.",
-            ),
+            (outside, beyond, "move it inside, or extend the map with unknown cells."),
+            ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
             (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
         )
         for fault, what, remedy in faults:

@@ -26,6 +26,8 @@ from sionna_partial.settings import Material
 
 logger = logging.getLogger(__name__)
 
+States = NDArray[np.uint8]
+
 MODES = ("trinary", "scale", "raw")
 """How map_server may read an image."""
 
@@ -127,9 +129,7 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         picture.write(np.flipud(shades[partial.state]).tobytes())
 
 
-def turn_grid(
-    state: NDArray[np.uint8], resolution_m: float, origin: tuple[float, float, float]
-) -> tuple[NDArray[np.uint8], float, tuple[float, float]]:
+def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
     """Turn a grid (ny, nx) by the yaw of its origin (x, y, yaw), onto the world axes; UNKNOWN outside it.
 
     Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is below the map's
@@ -167,9 +167,7 @@ def turn_grid(
     return result, cell_m, (x + float(low[1]), y + float(low[0]))
 
 
-def states_from_percent(
-    percent: NDArray[np.integer], occupied_percent: float, free_percent: float
-) -> NDArray[np.uint8]:
+def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, free_percent: float) -> States:
     """CellState of ROS occupancy values, as nav2's map_saver draws them: 0 to 100 percent, any other is unknown.
 
     From `occupied_percent` a cell is wall; up to `free_percent` it is free.

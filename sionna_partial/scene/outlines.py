@@ -167,14 +167,8 @@ def _wall_graph(wall: NDArray[np.bool_], *, cut_spurs: bool) -> _Graph:
     upright[:, 1:-1] &= ~(block[:, :-1] & block[:, 1:])
     rising = w[:-1, :-1] & w[1:, 1:] & ~w[:-1, 1:] & ~w[1:, :-1]
     falling = ~w[:-1, :-1] & ~w[1:, 1:] & w[:-1, 1:] & w[1:, :-1]
-    parts = []
-    for mask, ends in (
-        (across, [[0, 0], [1, 0]]),
-        (upright, [[0, 0], [0, 1]]),
-        (rising, [[0, 0], [1, 1]]),
-        (falling, [[1, 0], [0, 1]]),
-    ):
-        parts.append(np.argwhere(mask)[:, None, ::-1] + ends)
+    kinds = ((across, 0, 0, 1, 0), (upright, 0, 0, 0, 1), (rising, 0, 0, 1, 1), (falling, 1, 0, 0, 1))
+    parts = [np.argwhere(mask)[:, None, ::-1] + np.reshape(ends, (2, 2)) for mask, *ends in kinds]
     graph = _indexed(2 * np.concatenate(parts) - 1)
     if cut_spurs:
         ends_degree = graph.degree[graph.edges]

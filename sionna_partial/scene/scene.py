@@ -101,9 +101,8 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     if settings.outline == "cells":
         outlines = lattice_outlines(partial)
     else:
-        outlines = wall_outlines(
-            partial, tolerance_cells=settings.outline_tolerance_cells, bridge_gap_m=settings.bridge_gap_m
-        )
+        tolerance_cells, gap_m = settings.outline_tolerance_cells, settings.bridge_gap_m
+        outlines = wall_outlines(partial, tolerance_cells=tolerance_cells, bridge_gap_m=gap_m)
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
@@ -181,8 +180,9 @@ def export_scene(
         if partial.mesh is None:
             write_scene(build_scene(partial, settings), target, offset_m=offset_m, frequency_hz=frequency_hz)
         else:
-            options = {"offset_m": offset_m, "default_material": material, "frequency_hz": frequency_hz}
-            write_mesh_scene(partial.mesh, target, **options)
+            write_mesh_scene(
+                partial.mesh, target, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz
+            )
         write_ros_map(partial, target / "map.yaml", {"scene_offset": offset_m})
     return Path(folder)
 
@@ -195,11 +195,7 @@ def _whole_offset_m(low_m: float, high_m: float) -> float:
 
 
 def write_scene(
-    geometry: SceneGeometry,
-    folder: Path,
-    *,
-    offset_m: Sequence[float],
-    frequency_hz: float = CARRIER_FREQUENCY_HZ,
+    geometry: SceneGeometry, folder: Path, *, offset_m: Sequence[float], frequency_hz: float = CARRIER_FREQUENCY_HZ
 ) -> Path:
     """Write `scene.xml`, whose path is returned, and its meshes into an existing folder.
 

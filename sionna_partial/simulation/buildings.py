@@ -10,7 +10,7 @@ import shapely
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split
 
-from sionna_partial.simulation.furniture import log_uniform, parts_of, union_of
+from sionna_partial.simulation.furniture import Rng, log_uniform, parts_of, union_of
 
 LARGEST_M = (100.0, 60.0)
 """Length and width of the largest building [m]."""
@@ -33,11 +33,14 @@ class Layout(NamedTuple):
     fixtures: list[Polygon]
 
 
-LayoutMaker = Callable[[np.random.Generator, float, float], Layout]
+Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
+"""Draws what stands in a hall."""
+
+LayoutMaker = Callable[[Rng, float, float], Layout]
 """Draws a layout from the area of the building and a typical area of its small rooms [m2]."""
 
 
-def floor_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> Layout:
+def floor_layout(rng: Rng, area_m2: float, room_m2: float) -> Layout:
     """Office floor: rows of rooms along one corridor, or along two or more with large rooms and services between."""
     length_m, width_m = _sides(rng, area_m2, (1.4, 4.0))
     outline = _notched(rng, box(0, 0, length_m, width_m))
@@ -61,13 +64,7 @@ def floor_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> La
 
 
 def _hall_layout(
-    rng: np.random.Generator,
-    area_m2: float,
-    room_m2: float,
-    *,
-    hall_fraction: tuple[float, float],
-    fill: Callable[[np.random.Generator, Polygon], Iterator[Polygon]],
-    columned: float,
+    rng: Rng, area_m2: float, room_m2: float, *, hall_fraction: tuple[float, float], fill: Fill, columned: float
 ) -> Layout:
     """One or a few large rooms with columns and what fills them; most have a row of offices."""
     length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
@@ -77,13 +74,13 @@ def _hall_layout(
     return Layout(halls + offices, _columns(rng, halls, columned) + things)
 
 
-def _sides(rng: np.random.Generator, area_m2: float, aspect: tuple[float, float]) -> tuple[float, float]:
+def _sides(rng: Rng, area_m2: float, aspect: tuple[float, float]) -> tuple[float, float]:
     """Length and width [m] of about the wanted area."""
     length_m = min(LARGEST_M[0], math.sqrt(area_m2 * log_uniform(rng, aspect)))
     return length_m, min(LARGEST_M[1], area_m2 / length_m)
 
 
-def _notched(rng: np.random.Generator, outline: Polygon) -> Polygon:
+def _notched(rng: Rng, outline: Polygon) -> Polygon:
     """Outline of a building, some with one or two corners cut out."""
     _, _, x1, y1 = outline.bounds
     for x, y in rng.permutation([(0, 0), (x1, 0), (x1, y1), (0, y1)])[: rng.choice(3, p=[0.6, 0.3, 0.1])]:
@@ -92,7 +89,7 @@ def _notched(rng: np.random.Generator, outline: Polygon) -> Polygon:
     return parts_of(outline)[0]
 
 
-def _corridors(rng: np.random.Generator, length_m: float, width_m: float) -> tuple[list[Polygon], list[Polygon]]:
+def _corridors(rng: Rng, length_m: float, width_m: float) -> tuple[list[Polygon], list[Polygon]]:
     """Corridors along and across a floor, and the blocks of services beside those across."""
     wide_m = log_uniform(rng, _CORRIDOR_M)
     ends = [rng.choice([0.0, rng.uniform(3.0, 8.0)]) for _ in range(2)]
@@ -114,18 +111,17 @@ def _corridors(rng: np.random.Generator, length_m: float, width_m: float) -> tup
     return along + across, services
 
 
-def _sections(rng: np.random.Generator, corridor: shapely.Geometry) -> list[Polygon]:
+def _sections(rng: Rng, corridor: shapely.Geometry) -> list[Polygon]:
     """Parts of the corridors, some of which have doors across."""
     x0, y0, x1, y1 = corridor.bounds
     for x in rng.uniform(x0, x1, rng.choice(3, p=[0.6, 0.25, 0.15])):
         cut = LineString([(x, y0 - 1), (x, y1 + 1)])
-        corridor = shapely.GeometryCollection(
-            [piece for part in parts_of(corridor) for piece in parts_of(split(part, cut))]
-        )
+        pieces = [piece for part in parts_of(corridor) for piece in parts_of(split(part, cut))]
+        corridor = shapely.GeometryCollection(pieces)
     return parts_of(corridor)
 
 
-def _row(rng: np.random.Generator, part: Polygon, room_m2: float) -> Iterator[Polygon]:
+def _row(rng: Rng, part: Polygon, room_m2: float) -> Iterator[Polygon]:
     """Divide a band into rooms side by side, of widths that are multiples of one module; some have an anteroom."""
     x0, y0, x1, y1 = part.bounds
     upright = y1 - y0 > x1 - x0
@@ -140,7 +136,7 @@ def _row(rng: np.random.Generator, part: Polygon, room_m2: float) -> Iterator[Po
         start = stop
 
 
-def _halved(rng: np.random.Generator, part: Polygon, largest_m2: float) -> Iterator[Polygon]:
+def _halved(rng: Rng, part: Polygon, largest_m2: float) -> Iterator[Polygon]:
     """Halve an area across its longer side until no part is larger than wanted."""
     if part.area <= largest_m2:
         yield part
@@ -152,9 +148,7 @@ def _halved(rng: np.random.Generator, part: Polygon, largest_m2: float) -> Itera
         yield from _halved(rng, piece, largest_m2)
 
 
-def _hall_and_offices(
-    rng: np.random.Generator, outline: Polygon, room_m2: float
-) -> tuple[list[Polygon], list[Polygon]]:
+def _hall_and_offices(rng: Rng, outline: Polygon, room_m2: float) -> tuple[list[Polygon], list[Polygon]]:
     """Split off a row of offices along one side of a hall, for most halls."""
     x0, y0, x1, y1 = outline.bounds
     if rng.random() < 0.3:
@@ -166,7 +160,7 @@ def _hall_and_offices(
     return parts_of(outline.difference(strip)), offices
 
 
-def _columns(rng: np.random.Generator, rooms: list[Polygon], chance: float) -> list[Polygon]:
+def _columns(rng: Rng, rooms: list[Polygon], chance: float) -> list[Polygon]:
     """Columns on a grid in the large rooms, for some buildings."""
     if rng.random() >= chance:
         return []
@@ -177,7 +171,7 @@ def _columns(rng: np.random.Generator, rooms: list[Polygon], chance: float) -> l
     return list(shapely.box(x - half_m, y - half_m, x + half_m, y + half_m)[inside])
 
 
-def _machines(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
+def _machines(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
     """Machines, tanks and stacks that stand free of each other, or against the wall of a hall."""
     clear_m = rng.uniform(0.9, 2.5)
     placed: list[Polygon] = []
@@ -197,7 +191,7 @@ def _machines(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
             yield thing
 
 
-def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
+def _shelves(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
     """Blocks of shelves with aisles between; of some, only the legs and what lies on the floor is as low as a robot."""
     inner = hall.buffer(-rng.uniform(1.5, 4.0), join_style="mitre")
     if inner.is_empty:
@@ -216,7 +210,7 @@ def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
                 yield from _legs(rng, block, half_leg_m) if on_legs else [block]
 
 
-def _legs(rng: np.random.Generator, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
+def _legs(rng: Rng, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
     """Legs along both sides of a shelf, and pallets below it."""
     x0, y0, x1, y1 = block.bounds
     xs, ys = (np.linspace(low, high, max(2, round((high - low) / _BAY_M) + 1)) for low, high in ((x0, x1), (y0, y1)))

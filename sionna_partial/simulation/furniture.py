@@ -13,6 +13,8 @@ GRID_M = 1e-5
 NEAR_M = 0.01
 """Distance within which shapes touch [m]."""
 
+Rng = np.random.Generator
+
 _EMPTY_ROOM_M2 = 2.5
 _PILLARED_ROOM_M2 = 20.0
 
@@ -28,13 +30,13 @@ def parts_of(shape: shapely.Geometry) -> list[Polygon]:
     return sorted(polygons, key=lambda part: -part.area)
 
 
-def log_uniform(rng: np.random.Generator, between: tuple[float, float]) -> float:
+def log_uniform(rng: Rng, between: tuple[float, float]) -> float:
     """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(*np.log(between))))
 
 
 def furnish(
-    rng: np.random.Generator,
+    rng: Rng,
     room: Polygon,
     walls: shapely.Geometry,
     openings: list[LineString],
@@ -66,7 +68,7 @@ def furnish(
             yield thing
 
 
-def _furniture(rng: np.random.Generator, room: Polygon) -> Polygon:
+def _furniture(rng: Rng, room: Polygon) -> Polygon:
     """Piece of furniture: along a wall, in a corner, or in the middle of a room."""
     make, at_wall = _KINDS[int(rng.choice(len(_KINDS), p=_FREQUENCIES))]
     thing = make(rng)
@@ -85,13 +87,13 @@ def _furniture(rng: np.random.Generator, room: Polygon) -> Polygon:
     return affinity.translate(turned, x + along_m * dx, y + along_m * dy)
 
 
-def _place(rng: np.random.Generator, room: Polygon, thing: Polygon) -> Polygon:
+def _place(rng: Rng, room: Polygon, thing: Polygon) -> Polygon:
     """Put a thing somewhere into the bounds of a room."""
     x0, y0, x1, y1 = room.bounds
     return affinity.translate(thing, rng.uniform(x0, x1), rng.uniform(y0, y1))
 
 
-def _block(rng: np.random.Generator, half_width: tuple[float, float], depth: tuple[float, float]) -> Polygon:
+def _block(rng: Rng, half_width: tuple[float, float], depth: tuple[float, float]) -> Polygon:
     """Rectangle whose middle is on a wall, deep enough on both sides of it; some have an arm."""
     half_width_m, depth_m = rng.uniform(*half_width), rng.uniform(*depth)
     thing = box(-half_width_m, -depth_m, half_width_m, depth_m)
@@ -103,7 +105,7 @@ def _block(rng: np.random.Generator, half_width: tuple[float, float], depth: tup
     return thing
 
 
-def _heap(rng: np.random.Generator) -> Polygon:
+def _heap(rng: Rng) -> Polygon:
     """Irregular block: a star of random radii, as scans make of plants, chairs and piles."""
     count = int(rng.integers(5, 9))
     angle = np.sort(rng.uniform(0, 1 / count, count) + np.arange(count) / count) * 2 * math.pi
@@ -111,7 +113,7 @@ def _heap(rng: np.random.Generator) -> Polygon:
     return Polygon(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
 
 
-_KINDS: tuple[tuple[Callable[[np.random.Generator], Polygon], float], ...] = (
+_KINDS: tuple[tuple[Callable[[Rng], Polygon], float], ...] = (
     (lambda rng: _block(rng, (0.6, 2.0), (0.35, 0.7)), 1.0),  # shelves, kitchens, wardrobes
     (lambda rng: _block(rng, (0.4, 1.0), (0.8, 2.0)), 1.0),  # beds, sofas, desks
     (lambda rng: _block(rng, (0.3, 1.0), (0.2, 0.5)), 0.2),  # tables

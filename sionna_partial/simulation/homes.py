@@ -8,6 +8,7 @@ walls and furniture swell a little, as on maps of robots and scanners. `docs/hom
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -24,7 +25,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import HOME_KINDS, HomeKind, is_whole, require, require_number
 from sionna_partial.simulation.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
-from sionna_partial.simulation.furniture import GRID_M, NEAR_M, furnish, log_uniform, parts_of, union_of
+from sionna_partial.simulation.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
 
 RESOLUTION_M = 0.05
 """Edge of a cell of the other kinds where none is given [m]."""
@@ -63,6 +64,7 @@ _WALKED_FRACTION = 0.97
 _SMALLEST_ROOM_M2 = 1.0
 _SMALLEST_M2 = 3.0
 _WAVES = 12
+_AISLE_M = (1.6, 4.5)
 _WAVE_PER_M = 0.5
 
 
@@ -96,15 +98,9 @@ STYLES: dict[str, _Style] = {
     "apartment": _Style(0.5, (30, 150), (7, 20), 0.35, 0.5, (0.9, 1.4), 0.4, 0.15, 0.1),
     "house": _Style(0.35, (40, 230), (9, 26), 0.35, 0.5, (1.0, 1.6), 0.4, 0.25, 0.15),
     "office": _Style(0.15, (90, 600), (10, 40), 0.1, 0.95, (1.4, 2.4), 0.2, 0.15, 0.5, 0.1, clutter=0.5),
-    "floor": _Style(
-        0.0, (600, 6000), (30, 100), 0.0, 1.0, (1.6, 4.5), 0.1, 0.05, 0.0, 0.1, clutter=0.03, layout=floor_layout
-    ),
-    "hall": _Style(
-        0.0, (200, 6000), (12, 40), 0.0, 0.0, (1.6, 4.5), 0.2, 0.3, 0.0, 0.1, clutter=0.02, layout=hall_layout
-    ),
-    "warehouse": _Style(
-        0.0, (300, 6000), (12, 40), 0.0, 0.0, (1.6, 4.5), 0.2, 0.3, 0.0, 0.1, clutter=0.01, layout=warehouse_layout
-    ),
+    "floor": _Style(0, (600, 6000), (30, 100), 0, 1, _AISLE_M, 0.1, 0.05, 0, 0.1, 0.1, 0.03, layout=floor_layout),
+    "hall": _Style(0, (200, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.02, layout=hall_layout),
+    "warehouse": _Style(0, (300, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.01, layout=warehouse_layout),
 }
 """The kinds of homes that can be made; areas are those of the outline. `frequency` is how often kind=None draws one."""
 
@@ -175,7 +171,7 @@ class _Plan:
     waves: NDArray[np.float64]
 
 
-def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
+def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
     """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
     area_m2 = log_uniform(rng, style.area)
@@ -221,7 +217,7 @@ def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.Geomet
     return shapely.GeometryCollection([part for part, fits in zip(parts, few, strict=True) if fits])
 
 
-def _varied(rng: np.random.Generator, style: _Style) -> _Style:
+def _varied(rng: Rng, style: _Style) -> _Style:
     """Style of one home: how it differs from the mean of its kind."""
     scale = log_uniform(rng, (0.45, 3.5))
     return replace(
@@ -237,7 +233,7 @@ def _varied(rng: np.random.Generator, style: _Style) -> _Style:
     )
 
 
-def _outline(rng: np.random.Generator, area: float) -> Polygon:
+def _outline(rng: Rng, area: float) -> Polygon:
     """Outline of a home: a rectangle with corners cut out (L, T, U, Z, chamfers), a turned wing, and bays."""
     width, height = rng.uniform(1.0, 2.0), 1.0
     outline = box(0, 0, width, height)
@@ -264,7 +260,7 @@ def _outline(rng: np.random.Generator, area: float) -> Polygon:
     return Polygon(outline.exterior)
 
 
-def _rooms(rng: np.random.Generator, outline: Polygon, style: _Style) -> Iterator[Polygon]:
+def _rooms(rng: Rng, outline: Polygon, style: _Style) -> Iterator[Polygon]:
     """Divide the outline into rooms, often along a corridor, which comes first."""
     rest: shapely.Geometry = outline
     if rng.random() < style.corridor:
@@ -272,19 +268,17 @@ def _rooms(rng: np.random.Generator, outline: Polygon, style: _Style) -> Iterato
         x, y = np.array([x0, y0]) + rng.uniform(0.35, 0.65, 2) * (x1 - x0, y1 - y0)
         half = (rng.uniform(*style.corridor_width) + style.wall) / 2
         reach = rng.choice([1.0, rng.uniform(0.5, 0.9)])
-        strips = [
-            box(x0, y - half, x0 + reach * (x1 - x0), y + half),
-            box(x - half, y0, x + half, y0 + reach * (y1 - y0)),
-        ]
-        first = int(y1 - y0 > x1 - x0)
-        corridor = strips[first].union(strips[1 - first]) if rng.random() < 0.3 else strips[first]
+        along_x = box(x0, y - half, x0 + reach * (x1 - x0), y + half)
+        along_y = box(x - half, y0, x + half, y0 + reach * (y1 - y0))
+        strip, other = (along_y, along_x) if y1 - y0 > x1 - x0 else (along_x, along_y)
+        corridor = strip.union(other) if rng.random() < 0.3 else strip
         yield from parts_of(outline.intersection(corridor))
         rest = outline.difference(corridor)
     for part in parts_of(rest):
         yield from _divide(rng, part, style)
 
 
-def _divide(rng: np.random.Generator, part: Polygon, style: _Style) -> Iterator[Polygon]:
+def _divide(rng: Rng, part: Polygon, style: _Style) -> Iterator[Polygon]:
     """Halve an area across its longer side until its parts are of the size of rooms; carve closets from some."""
     x0, y0, x1, y1 = part.bounds
     long, short = max(x1 - x0, y1 - y0), min(x1 - x0, y1 - y0)
@@ -314,9 +308,7 @@ def _cores(piece: Polygon) -> list[Polygon]:
     return [core for core in parts_of(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
 
 
-def _connected(
-    rng: np.random.Generator, rooms: list[Polygon], style: _Style
-) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
+def _connected(rng: Rng, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
     """Rooms that can be reached, their openings, and locked rooms.
 
     Openings are those of a random spanning tree, which goes through corridors where it can, and some more.
@@ -345,16 +337,12 @@ def _common_wall(room: Polygon, other: Polygon) -> LineString:
     if room.distance(other) > NEAR_M:
         return LineString()
     shared = shapely.line_merge(room.boundary.intersection(other.buffer(NEAR_M)))
-    sides = [
-        LineString(ends)
-        for line in shapely.get_parts(shared)
-        if line.geom_type == "LineString"
-        for ends in zip(line.coords, line.coords[1:], strict=False)
-    ]
+    lines = [line.coords for line in shapely.get_parts(shared) if line.geom_type == "LineString"]
+    sides = [LineString(ends) for line in lines for ends in pairwise(line)]
     return max(sides, key=lambda side: side.length, default=LineString())
 
 
-def _opening(rng: np.random.Generator, wall: LineString, style: _Style, jamb_m: float) -> LineString:
+def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineString:
     """Part of a wall that is a door, a wide opening, or all of it."""
     room = wall.length - 2 * jamb_m
     if rng.random() < style.openness and room > WIDE_M[0]:

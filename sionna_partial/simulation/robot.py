@@ -215,10 +215,9 @@ class Robot:
 
     def _cells_around(self, row: float, column: float, reach: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
-        spans = zip((row, column), self.seen.shape, strict=True)
-        rows, columns = (
-            np.arange(max(0, int(at - reach)), max(0, min(size, int(at + reach) + 2))) for at, size in spans
-        )
+        ny, nx = self.seen.shape
+        rows = np.arange(max(0, int(row - reach)), max(0, min(ny, int(row + reach) + 2)))
+        columns = np.arange(max(0, int(column - reach)), max(0, min(nx, int(column + reach) + 2)))
         return rows[:, None], columns[None]
 
 
@@ -247,9 +246,8 @@ class _Router:
             ends.append([self._index[here][linked], self._index[there][linked]])
             weights.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
         graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(len(self._cells),) * 2)
-        cheapest, self._before = dijkstra(
-            graph.tocsr(), directed=False, indices=self._index[start], return_predecessors=True
-        )
+        options = {"directed": False, "indices": self._index[start], "return_predecessors": True}
+        cheapest, self._before = dijkstra(graph.tocsr(), **options)
         self.costs = np.full(cost.shape, np.inf)
         self.costs[tuple(self._cells.T)] = cheapest
 

@@ -160,9 +160,7 @@ def _polygon(observed: ArrayLike) -> Any:
     return polygon
 
 
-def _cells_with_surfaces(
-    mesh: SceneMesh, empty: PartialMap, band_m: tuple[float, float], *, upper: bool
-) -> NDArray[np.bool_]:
+def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> NDArray[np.bool_]:
     """Cells (ny, nx) in which the mesh has a surface between two heights; touching borders does not count."""
     corners = mesh.corners_m
     z = corners[..., 2]

@@ -27,8 +27,11 @@ SEAM_M = 1e-4
 Triangles = NDArray[np.float64]
 """Corners (F, 3, 3) of triangles [m]."""
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
-def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], Triangles, NDArray[np.intp]]:
+
+def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], Triangles, Ints]:
     """Cut triangles at the border of an area (shapely, world x and y [m]) seen from above.
 
     Returns a mask (F,) of the triangles that lie in the area or on its border (within `BORDER_M`), the pieces in the
@@ -57,9 +60,7 @@ def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], T
 
 
 @njit(cache=True)
-def clip_slab(
-    corners_m: Triangles, values: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # pragma: no cover - compiled
+def clip_slab(corners_m, values, low, high):  # type: ignore[no-untyped-def]
     """Clip triangles to where a linear function with `values` (F, 3) at their corners lies between two limits (F,).
 
     Returns polygons (F, 5, 3) [m] with the winding of the triangles, and their numbers of corners (F,), 0 for none.
@@ -85,7 +86,7 @@ def clip_slab(
     return polygons, sizes
 
 
-def merge_points(points_m: NDArray[np.float64], distance_m: float = MERGE_M) -> NDArray[np.intp]:
+def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Ints:
     """Index (V,) of the first point that each point is one with: its own where there is none before it."""
     unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
     if not len(unique):
@@ -98,9 +99,7 @@ def merge_points(points_m: NDArray[np.float64], distance_m: float = MERGE_M) -> 
     return lowest[labels][inverse.ravel()]
 
 
-def close_seams(
-    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64], first_new: int
-) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+def close_seams(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[Ints, Ints]:
     """Split triangles at the vertices from `first_new` on that lie on their open edges, so that neighbours share edges.
 
     An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns the
@@ -129,9 +128,7 @@ def close_seams(
         triangles, source = np.concatenate([triangles[kept], parts])[order], source[origin[order]]
 
 
-def _points_on_edges(
-    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64], first_new: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64], NDArray[np.float64]]:
+def _points_on_edges(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[Ints, Ints, Ints, Floats]:
     """Triangle, corner at which its open edge starts, new vertex on that edge, and where on it (fraction of length)."""
     edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     _, index, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -153,7 +150,7 @@ def _points_on_edges(
     return edge // 3, edge % 3, point[order], fraction[order]
 
 
-def _seen_from_above(flat_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _seen_from_above(flat_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Longest edge (F, 2, 2) of triangles (F, 3, 2), and whether they are upright."""
     edges = np.stack([flat_m, np.roll(flat_m, -1, axis=1)], axis=2)
     lengths = np.linalg.norm(edges[:, :, 1] - edges[:, :, 0], axis=2)
@@ -162,11 +159,11 @@ def _seen_from_above(flat_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     return edges[rows, longest], np.abs(_doubled_area(flat_m)) <= UPRIGHT_M * lengths[rows, longest]
 
 
-def _doubled_area(flat_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _doubled_area(flat_m: Floats) -> Floats:
     return cross(flat_m[:, 1] - flat_m[:, 0], flat_m[:, 2] - flat_m[:, 0])
 
 
-def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
+def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Ints]:
     """Cut triangles that have a width seen from above; the height of new corners is that of the triangle's plane."""
     parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
     wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
@@ -184,7 +181,7 @@ def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Tr
     return cut, source
 
 
-def _cut_upright(corners_m: Triangles, ends_m: NDArray[np.float64], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
+def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Triangles, Ints]:
     """Cut triangles that are lines seen from above, where these lines leave the area."""
     source, low, high = _spans_inside(ends_m, area)
     start, along = ends_m[source, 0], ends_m[source, 1] - ends_m[source, 0]
@@ -196,9 +193,7 @@ def _cut_upright(corners_m: Triangles, ends_m: NDArray[np.float64], area: Any) -
     return pieces, np.concatenate([source[rows] for rows, _ in fans])
 
 
-def _spans_inside(
-    ends_m: NDArray[np.float64], area: Any
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+def _spans_inside(ends_m: Floats, area: Any) -> tuple[Ints, Floats, Floats]:
     """Line, start and end (fractions of its length) of every stretch of lines (L, 2, 2) in an area or on its border."""
     lengths = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
     line, fraction = _border_stops(ends_m, area)
@@ -220,7 +215,7 @@ def _spans_inside(
     return line[first], low[first], high[last]
 
 
-def _border_stops(ends_m: NDArray[np.float64], area: Any) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _border_stops(ends_m: Floats, area: Any) -> tuple[Ints, Floats]:
     """Line, and fraction of its length, where lines (L, 2, 2) cross the border of an area or touch its corners."""
     rings, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
     edges = np.stack([rings[:-1], rings[1:]], axis=1)[ring[:-1] == ring[1:]]
