@@ -96,6 +96,25 @@ class _Rays(NamedTuple):
     reach: float
 
 
+class _Walk(NamedTuple):
+    """A ray in one of the cells along it, and where it enters and leaves the cell [cells].
+
+    A ray through a corner crosses one of the two cells beside it, so that it never slips between two walls. It is
+    at least a billionth of a cell long in each cell, so that a distance belongs to one cell.
+    """
+
+    row: int
+    column: int
+    enters: float
+    leaves: float
+    step_x: int
+    step_y: int
+    pace_x: float
+    pace_y: float
+    next_x: float
+    next_y: float
+
+
 @njit(cache=True)
 def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-def]
     """Write what one picture reports into `view`, whose first cell is `corner` of the home: free up to the reading.
@@ -106,17 +125,19 @@ def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-de
     for ray in range(len(angles)):
         echo, reading = _read(truth, missed, x, y, angles[ray], reach)
         reading += noise[ray]
-        cells, ends = _cells_along(x + shift[0], y + shift[1], angles[ray], reach)
-        for k in range(len(cells)):
-            row, column = cells[k, 0] - corner[0], cells[k, 1] - corner[1]
-            if not (0 <= row < view.shape[0] and 0 <= column < view.shape[1]):
-                break
-            if echo != _FAR and ends[k] > reading:
+        walk = _start(x + shift[0], y + shift[1], angles[ray])
+        row, column = walk.row - corner[0], walk.column - corner[1]
+        while 0 <= row < view.shape[0] and 0 <= column < view.shape[1]:
+            if echo != _FAR and walk.leaves > reading:
                 if echo == _WALL_ECHO:
                     view[row, column] = _WALL
                 break
-            if view[row, column] == _UNKNOWN and k < len(cells) - 1:
+            if walk.enters > reach:
+                break
+            if view[row, column] == _UNKNOWN:
                 view[row, column] = _FREE
+            walk = _next(walk)
+            row, column = walk.row - corner[0], walk.column - corner[1]
 
 
 @njit(cache=True)
@@ -131,36 +152,35 @@ def _ranges(truth, x, y, angles, reach):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _read(truth, missed, x, y, angle, reach):  # type: ignore[no-untyped-def]
     """Return what ends a ray (a wall that is noticed, one that is not, or nothing), and a distance within that cell."""
-    cells, ends = _cells_along(x, y, angle, reach)
-    for k in range(len(cells) - 1):
-        row, column = cells[k]
-        if truth[row, column] != _FREE:
-            noticed = truth[row, column] == _WALL and not missed[row, column]
-            return (_WALL_ECHO if noticed else _NO_ECHO), ((ends[k - 1] if k > 0 else 0.0) + ends[k]) / 2
+    walk = _start(x, y, angle)
+    while walk.enters <= reach:
+        if truth[walk.row, walk.column] != _FREE:
+            noticed = truth[walk.row, walk.column] == _WALL and not missed[walk.row, walk.column]
+            return (_WALL_ECHO if noticed else _NO_ECHO), (walk.enters + walk.leaves) / 2
+        walk = _next(walk)
     return _FAR, reach
 
 
 @njit(cache=True)
-def _cells_along(x, y, angle, reach):  # type: ignore[no-untyped-def]
-    """Cells (n, 2) along a ray, row and column, and where it leaves them (n,) [cells]; the last is beyond its reach.
-
-    A ray through a corner crosses one of the two cells beside it, so that it never slips between two walls. It is
-    at least a billionth of a cell long in each cell, so that a distance belongs to one cell.
-    """
+def _start(x, y, angle):  # type: ignore[no-untyped-def]
+    """Return a ray in the cell where it starts."""
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
+    step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
     pace_x, pace_y = 1.0 / max(abs(along_x), 1e-12), 1.0 / max(abs(along_y), 1e-12)
     next_x = pace_x * (column + 1 - x if along_x > 0 else x - column)
     next_y = pace_y * (row + 1 - y if along_y > 0 else y - row)
-    size = int(reach * (abs(along_x) + abs(along_y))) + 8
-    cells, ends = np.empty((size, 2), np.int64), np.empty(size)
-    count, start, end = 0, 0.0, 0.0
-    while start <= reach and count < size:
-        start, end = end, max(min(next_x, next_y), end + 1e-9)
-        cells[count, 0], cells[count, 1], ends[count] = row, column, end
-        count += 1
-        if next_x < next_y:
-            column, next_x = column + (1 if along_x > 0 else -1), next_x + pace_x
-        else:
-            row, next_y = row + (1 if along_y > 0 else -1), next_y + pace_y
-    return cells[:count], ends[:count]
+    leaves = max(min(next_x, next_y), 1e-9)
+    return _Walk(row, column, 0.0, leaves, step_x, step_y, pace_x, pace_y, next_x, next_y)
+
+
+@njit(cache=True)
+def _next(walk):  # type: ignore[no-untyped-def]
+    """Return the ray in the next cell."""
+    row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
+    if next_x < next_y:
+        column, next_x = column + walk.step_x, next_x + walk.pace_x
+    else:
+        row, next_y = row + walk.step_y, next_y + walk.pace_y
+    leaves = max(min(next_x, next_y), walk.leaves + 1e-9)
+    return _Walk(row, column, walk.leaves, leaves, walk.step_x, walk.step_y, walk.pace_x, walk.pace_y, next_x, next_y)
