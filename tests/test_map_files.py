@@ -281,28 +281,6 @@ def test_array_row_0_is_the_smallest_y() -> None:
     assert partial.state_at(np.array([10.6, 20.1])) == WALL
 
 
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [
-        ([[0.0, 1.0]], "array has dtype float64: give integers"),
-        ([[np.nan]], "array has dtype float64: give integers"),
-        ([["wall"]], "array has dtype <U4: give integers"),
-        ([[None]], "array has dtype object: give integers"),
-        ([[1 + 2j]], "array has dtype complex128: give integers"),
-        ([[0, 1], [0]], "array is not a rectangular array: give a two-dimensional array (ny, nx)"),
-        ([0, 1], "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
-        (np.zeros((2, 2, 3), int), "array has shape (2, 2, 3): give a two-dimensional array"),
-        (np.zeros((0, 2), int), "array has shape (0, 2): give a two-dimensional array"),
-        (3, "array has shape (): give a two-dimensional array"),
-        ([[0, 3]], "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
-        ([[-1, 0]], "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
-    ],
-)
-def test_wrong_array(array: object, message: str) -> None:
-    with pytest.raises(MapError, match=re.escape(message)):
-        map_from_array(array, 0.05)  # type: ignore[arg-type]
-
-
 def test_occupancy_grid() -> None:
     data = [[-1, 0, 25], [26, 64, 65], [100, 50, 255]]
     partial = map_from_occupancy(data, 0.1, origin_m=(1.0, 2.0))
@@ -313,23 +291,6 @@ def test_occupancy_grid() -> None:
     flat = np.array([-1, 0, 100], dtype=np.int8)
     assert map_from_occupancy(flat.reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
     assert map_from_occupancy(flat.view(np.uint8).reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
-
-
-@pytest.mark.parametrize(
-    ("data", "options", "message"),
-    [
-        ([[0, 101]], {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
-        ([[-2]], {}, "data holds -2: give -1 for unknown"),
-        ([[0.5]], {}, "data has dtype float64: give integers"),
-        ([0, 100], {}, "data has shape (2,): give a two-dimensional array"),
-        ([[0]], {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
-        ([[0]], {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
-        ([[0]], {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
-    ],
-)
-def test_wrong_occupancy(data: object, options: dict[str, float], message: str) -> None:
-    with pytest.raises(MapError, match=re.escape(message)):
-        map_from_occupancy(data, 0.05, **options)  # type: ignore[arg-type]
 
 
 def test_habitat_with_border() -> None:
@@ -363,22 +324,6 @@ def test_habitat_zero_is_never_free_and_hidden_never_free(top_down: np.ndarray, 
     assert (state[~seen & (top_down != 0)] == UNKNOWN).all()
 
 
-@pytest.mark.parametrize(
-    ("top_down", "seen", "message"),
-    [
-        ([[0, 1]], [[1]], "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
-        ([[0.0]], [[1]], "top_down has dtype float64: give integers"),
-        ([[True]], [[1]], "top_down has dtype bool: give integers"),
-        ([[1]], [[0.5]], "fog_of_war has dtype float64: give integers"),
-        ([[1, -1]], [[1, 1]], "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
-        ([[1, 256]], [[1, 1]], "top_down holds values 1 to 256: give Habitat's map, 0 to 255"),
-    ],
-)
-def test_wrong_habitat(top_down: object, seen: object, message: str) -> None:
-    with pytest.raises(MapError, match=re.escape(message)):
-        map_from_habitat(top_down, seen, 0.05)  # type: ignore[arg-type]
-
-
 def test_slam_channels() -> None:
     """An obstacle that was not explored is unknown; row 0 is the smallest y."""
     obstacle, explored = [[0.0, 0.9, 0.9], [0.5, 0.49, 0.0]], [[1.0, 1.0, 0.2], [0.5, 0.6, 0.49]]
@@ -389,20 +334,49 @@ def test_slam_channels() -> None:
     assert booleans.state.tolist() == [[WALL, UNKNOWN, FREE]]
 
 
+FUNCTIONS = {
+    "array": map_from_array,
+    "occupancy": map_from_occupancy,
+    "habitat": map_from_habitat,
+    "slam": map_from_slam,
+}
+
+
 @pytest.mark.parametrize(
-    ("obstacle", "explored", "options", "message"),
+    ("kind", "arrays", "options", "message"),
     [
-        ([[0, 1]], [[1]], {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
-        ([[np.nan]], [[1]], {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or booleans"),
-        ([[0]], [[255]], {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
-        ([["a"]], [[1]], {}, "obstacle has dtype <U1: give numbers"),
-        ([[0]], [[1]], {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
-        ([[0]], [[1]], {"threshold": np.nan}, "threshold = nan is not allowed"),
+        ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
+        ("array", ([["wall"]],), {}, "array has dtype <U4: give integers"),
+        ("array", ([[None]],), {}, "array has dtype object: give integers"),
+        ("array", ([[0, 1], [0]],), {}, "array is not a rectangular array: give a two-dimensional array (ny, nx)"),
+        ("array", ([0, 1],), {}, "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
+        ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
+        ("array", (np.zeros((0, 2), int),), {}, "array has shape (0, 2): give a two-dimensional array"),
+        ("array", (3,), {}, "array has shape (): give a two-dimensional array"),
+        ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ("array", ([[-1, 0]],), {}, "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
+        ("occupancy", ([[-2]],), {}, "data holds -2: give -1 for unknown"),
+        ("occupancy", ([[0.5]],), {}, "data has dtype float64: give integers"),
+        ("occupancy", ([[0]],), {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
+        ("occupancy", ([[0]],), {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
+        ("occupancy", ([[0]],), {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
+        ("habitat", ([[0, 1]], [[1]]), {}, "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
+        ("habitat", ([[True]], [[1]]), {}, "top_down has dtype bool: give integers"),
+        ("habitat", ([[1]], [[0.5]]), {}, "fog_of_war has dtype float64: give integers"),
+        ("habitat", ([[1, -1]], [[1, 1]]), {}, "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
+        ("habitat", ([[1, 256]], [[1, 1]]), {}, "top_down holds values 1 to 256: give Habitat's map, 0 to 255"),
+        ("slam", ([[0, 1]], [[1]]), {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
+        ("slam", ([[np.nan]], [[1]]), {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or"),
+        ("slam", ([[0]], [[255]]), {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
+        ("slam", ([["a"]], [[1]]), {}, "obstacle has dtype <U1: give numbers"),
+        ("slam", ([[0]], [[1]]), {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
+        ("slam", ([[0]], [[1]]), {"threshold": np.nan}, "threshold = nan is not allowed"),
     ],
 )
-def test_wrong_slam(obstacle: object, explored: object, options: dict[str, float], message: str) -> None:
+def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, float], message: str) -> None:
     with pytest.raises(MapError, match=re.escape(message)):
-        map_from_slam(obstacle, explored, 0.05, **options)  # type: ignore[arg-type]
+        FUNCTIONS[kind](*arrays, 0.05, **options)  # type: ignore[operator]
 
 
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="the Gibson plans are not here")
