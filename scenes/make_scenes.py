@@ -1,4 +1,4 @@
-"""Make the homes that ship with the package: complete, and as a robot knows them after so many steps.
+"""Make the homes that ship with the package: complete, and as a robot has seen them after so many steps.
 
 usage: python scenes/make_scenes.py [FOLDER]
 

@@ -17,7 +17,7 @@ from sionna_partial.calibration.measured_building import custom_material
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
-from sionna_partial.scene.scene_xml import itu_constants
+from sionna_partial.scene.scene import itu_constants
 from sionna_partial.tracing.slab import reflection_loss_db
 
 SETTINGS = sp.TraceSettings(max_depth=2)

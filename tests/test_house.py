@@ -21,15 +21,9 @@ PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": ("constants", "errors", "resources", "settings", "files", "planar", "cores", "llvm"),
-    "maps": (
-        *("mesh.cut", "mesh.mesh", "partial_map", "map_turn", "ros_map"),
-        *("mesh.files", "mesh.mitsuba_xml", "mesh.cells", "map_files"),
-    ),
+    "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
-    "scene": (
-        *("lines", "wall_cells", "polylines", "graph", "outlines", "lattice"),
-        *("floor_plan", "scene_xml", "scene"),
-    ),
+    "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
         *("candidates", "paths", "engine", "slab"),
         *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),

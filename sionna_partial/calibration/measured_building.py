@@ -11,7 +11,7 @@ from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.link_context import SEEN_M
-from sionna_partial.scene.scene_xml import itu_constants
+from sionna_partial.scene.scene import itu_constants
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.fixed_paths import PathScene
 from sionna_partial.tracing.trace import Progress, nearest_m
