@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import BackendError, PositionError, SettingsError
-from sionna_partial.tracing import fixed_paths, gradients
+from sionna_partial.tracing import gradients, path_set
 from sionna_partial.tracing.gradients import GainGradients, gain_gradients
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
@@ -192,7 +192,7 @@ class TestGainGradients:
         assert same_bytes(found, gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS))
 
     def test_blocks_change_nothing(self, found: GainGradients, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "PATHS_PER_BLOCK", 29)
+        monkeypatch.setattr(path_set, "PATHS_PER_BLOCK", 29)
         in_blocks = gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS)
         np.testing.assert_allclose(all_slopes(in_blocks), all_slopes(found), rtol=1e-6)
 
@@ -245,13 +245,13 @@ class TestErrors:
             gain_gradients(FIELD, TX, RX, scene_settings=sp.SceneSettings(material=sp.Material(itu="wet_ground")))
 
     def test_places_are_checked_before_the_scene_is_opened(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: pytest.fail("opened"))
+        monkeypatch.setattr(path_set, "fast_engine_works", lambda: pytest.fail("opened"))
         with pytest.raises(PositionError, match="rx"):
             gain_gradients(FIELD, TX, [(99.0, 1.0, 1.0)])
         assert len(gain_gradients(FIELD, TX, []).gain_db) == 0
 
     def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: False)
+        monkeypatch.setattr(path_set, "fast_engine_works", lambda: False)
         message = r'Gradients need .* that the fast engine has: run pip install "sionna-rt=='
         with pytest.raises(BackendError, match=message):
             gain_gradients(FIELD, TX, RX)

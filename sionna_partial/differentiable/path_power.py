@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
-from sionna_partial.tracing.fixed_paths import FixedPaths
+from sionna_partial.tracing.path_set import PathSet
 
 STEEPEST = 4.0
 """How much faster than its smooth surrogate a length grows at most, as where it hardly touches a cell."""
 
 
-def moved_paths(paths: FixedPaths, given: Mapping[str, Any]) -> tuple[Any, Any]:
+def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
     """Evaluate fixed paths for other parameters.
 
     Parameters
     ----------
-    paths : FixedPaths
+    paths : PathSet
     given : mapping of str to float64 tensors
         Fields of `PathParameters`; the others are as the paths were traced.
 

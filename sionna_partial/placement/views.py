@@ -8,7 +8,7 @@ from sionna_partial.placement.area import PlacementArea
 from sionna_partial.placement.objective import PlacementObjective
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.tracing.fixed_paths import FixedPaths
+from sionna_partial.tracing.path_set import PathSet
 from sionna_partial.tracing.trace import nearest_m
 
 
@@ -25,7 +25,7 @@ class PlacementViews:
     def __init__(self, scene: DifferentiableScene, area: PlacementArea, objective: PlacementObjective) -> None:
         self._scene, self._objective, self._rx_m, self._weight = scene, objective, area.rx_m, area.weight
         self._values: dict[bytes, NDArray[np.float64]] = {}
-        self._paths: dict[bytes, FixedPaths] = {}
+        self._paths: dict[bytes, PathSet] = {}
 
     def sees_as(self, other: "PlacementViews") -> bool:
         """Whether both have the same receivers and the same objective."""
@@ -68,7 +68,7 @@ class PlacementViews:
             return LinkPrediction.of_trace(phi)
         return self._scene.predictor.predict(phi)
 
-    def _trace(self, place_m: NDArray[np.float64]) -> FixedPaths:
+    def _trace(self, place_m: NDArray[np.float64]) -> PathSet:
         return self._scene.paths.paths(place_m, self._rx_m[self._far(place_m)])
 
     def _far(self, place_m: NDArray[np.float64]) -> NDArray[np.bool_]:
