@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
@@ -11,7 +12,6 @@ from sionna_partial.differentiable.path_power import STEEPEST, moved_lengths_m, 
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
-from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
 from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
 TX = np.array([1.1, 1.7, 1.4])

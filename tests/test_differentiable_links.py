@@ -9,6 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from predictor_links import QUIET
+from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
@@ -16,7 +17,6 @@ from sionna_partial.differentiable import scene as differentiable_links
 from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras
-from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
 from sionna_partial.tracing.probe import TX_M, small_room
 
 pytestmark = QUIET

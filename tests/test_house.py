@@ -34,7 +34,7 @@ ROOMS = {
         *("slab", "plan.bounds", "plan.beams", "plan.candidates", "plan.diffraction"),
         *("mesh.rays", "mesh.planes", "mesh.sequences", "mesh.candidates"),
         *("paths", "sionna_rt", "contract", "stock", "chain", "solver", "generator", "probe", "trace"),
-        *("fixed_paths", "gradients"),
+        *("path_set", "gradients"),
     ),
     "prediction": (
         *("unobserved", "link_context", "features", "certainty", "windows"),
@@ -44,9 +44,7 @@ ROOMS = {
     "differentiable": ("smooth_lengths", "link_distribution", "path_power", "scene"),
     "checkpoint": ("checkpoint",),
     "measurements": ("measurements",),
-    "calibration": (
-        *("gain_errors", "material_paths", "material_fit", "material_search", "measured_building", "calibration"),
-    ),
+    "calibration": (*("gain_errors", "measured_building", "material_fit", "material_search", "calibration"),),
     "placement": ("area", "objective", "climb", "state", "views", "placement"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),

@@ -21,10 +21,11 @@ from sionna_partial.calibration.material_fit import (
     lossless_scale_s_m,
     prior_posterior,
 )
-from sionna_partial.calibration.material_paths import MaterialPaths, link_gains_db
 from sionna_partial.calibration.material_search import search
 from sionna_partial.calibration.measured_building import (
+    LinkPaths,
     MeasuredBuilding,
+    link_gains_db,
     require_places,
     start_materials,
     usable_links,
@@ -220,7 +221,7 @@ def calibrate_materials(
     report = progress or (lambda share, message: None)
     report(0.0, "building the scene")
     paths = building.paths(measured, settings, scene_settings, report)
-    used, left_out = usable_links(paths, measured)
+    used, left_out = usable_links(partial, paths, measured)
     target = MaterialTarget(paths.of_links(used), measured.gain_db[used])
     target.known.update(known)
     kept = _Kept(target, store)
@@ -350,7 +351,7 @@ def _result(
     measured: Measurements,
     used: NDArray[np.bool_],
     left_out: dict[str, int],
-    paths: MaterialPaths,
+    paths: LinkPaths,
     settings: TraceSettings,
 ) -> MaterialCalibration:
     begin, point, count = fit.steps[0], fit.point, len(measured)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.calibration.gain_errors import GainErrors, fit_errors
-from sionna_partial.calibration.material_paths import MaterialPaths, link_gains_db
+from sionna_partial.calibration.measured_building import LinkPaths, link_gains_db
 from sionna_partial.tracing.slab import reflection_loss_db
 
 PRIOR_SUSCEPTIBILITY, SUSCEPTIBILITY_SPREAD = 2.5, 0.9
@@ -92,7 +92,7 @@ class MaterialTarget:
 
     Parameters
     ----------
-    paths : MaterialPaths
+    paths : LinkPaths
         Of N links, each with a path.
     gain_db : (N,) float64 array
         Measured gains [dB].
@@ -105,7 +105,7 @@ class MaterialTarget:
         Called when something has been found.
     """
 
-    def __init__(self, paths: MaterialPaths, gain_db: NDArray[np.float64]) -> None:
+    def __init__(self, paths: LinkPaths, gain_db: NDArray[np.float64]) -> None:
         self.paths, self.gain_db = paths, gain_db
         self.known: dict[str, list[float]] = {}
         self.is_direct = np.zeros(len(gain_db), dtype=bool)
@@ -125,17 +125,6 @@ class MaterialTarget:
         loss, *errors_found = self.known[key]
         loss += _prior_loss(permittivity, conductivity_s_m)
         return Point(permittivity, conductivity_s_m, loss, GainErrors(*errors_found))
-
-    def prepare(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> None:
-        """Judge many materials (K, M) together, which is quicker than one by one with `at`."""
-        keys = [_key(*pair) for pair in zip(permittivity, conductivity_s_m, strict=True)]
-        new = np.flatnonzero([key not in self.known for key in keys])
-        for start in range(0, len(new), self.paths.at_once):
-            rows = new[start : start + self.paths.at_once]
-            powers = self.paths.powers(permittivity[rows], conductivity_s_m[rows])
-            for row, power in zip(rows, powers, strict=True):
-                self._learn(keys[row], self._gains_db(power))
-            self.on_progress()
 
     def _gains_db(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)

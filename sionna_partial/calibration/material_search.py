@@ -33,8 +33,8 @@ SPLIT_SHARE, MOST_CELLS = 0.004, 600
 MOST_TEETH, FEW_STEPS, FEW_TEETH = 8, 3, 2
 """Number of teeth whose bottoms are looked for, and of steps to each; number of teeth that are followed to the end."""
 
-CELLS_AT_ONCE = 64
-"""Number of cells after which progress is told."""
+CELLS_A_REPORT = 64
+"""Number of cells after which progress is reported."""
 
 
 @dataclass(frozen=True)
@@ -133,13 +133,12 @@ class _Evaluation:
         self._target, self._start, self._which, self._report = target, start, which, report
 
     def __call__(self, cells: _Cells, begin: float, end: float) -> _Cells:
-        places = [*zip(cells.index, cells.log_conductivity, strict=True)]
-        for first in range(0, len(places), CELLS_AT_ONCE):
-            pairs = [self._materials(*place) for place in places[first : first + CELLS_AT_ONCE]]
-            self._target.prepare(*(np.array(values) for values in zip(*pairs, strict=True)))
-            share = min(1.0, (first + CELLS_AT_ONCE) / len(places))
-            self._report(begin + (end - begin) * share, "searching for the material")
-        return replace(cells, loss=np.array([self._point(*place).loss for place in places]))
+        loss = np.zeros(len(cells.index))
+        for number, (index, log_conductivity) in enumerate(zip(cells.index, cells.log_conductivity, strict=True)):
+            loss[number] = self._point(index, log_conductivity).loss
+            if (number + 1) % CELLS_A_REPORT == 0 or number + 1 == len(loss):
+                self._report(begin + (end - begin) * (number + 1) / len(loss), "searching for the material")
+        return replace(cells, loss=loss)
 
     def best(self, cells: _Cells, tooth: float, most: int) -> list[Point]:
         """Return the best points of the best teeth, at most so many."""

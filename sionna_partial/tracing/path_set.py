@@ -4,6 +4,7 @@ Paths are found once, by a complete trace. Sionna RT then gives their power and 
 the derivatives. A path that other values make invalid has no power; one that they would make possible is not found.
 """
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
@@ -147,6 +148,8 @@ class PathSet:
     def __init__(self, scene: PathScene, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], parts: list[Part]):
         self.base, self.rx_m, self._scene, self._parts = scene.parameters(tx_m), rx_m, scene, _merged(parts)
         self._held: dict[int, HeldPaths] = {}
+        ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
+        self._rows = [slice(*each) for each in itertools.pairwise(ends)]
         depth = max(1, scene.settings.max_depth)
         paths = [join_paths([], depth), *(solved for _, solved in self._parts)]
         self.path_tx = np.concatenate([each.path_tx for each in paths])
@@ -167,12 +170,16 @@ class PathSet:
 
     def kept(self, mask: NDArray[np.bool_]) -> "PathSet":
         """Return the paths of a mask (P,)."""
-        parts, first = [], 0
-        for candidates, paths in self._parts:
-            rows = np.flatnonzero(mask[first : first + len(candidates.rx)])
-            first += len(candidates.rx)
-            parts.append((candidates.rows(rows), paths.take(rows)))
+        parts = []
+        for (candidates, paths), rows in zip(self._parts, self._rows, strict=True):
+            index = np.flatnonzero(mask[rows])
+            parts.append((candidates.rows(index), paths.take(index)))
         return PathSet(self._scene, self.base.tx_m, self.rx_m, parts)
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the M radio materials, in the order of `PathParameters`."""
+        return self._scene.materials
 
     @property
     def is_direct(self) -> NDArray[np.bool_]:
@@ -203,16 +210,15 @@ class PathSet:
 
         For a frequency that a material does not cover this raises a SettingsError; so do the derivatives.
         """
-        power, vertices_m = np.zeros(len(self)), self.vertices_m.copy()
-        _, variables = self._variables(parameters)
-        moves = self._moves(parameters)
-        for rows, candidates, path_tx in self._blocks():
-            if not moves:
-                held = self._held_paths(rows, candidates, path_tx)
-                power[rows] = self._scene.solver.power(held, variables, differentiable=False).numpy()
-                continue
-            ends = self._ends()
-            found = self._scene.solver.moved(candidates, path_tx, *ends, variables, differentiable=False)
+        power, vertices_m = np.zeros(len(self)), self.vertices_m
+        solver, moves, (_, variables) = self._scene.solver, self._moves(parameters), self._variables(parameters)
+        if not moves:
+            for number, rows in enumerate(self._rows):
+                power[rows] = solver.power(self._held_paths(number), variables, differentiable=False).numpy()
+            return power, vertices_m.copy()
+        vertices_m = np.full_like(vertices_m, math.nan)
+        for (candidates, paths), rows in zip(self._parts, self._rows, strict=True):
+            found = solver.moved(candidates, paths.path_tx, *self._ends(), variables, differentiable=False)
             power[rows], depth = found[0].numpy(), candidates.face.shape[1]
             vertices_m[rows, :depth] = np.transpose(found[1].numpy()).reshape(-1, depth, 3) + self._scene.shift_m
         vertices_m[self.interactions == 0] = math.nan
@@ -252,13 +258,15 @@ class PathSet:
         """Pass forward from each entry of each parameter: derivatives of power and vertices, block by block."""
         import drjit as dr
 
-        solver = self._scene.solver
-        for rows, candidates, path_tx in self._blocks():
+        solver, moves = self._scene.solver, "tx_m" in names or self._moves(parameters)
+        for number, (candidates, paths) in enumerate(self._parts):
+            rows = self._rows[number]
             leaves, variables = self._variables(parameters, names, together=together)
-            if "tx_m" in names or self._moves(parameters):
-                power, vertices_m = solver.moved(candidates, path_tx, *self._ends(), variables, differentiable=True)
+            if moves:
+                ends = self._ends()
+                power, vertices_m = solver.moved(candidates, paths.path_tx, *ends, variables, differentiable=True)
             else:
-                power = solver.power(self._held_paths(rows, candidates, path_tx), variables, differentiable=True)
+                power = solver.power(self._held_paths(number), variables, differentiable=True)
                 vertices_m = dr.zeros(type(power))
             results = power, vertices_m + dr.opaque(type(power), 0.0)  # power is made of them: theirs would be cleared
             for name in names:
@@ -272,11 +280,12 @@ class PathSet:
         """Transmitters (T, 3) and receivers (N, 3) at `base`, in scene coordinates [m]."""
         return self.base.tx_m.reshape(-1, 3) - self._scene.shift_m, self.rx_m - self._scene.shift_m
 
-    def _held_paths(self, rows: slice, candidates: Candidates, path_tx: NDArray[np.int32]) -> HeldPaths:
-        """Return the paths of a block at `base`, which are verified once."""
-        if rows.start not in self._held:
-            self._held[rows.start] = self._scene.solver.held(candidates, path_tx, *self._ends())
-        return self._held[rows.start]
+    def _held_paths(self, number: int) -> HeldPaths:
+        """Return the paths of a part at `base`, which are verified once."""
+        if number not in self._held:
+            candidates, paths = self._parts[number]
+            self._held[number] = self._scene.solver.held(candidates, paths.path_tx, *self._ends())
+        return self._held[number]
 
     def _variables(
         self, parameters: PathParameters, names: Sequence[str] = (), *, together: bool = False
@@ -303,20 +312,9 @@ class PathSet:
         shift = tuple(mi.Float(column) + leaf for column, leaf in zip(shift_m, leaves["tx_m"], strict=True))
         return leaves, Variables(shift, *(tuple(own) for own in values.values()), frequency_hz=frequency_hz[0])
 
-    def _blocks(self) -> Iterator[tuple[slice, Candidates, NDArray[np.int32]]]:
-        """Paths in blocks: where they are among all, their candidates and transmitters."""
-        first = 0
-        for candidates, _ in self._parts:
-            count = len(candidates.rx)
-            for start in range(0, count, PATHS_PER_BLOCK):
-                stop = min(start + PATHS_PER_BLOCK, count)
-                rows = slice(first + start, first + stop)
-                yield rows, candidates.rows(np.arange(start, stop)), self.path_tx[rows]
-            first += count
-
 
 def _merged(parts: list[Part]) -> list[Part]:
-    """Join parts to one of all paths without diffraction and one of all others."""
+    """Join parts of one kind, without diffraction or with it, and cut them to `PATHS_PER_BLOCK`."""
     merged = []
     for is_diffracted in (False, True):
         some = [part for part in parts if (part[0].wedges is not None) == is_diffracted and len(part[0].rx)]
@@ -335,7 +333,11 @@ def _merged(parts: list[Part]) -> list[Part]:
             if field.name in ("interactions", "vertices_m"):
                 own = [_widened(each, depth, 0 if field.name == "interactions" else math.nan) for each in own]
             columns[field.name] = np.concatenate(own)
-        merged.append((candidates, SolvedPaths(**columns)))
+        paths = SolvedPaths(**columns)
+        for start in range(0, len(paths.a), PATHS_PER_BLOCK):
+            rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))
+            whole = len(rows) == len(paths.a)
+            merged.append((candidates, paths) if whole else (candidates.rows(rows), paths.take(rows)))
     return merged
 
 

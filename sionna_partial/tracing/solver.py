@@ -8,6 +8,7 @@ internal part that is used.
 Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a chain of each kind.
 """
 
+import gc
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
@@ -150,7 +151,7 @@ class SceneSolver:
     ) -> tuple[Any, Any]:
         """Verify candidates from T transmitters to N receivers, in scene coordinates, for other variables.
 
-        Returns their power (C,), 0 where there is no path, and their vertices (C D,) [m]. Derivatives need slower loops.
+        Returns their power (C,), 0 where there is no path, and vertices (C D,) [m]. Derivatives need slower loops.
         """
         import drjit as dr
         import mitsuba as mi
@@ -193,7 +194,15 @@ class SceneSolver:
         import drjit as dr
 
         with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
-            return paths.evaluate(self._evaluated) if differentiable else paths.repeat()
+            if differentiable or not self._scene.radio_materials:  # without any, Dr.Jit has nothing to record
+                return paths.evaluate(self._evaluated if differentiable else self._symbolic)
+            collects = gc.isenabled()
+            gc.disable()  # Dr.Jit aborts where a scene is collected while it records
+            try:
+                return paths.repeat()
+            finally:
+                if collects:
+                    gc.enable()
 
     def _verified(
         self, chain: Chain, candidates: Candidates, tx_index: NDArray[np.int32], ends: tuple[Any, Any]
