@@ -210,13 +210,14 @@ class PathSet:
 
         For a frequency that a material does not cover this raises a SettingsError; so do the derivatives.
         """
-        power, vertices_m = np.zeros(len(self)), self.vertices_m
-        solver, moves, (_, variables) = self._scene.solver, self._moves(parameters), self._variables(parameters)
-        if not moves:
+        if all(np.array_equal(getattr(parameters, name), getattr(self.base, name)) for name in PARAMETERS):
+            return self.power.copy(), self.vertices_m.copy()
+        solver, (_, variables), power = self._scene.solver, self._variables(parameters), np.zeros(len(self))
+        if not self._moves(parameters):
             for number, rows in enumerate(self._rows):
                 power[rows] = solver.power(self._held_paths(number), variables, differentiable=False).numpy()
-            return power, vertices_m.copy()
-        vertices_m = np.full_like(vertices_m, math.nan)
+            return power, self.vertices_m.copy()
+        vertices_m = np.full_like(self.vertices_m, math.nan)
         for (candidates, paths), rows in zip(self._parts, self._rows, strict=True):
             found = solver.moved(candidates, paths.path_tx, *self._ends(), variables, differentiable=False)
             power[rows], depth = found[0].numpy(), candidates.face.shape[1]
