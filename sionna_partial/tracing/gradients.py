@@ -140,5 +140,15 @@ def gain_gradients(
     above = gain_db > GAIN_FLOOR_DB
     slopes_db = np.where(above, 10.0 / math.log(10.0) * slopes / np.where(above, power, 1.0), 0.0)
     return GainGradients(
-        tx_m[0].copy(), rx_m.copy(), link_state, gain_db, slopes_db[:3].T, *slopes_db[3:], settings, scene_settings
+        tx=tx_m[0].copy(),
+        rx=rx_m.copy(),
+        link_state=link_state,
+        gain_db=gain_db,
+        tx_db_per_m=slopes_db[:3].T,
+        relative_permittivity_db=slopes_db[3],
+        conductivity_db_per_s_m=slopes_db[4],
+        thickness_db_per_m=slopes_db[5],
+        frequency_db_per_hz=slopes_db[6],
+        settings=settings,
+        scene_settings=scene_settings,
     )

@@ -89,8 +89,9 @@ class PathScene:
 
     def parameters(self, tx_m: ArrayLike) -> PathParameters:
         """Return those of the scene, with transmitters (3,) or (T, 3) [m]."""
-        constants = np.reshape([*self.solver.materials.values()], (-1, 3)).T
-        return PathParameters(np.array(tx_m, dtype=np.float64), *constants, np.array(self.settings.frequency_hz))
+        permittivity, conductivity_s_m, thickness_m = np.reshape([*self.solver.materials.values()], (-1, 3)).T
+        tx_m, frequency_hz = np.array(tx_m, dtype=np.float64), np.array(self.settings.frequency_hz)
+        return PathParameters(tx_m, permittivity, conductivity_s_m, thickness_m, frequency_hz)
 
     def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | None = None) -> "PathSet":
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], as `trace_links` does."""
@@ -311,7 +312,8 @@ class PathSet:
             values = {name: [value + leaves[name][0] for value in own] for name, own in values.items()}
         shift_m = (parameters.tx_m - self.base.tx_m).reshape(-1, 3).T.astype(np.float32)
         shift = tuple(mi.Float(column) + leaf for column, leaf in zip(shift_m, leaves["tx_m"], strict=True))
-        return leaves, Variables(shift, *(tuple(own) for own in values.values()), frequency_hz=frequency_hz[0])
+        materials = {name: tuple(own) for name, own in values.items()}
+        return leaves, Variables(shift_m=shift, frequency_hz=frequency_hz[0], **materials)
 
 
 def _merged(parts: list[Part]) -> list[Part]:
