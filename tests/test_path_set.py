@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
-from sionna_partial.errors import BackendError, PositionError, SettingsError
+from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.tracing import path_set
@@ -472,15 +472,6 @@ class TestNothingThere:
 
 
 class TestErrors:
-    @pytest.mark.parametrize("name", ["refraction", "diffuse_reflection"])
-    def test_rays_are_shot(self, name: str) -> None:
-        with pytest.raises(SettingsError, match=f"{name} = True is not allowed: paths that are found by shooting rays"):
-            PathScene(FIELD, settings=sp.TraceSettings(**{name: True}))
-
-    def test_diffraction_on_a_mesh(self) -> None:
-        with pytest.raises(SettingsError, match="diffraction = True is not allowed: paths that are found by shooting"):
-            PathScene(mesh_room(), settings=sp.TraceSettings(power_tolerance_db=0.0, diffraction=True))
-
     def test_diffraction_left_open_is_off_on_a_mesh_only(self, mesh_paths: PathSet, paths: PathSet) -> None:
         assert mesh_paths._scene.settings.diffraction is False
         assert paths._scene.settings.diffraction is True
@@ -491,16 +482,8 @@ class TestErrors:
         with pytest.raises(BackendError, match=message):
             PathScene(FIELD)
 
-    def test_positions(self, room: PathScene) -> None:
-        with pytest.raises(PositionError, match=r"rx\[0\] = .* outside the map"):
-            room.paths(TX_M, [(99.0, 1.0, 1.0)])
-        with pytest.raises(PositionError, match="inside a wall"):
-            room.paths((2.3, 1.6, 1.4), RX_M)
-
     def test_frequency_that_a_material_does_not_cover(self, itu_paths: PathSet) -> None:
         there = replace(itu_paths.base, frequency_hz=np.array(5e8))
         for call in (itu_paths.at, itu_paths.slopes, itu_paths.transmitter_slopes):
             with pytest.raises(SettingsError, match="ITU material 'concrete' is defined for"):
                 call(there)
-        with pytest.raises(SettingsError, match="ITU material 'wet_ground'"):
-            PathScene(FIELD, scene_settings=sp.SceneSettings(material=sp.Material(itu="wet_ground")))

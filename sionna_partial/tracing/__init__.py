@@ -6,5 +6,5 @@
 - Sionna RT: `sionna_rt` loads it, `contract` names the internal parts that `chain` and `solver` lean on, `stock`
   does without them, and `paths` is what either of them gives.
 - `generator` knows which scene has which candidates, `probe` whether `solver` can be trusted, and `trace` is the door
-  for everybody else. `fixed_paths` makes functions of what comes through it, and `gradients` differentiates the gain.
+  for everybody else. `path_set` is the forward model: power and vertices of paths found once; `gradients` asks it.
 """
