@@ -90,8 +90,13 @@ class PathScene:
     def parameters(self, tx_m: ArrayLike) -> PathParameters:
         """Return those of the scene, with transmitters (3,) or (T, 3) [m]."""
         permittivity, conductivity_s_m, thickness_m = np.reshape([*self.solver.materials.values()], (-1, 3)).T
-        tx_m, frequency_hz = np.array(tx_m, dtype=np.float64), np.array(self.settings.frequency_hz)
-        return PathParameters(tx_m, permittivity, conductivity_s_m, thickness_m, frequency_hz)
+        return PathParameters(
+            tx_m=np.array(tx_m, dtype=np.float64),
+            relative_permittivity=permittivity,
+            conductivity_s_m=conductivity_s_m,
+            thickness_m=thickness_m,
+            frequency_hz=np.array(self.settings.frequency_hz),
+        )
 
     def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | None = None) -> "PathSet":
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], as `trace_links` does."""
@@ -120,7 +125,8 @@ class PathScene:
                 continue
             ends = position_m - self.shift_m, rx_m[chosen] - self.shift_m
             for candidates, paths, fraction, message in self._written.paths(self.solver, *ends):
-                report((number + fraction) / len(positions_m), message)
+                which = f" of transmitter {number + 1} of {len(positions_m)}" if len(positions_m) > 1 else ""
+                report((number + fraction) / len(positions_m), f"{message}{which}")
                 rx = chosen[candidates.rx].astype(np.int32)
                 path_tx = np.full(len(rx), number, np.int32)
                 part = replace(candidates, rx=rx), replace(paths, path_tx=path_tx, path_rx=rx)
@@ -146,7 +152,9 @@ class PathSet:
         Positions of the interactions at `base` [m]; NaN where there is none.
     """
 
-    def __init__(self, scene: PathScene, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], parts: list[Part]):
+    def __init__(
+        self, scene: PathScene, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], parts: list[Part]
+    ) -> None:
         self.base, self.rx_m, self._scene, self._parts = scene.parameters(tx_m), rx_m, scene, _merged(parts)
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
