@@ -125,7 +125,7 @@ class MeasuredBuilding:
         kept, new = nothing, [nothing]
 
         def link_paths(paths: PathSet) -> LinkPaths:
-            columns = [paths.materials.index(name) for name in self.start if name in paths.materials]
+            columns = [paths.materials.index(name) for name in self.start]
             return LinkPaths(paths, np.array(columns, dtype=int), paths.path_rx.astype(np.int64))
 
         def strong() -> PathSet:
