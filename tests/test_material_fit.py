@@ -36,19 +36,6 @@ class TestMaterialTarget:
         for one, other in zip(target.slopes(first), slopes, strict=True):
             np.testing.assert_array_equal(one, other)
 
-    def test_many_together_are_judged_as_one_by_one(self) -> None:
-        target, other = fake_target(4.0, 0.3), fake_target(4.0, 0.3)
-        permittivity, conductivity_s_m = np.linspace(2.0, 6.0, 17)[:, None], np.full((17, 1), 0.3)
-        told = []
-        target.on_progress = lambda: told.append(len(target.known))
-        target.prepare(permittivity, conductivity_s_m)
-        assert told == [7, 14, 17]
-        target.prepare(permittivity, conductivity_s_m)
-        for pair in zip(permittivity, conductivity_s_m, strict=True):
-            other.at(*pair)
-        assert target.known == other.known
-        assert told == [7, 14, 17]
-
     def test_vanishing_paths_give_a_floor(self) -> None:
         gains_db = fake_target(4.0, 0.3).gains_db(np.array([1.0]), np.array([0.0]))
         np.testing.assert_array_equal(gains_db, material_fit.LOWEST_GAIN_DB)
