@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from predictor_links import QUIET
-from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
