@@ -9,7 +9,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from predictor_links import QUIET
-from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
@@ -17,6 +16,7 @@ from sionna_partial.differentiable import scene as differentiable_links
 from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS
 from sionna_partial.tracing.probe import TX_M, small_room
 
 pytestmark = QUIET
@@ -238,13 +238,13 @@ class TestSlopes:
 class TestSecondUse:
     def test_nothing_is_traced_again(self, tf, monkeypatch):
         scene = scene_of("partial")
-        written, calls = scene.paths.written, []
+        blocks, calls = scene.paths.blocks, []
 
         def counted(*arguments):
             calls.append(1)
-            return written.paths(*arguments)
+            return blocks(*arguments)
 
-        monkeypatch.setattr(scene.paths, "written", replace(written, paths=counted))
+        monkeypatch.setattr(scene.paths, "blocks", counted)
         links = scene.links(TX_M, RX_M)
         assert len(calls) == 1
         variable = tf.Variable(TX_M)
