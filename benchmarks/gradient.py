@@ -28,7 +28,7 @@ import sionna_partial as sp
 from sionna_partial.differentiable.scene import DifferentiableLinks, DifferentiableScene
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.prediction.windows import CELLS_M
-from sionna_partial.tracing.fixed_paths import FixedPaths
+from sionna_partial.tracing.path_set import PathSet
 
 import_keras()
 import tensorflow as tf  # noqa: E402 (after LLVM)
@@ -139,7 +139,7 @@ def moved(links: DifferentiableLinks, name: str, step: float) -> NDArray[np.floa
     return getattr(links.base, field_of(name)) + step * direction
 
 
-def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: float) -> NDArray[np.bool_]:
+def changes(scene: DifferentiableScene, paths: PathSet, name: str, reach: float) -> NDArray[np.bool_]:
     """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within reach."""
     changed = np.zeros(len(paths.rx_m), dtype=bool)
     if name not in "xyz":
@@ -148,10 +148,10 @@ def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: flo
         place = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
         there = scene.paths.paths(place, paths.rx_m)
         kept = paths.at(replace(paths.base, tx_m=place))[0]
-        old = np.bincount(paths.rx_of_path, weights=paths.power, minlength=len(changed))
-        gone = np.bincount(paths.rx_of_path, weights=paths.power * (kept == 0.0), minlength=len(changed))
-        fixed = np.bincount(paths.rx_of_path, weights=kept, minlength=len(changed))
-        new = np.bincount(there.rx_of_path, weights=there.power, minlength=len(changed))
+        old = np.bincount(paths.path_rx, weights=paths.power, minlength=len(changed))
+        gone = np.bincount(paths.path_rx, weights=paths.power * (kept == 0.0), minlength=len(changed))
+        fixed = np.bincount(paths.path_rx, weights=kept, minlength=len(changed))
+        new = np.bincount(there.path_rx, weights=there.power, minlength=len(changed))
         changed |= (gone > CHANGE * old) | (np.abs(new - fixed) > CHANGE * np.maximum(old, new))
     return changed
 

@@ -17,8 +17,7 @@ from sionna_partial.differentiable import scene as differentiable_links
 from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras
-from sionna_partial.tracing.finder import PlanScene
-from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS
 
 pytestmark = QUIET
 
@@ -239,13 +238,13 @@ class TestSlopes:
 class TestSecondUse:
     def test_nothing_is_traced_again(self, tf, monkeypatch):
         scene = scene_of("partial")
-        paths, calls = PlanScene.paths, []
+        blocks, calls = scene.paths.blocks, []
 
         def counted(*arguments):
             calls.append(1)
-            return paths(*arguments)
+            return blocks(*arguments)
 
-        monkeypatch.setattr(PlanScene, "paths", counted)
+        monkeypatch.setattr(scene.paths, "blocks", counted)
         links = scene.links(TX_M, RX_M)
         assert len(calls) == 1
         variable = tf.Variable(TX_M)

@@ -28,7 +28,7 @@ ROOMS = {
         *("candidates", "paths", "engine", "slab"),
         *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "stock", "trace"),
-        *("fixed_paths", "gradients"),
+        *("path_set", "gradients"),
     ),
     "prediction": (
         *("unobserved", "link_context", "features", "certainty", "windows"),
@@ -37,7 +37,7 @@ ROOMS = {
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "link_distribution", "path_power", "scene"),
     "measurements": ("measurements",),
-    "calibration": (*("material_paths", "material_fit", "measured_building", "calibration"),),
+    "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),

@@ -85,13 +85,6 @@ class TestMaterialTarget:
             assert gradient[number] == pytest.approx((losses[0] - losses[1]) / (2 * GRADIENT_STEP), rel=1e-3, abs=1e-3)
         assert (np.linalg.eigvalsh(curvature) > 0.0).all()
 
-    def test_many_together_are_evaluated_as_one_by_one(self) -> None:
-        target = fake_target(4.0, 0.3)
-        values = np.stack([np.linspace(2.0, 6.0, 17), np.full(17, 0.3)], axis=1)[:, :, None]
-        losses = [each.loss for each in target.points(values)]
-        assert len(values) > 2 * FakePaths.at_once
-        np.testing.assert_allclose(losses, [target.at(each).loss for each in values], rtol=1e-12)
-
     def test_vanishing_paths_give_a_floor(self) -> None:
         gains_db = fake_target(4.0, 0.3).gains_db(FakePaths().power(*LOSSLESS))
         np.testing.assert_array_equal(gains_db, material_fit.LOWEST_GAIN_DB)

@@ -20,9 +20,9 @@ from sionna_partial.calibration.material_fit import (
     prior_posterior,
     search,
 )
-from sionna_partial.calibration.material_paths import link_gains_db
 from sionna_partial.calibration.measured_building import (
     MeasuredBuilding,
+    link_gains_db,
     require_places,
     start_materials,
     usable_links,
@@ -212,7 +212,7 @@ def calibrate_materials(
     report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
     paths = building.paths(measured, settings, scene_settings, report)
-    used, left_out = usable_links(paths, measured)
+    used, left_out = usable_links(partial, paths, measured)
     target = MaterialTarget(paths.of_links(used), measured.gain_db[used])
     begin = tuple(building.start.values())
     fit = _fit(target, begin, settings.frequency_hz, report)

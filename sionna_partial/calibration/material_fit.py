@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from sionna_partial.calibration.material_paths import MaterialPaths, link_gains_db
+from sionna_partial.calibration.measured_building import LinkPaths, link_gains_db
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.tracing.slab import reflection_loss_db
 
@@ -63,7 +63,7 @@ SPLIT_FRACTION, MOST_CELLS = 0.004, 600
 MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
 """Number of fringes whose minima are searched, of steps to each, and of fringes that are followed to the end."""
 
-CELLS_AT_ONCE = 64
+CELLS_A_REPORT = 64
 """Number of cells after which progress is reported."""
 
 Report = Callable[[float, str], None]
@@ -202,30 +202,19 @@ class Posterior:
 class MaterialTarget:
     """How well materials explain measured gains (N,) [dB] of links that all have a path."""
 
-    def __init__(self, paths: MaterialPaths, gain_db: NDArray[np.float64]) -> None:
+    def __init__(self, paths: LinkPaths, gain_db: NDArray[np.float64]) -> None:
         self.paths, self.gain_db = paths, gain_db
         self.is_direct = np.zeros(len(gain_db), dtype=bool)
         self.is_direct[paths.link[paths.is_direct]] = True
 
     def at(self, values: NDArray[np.float64]) -> Point:
         """Evaluate materials (2, M)."""
-        return self._point(values, self.paths.power(*values))
-
-    def points(self, values: NDArray[np.float64]) -> list[Point]:
-        """Evaluate many materials (K, 2, M) together, which is quicker than one by one with `at`."""
-        found: list[Point] = []
-        for start in range(0, len(values), self.paths.at_once):
-            some = values[start : start + self.paths.at_once]
-            found += map(self._point, some, self.paths.powers(some[:, 0], some[:, 1]))
-        return found
+        errors, loss = fit_errors(self.gain_db - self.gains_db(self.paths.power(*values)), self.is_direct)
+        return Point(values, loss + prior_loss(values), errors)
 
     def gains_db(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
         """Gains (N,) [dB] from the power of the paths (P,)."""
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)
-
-    def _point(self, values: NDArray[np.float64], power: NDArray[np.float64]) -> Point:
-        errors, loss = fit_errors(self.gain_db - self.gains_db(power), self.is_direct)
-        return Point(values, loss + prior_loss(values), errors)
 
     def slopes(self, point: Point) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms, by Sionna RT and Dr.Jit."""
@@ -304,10 +293,10 @@ class _Plane:
         """Return the cells, and report progress from `begin` to `end`."""
         values = np.repeat(self._start.values[None], cells.shape[1], axis=0)
         values[:, 0, self._which], values[:, 1, self._which] = cells[0] ** 2, np.exp(cells[1])
-        for first in range(0, len(values), CELLS_AT_ONCE):
-            rows = slice(first, first + CELLS_AT_ONCE)
-            self._points |= zip(map(tuple, cells[:2, rows].T), self._target.points(values[rows]), strict=True)
-            part = min(1.0, (first + CELLS_AT_ONCE) / len(values))
+        for first in range(0, len(values), CELLS_A_REPORT):
+            rows = slice(first, first + CELLS_A_REPORT)
+            self._points |= zip(map(tuple, cells[:2, rows].T), map(self._target.at, values[rows]), strict=True)
+            part = min(1.0, (first + CELLS_A_REPORT) / len(values))
             self._report(begin + (end - begin) * part, "searching for the material")
         return cells
 

@@ -1,6 +1,6 @@
 """The predicted distribution as one differentiable function of transmitter, materials, frequency and network weights.
 
-Sionna RT and Dr.Jit give the paths and their derivatives (`tracing.fixed_paths`), a `tf.custom_gradient` hands both to
+Sionna RT and Dr.Jit give the paths and their derivatives (`tracing.path_set`), a `tf.custom_gradient` hands both to
 TensorFlow, and everything from there on, features and networks, is TensorFlow. At the place where links were traced the
 distribution is that of `Predictor.predict`.
 
@@ -62,7 +62,7 @@ from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, require
-from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
+from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
 from sionna_partial.tracing.trace import Progress
 
 WINDOW_STEP_M = CELLS_M[0] / 2
@@ -141,7 +141,7 @@ class DifferentiableScene:
         PositionError
             As `trace_links`, or for several transmitters.
         """
-        return DifferentiableLinks(self, self.paths.paths(tx, rx, progress=progress))
+        return DifferentiableLinks(self, self.paths.paths(one_transmitter(tx), rx, progress=progress))
 
     @cached_property
     def smooth_unknown(self) -> SmoothLengths:
@@ -160,7 +160,7 @@ class DifferentiableLinks:
     Parameters
     ----------
     scene : DifferentiableScene
-    paths : FixedPaths
+    paths : PathSet
 
     Attributes
     ----------
@@ -184,7 +184,7 @@ class DifferentiableLinks:
     [4.343, 0.0, 0.0]
     """
 
-    def __init__(self, scene: DifferentiableScene, paths: FixedPaths) -> None:
+    def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
         self._phi = link_features(scene.partial, paths.links())
 
@@ -225,7 +225,7 @@ class DifferentiableLinks:
         pairs = zip(PARAMETERS, values, strict=True)
         given = {name: self._tensor(name, value) for name, value in pairs if value is not None}
         power, vertices_m = moved_paths(self._paths, given)
-        gain_db = _gain_db(self._sum(power, self._paths.rx_of_path))
+        gain_db = _gain_db(self._sum(power, self._paths.path_rx))
         if self._scene.partial.is_complete:
             states = tf.cast([self._phi.link_state == state for state in LinkState], tf.float64)
             return LinkDistribution.of_parts(states, tf.stack([gain_db] * len(LinkState)), tf.zeros_like(states))
@@ -345,7 +345,7 @@ class _Legs:
     Parameters
     ----------
     partial : PartialMap
-    paths : FixedPaths
+    paths : PathSet
 
     Attributes
     ----------
@@ -359,9 +359,9 @@ class _Legs:
         The strongest of them to each receiver; -1 where there is none.
     """
 
-    def __init__(self, partial: PartialMap, paths: FixedPaths) -> None:
+    def __init__(self, partial: PartialMap, paths: PathSet) -> None:
         self.paths = np.flatnonzero(~paths.is_direct)
-        self.rx = paths.rx_of_path[self.paths]
+        self.rx = paths.path_rx[self.paths]
         self._rx_m = paths.rx_m
         vertices_m = paths.vertices_m[self.paths]
         self._of_path, self._start, self._end = _leg_nodes(paths.interactions[self.paths] > 0, self.rx, len(paths.rx_m))

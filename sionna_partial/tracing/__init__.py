@@ -2,5 +2,6 @@
 
 - `finder` writes the scene of a map and finds its paths: exact candidates of floor plans (`plan`), or those that rays
   find in meshes (`mesh`), which `engine` verifies on Sionna RT's internals. `stock` does without these.
-- `trace` is the door for links; `fixed_paths` evaluates paths for other parameters, `gradients` differentiates gains.
+- `trace` is the door for links; `path_set` is the forward model: power and vertices of paths found once, for
+  other parameters, and their derivatives; `gradients` asks it.
 """

@@ -61,30 +61,3 @@ class Candidates:
         """Pick some of the candidates."""
         wedge = None if self.wedges is None or self.wedge is None else self.wedge[index]
         return replace(self, rx=self.rx[index], face=self.face[index], vertices_m=self.vertices_m[index], wedge=wedge)
-
-
-def in_copies_of_scene(candidates: Candidates, vertices_m: NDArray[np.floating], faces: int, count: int) -> Candidates:
-    """Repeat candidates, with points of interaction (C, D, 3) [m], for each of `count` copies of a scene of `faces`."""
-    shift = faces * np.repeat(np.arange(count, dtype=np.int32), len(candidates.rx))
-    face = np.tile(candidates.face, (count, 1))
-    new = replace(
-        candidates,
-        rx=np.tile(candidates.rx, count),
-        face=np.where(face >= 0, face + shift[:, None], face),
-        vertices_m=np.tile(vertices_m, (count, 1, 1)),
-    )
-    wedges, wedge = candidates.wedges, candidates.wedge
-    if wedges is None or wedge is None:
-        return new
-    edges = len(wedges.edge_m)
-    faces_of = wedges.face.reshape(2, 1, edges, 2) + faces * np.arange(count, dtype=np.int32)[:, None, None]
-    normals = np.broadcast_to(wedges.normal.reshape(2, 1, edges, 2, 2), (2, count, edges, 2, 2))
-    copies = replace(
-        wedges,
-        edge_m=np.tile(wedges.edge_m, (count, 1)),
-        face=faces_of.reshape(-1, 2),
-        normal=normals.reshape(-1, 2, 2),
-    )
-    copy = np.repeat(np.arange(count, dtype=np.int32), len(wedge))
-    side, edge = np.divmod(np.tile(wedge, count), np.int32(edges))
-    return replace(new, wedges=copies, wedge=(side * count + copy) * np.int32(edges) + edge)

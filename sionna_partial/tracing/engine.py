@@ -8,9 +8,11 @@ Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: t
 """
 
 import functools
+import gc
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -23,7 +25,7 @@ from numpy.typing import NDArray
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges, in_copies_of_scene
+from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
@@ -184,24 +186,20 @@ def _to_device(kind: Any, values: NDArray[Any]) -> Any:
 
 @dataclass(frozen=True)
 class Variables:
-    """What the power of paths depends on: variables of Dr.Jit with one entry each.
-
-    With gradients enabled, the derivatives of what `SceneSolver.moved_paths` gives lead back to them. Materials have
-    values, not additions, which would drown in the conductivity of a metal.
+    """What the power of paths depends on, as `mitsuba.Float`, to which derivatives lead back.
 
     Parameters
     ----------
-    x_m, y_m, z_m : mitsuba.Float
-        Added to the transmitter's position [m].
-    relative_permittivity, conductivity_s_m, thickness_m : tuples of mitsuba.Float
+    shift_m : tuple of 3
+        Added to the x, y, z of the transmitters, each with 1 or T entries [m].
+    relative_permittivity, conductivity_s_m, thickness_m : tuples
         Of each of `SceneSolver.materials`; [S/m] and [m]. What an ITU material gains with the frequency comes on top.
-    frequency_hz : mitsuba.Float
+        They are values, not additions, which would drown in the conductivity of a metal.
+    frequency_hz
         Added to the carrier frequency [Hz].
     """
 
-    x_m: Any
-    y_m: Any
-    z_m: Any
+    shift_m: tuple[Any, ...]
     relative_permittivity: tuple[Any, ...]
     conductivity_s_m: tuple[Any, ...]
     thickness_m: tuple[Any, ...]
@@ -209,25 +207,15 @@ class Variables:
 
 
 @dataclass(frozen=True)
-class VerifiedPaths:
-    """Candidates that the image method has verified, from any of T transmitters to any of N receivers.
+class HeldPaths:
+    """Paths that stay where they are: functions that give their power (C,).
 
-    Parameters
-    ----------
-    buffer : sionna.rt PathsBuffer
-    valid : mitsuba.Bool
-        Which of them are paths.
-    source, targets : mitsuba.Point3f
-        The transmitters and the receivers [m].
-    diffraction : bool
-        Whether they diffract.
+    `evaluate` runs one of the chains. `repeat` has no derivatives, and replays the kernels that Dr.Jit has recorded:
+    the tracing in Python takes most of the time.
     """
 
-    buffer: Any
-    valid: Any
-    source: Any
-    targets: Any
-    diffraction: bool
+    evaluate: Callable[[_Verification], Any]
+    repeat: Callable[[], Any]
 
 
 class SceneSolver:
@@ -277,137 +265,87 @@ class SceneSolver:
         buffer = self._solve(self._symbolic, candidates, _points(tx_m[None]), _points(rx_m))
         return _read_buffer(buffer, tx_m, rx_m)
 
-    def moved_paths(
+    def moved(
         self,
         candidates: Candidates,
+        tx_index: NDArray[np.int32],
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
         variables: Variables,
         *,
-        differentiable: bool = True,
+        differentiable: bool,
     ) -> tuple[Any, Any]:
-        """Power and vertices of candidates as functions of the transmitter's position and of the scene.
+        """Verify candidates from T transmitters to N receivers, in scene coordinates, for other variables.
 
-        Candidates are verified again, so that those that they make invalid have no power.
-
-        Parameters
-        ----------
-        candidates : Candidates
-            At least one.
-        tx_m, rx_m : (3,) and (N, 3) arrays
-            Transmitter and receivers, in scene coordinates [m].
-        variables : Variables
-        differentiable : bool
-            Whether derivatives are wanted, which takes the slower, evaluated loops.
-
-        Returns
-        -------
-        power : mitsuba.Float
-            Squared magnitude (C,) of each candidate's coefficient.
-        vertices_m : mitsuba.Point3f
-            Points of interaction (C D,), candidate by candidate [m].
+        Returns their power (C,), 0 where there is no path, and vertices (C D,) [m]. Derivatives need slower loops.
         """
         import drjit as dr
         import mitsuba as mi
 
-        source = _points(tx_m[None]) + mi.Point3f(variables.x_m, variables.y_m, variables.z_m)
-        chain = self._evaluated if differentiable else self._symbolic
+        ends = _points(tx_m) + mi.Point3f(*variables.shift_m), _points(rx_m)
+        verification = self._evaluated if differentiable else self._symbolic
         # Dr.Jit cannot pass forward through a symbolic call of a material twice
         with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
-            buffer = self._solve(chain, candidates, source, _points(rx_m))
-            a = buffer.a[0][0]
-            power = dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
-            places = (buffer.vertices_x.array, buffer.vertices_y.array, buffer.vertices_z.array)
-            return power, mi.Point3f(*places)
+            buffer = self._verified(verification, candidates, tx_index, ends)
+            power = self._power(verification, buffer, ends, candidates.wedges is not None)
+            return power, mi.Point3f(buffer.vertices_x.array, buffer.vertices_y.array, buffer.vertices_z.array)
 
-    def verified(
+    def held(
         self,
         candidates: Candidates,
-        tx_index: NDArray[np.integer],
+        tx_index: NDArray[np.int32],
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
-    ) -> VerifiedPaths:
-        """Verify candidates from several transmitters once, for `power`.
-
-        Parameters
-        ----------
-        candidates : Candidates
-            At least one.
-        tx_index : (C,) integer array
-            Transmitter of each.
-        tx_m, rx_m : (T, 3) and (N, 3) arrays
-            Transmitters and receivers, in scene coordinates [m].
-
-        Returns
-        -------
-        VerifiedPaths
-        """
+    ) -> HeldPaths:
+        """Verify candidates once, for `power`."""
         import drjit as dr
+
+        ends, diffraction = (_points(tx_m), _points(rx_m)), candidates.wedges is not None
+        buffer = self._verified(self._symbolic, candidates, tx_index, ends)
+        buffer.schedule()
+        dr.eval(buffer.valid)
+
+        def evaluate(verification: _Verification) -> Any:
+            again = copy(buffer)
+            again.valid = dr.copy(buffer.valid)
+            return self._power(verification, again, ends, diffraction)
+
+        def state() -> Any:
+            return self.mi_scene, [*self._scene.radio_materials.values()], self._scene.frequency, vars(buffer), ends
+
+        return HeldPaths(evaluate, dr.freeze(lambda: evaluate(self._symbolic), state_fn=state))
+
+    def power(self, paths: HeldPaths, variables: Variables, *, differentiable: bool) -> Any:
+        """Power (C,) of paths that stay where they are for other materials and another frequency."""
+        import drjit as dr
+
+        with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+            if differentiable or not self._scene.radio_materials:  # without any, Dr.Jit has nothing to record
+                return paths.evaluate(self._evaluated if differentiable else self._symbolic)
+            collects = gc.isenabled()
+            gc.disable()  # Dr.Jit aborts where a scene is collected while it records
+            try:
+                return paths.repeat()
+            finally:
+                if collects:
+                    gc.enable()
+
+    def _verified(
+        self, verification: _Verification, candidates: Candidates, tx_index: NDArray[np.int32], ends: tuple[Any, Any]
+    ) -> Any:
         import mitsuba as mi
 
-        diffraction, (source, targets) = candidates.wedges is not None, (_points(tx_m), _points(rx_m))
         buffer = self._buffer(candidates)
         buffer._src_indices = _to_device(mi.UInt, tx_index.astype(np.uint32))
-        buffer = self._symbolic.verify(self._scene, buffer, source, targets, diffraction)
-        buffer.schedule()
-        return VerifiedPaths(buffer, dr.copy(buffer.valid), source, targets, diffraction)
+        return verification.verify(self._scene, buffer, *ends, candidates.wedges is not None)
 
-    def in_copies(
-        self, candidates: Candidates, tx_index: NDArray[np.integer], paths: VerifiedPaths, count: int
-    ) -> VerifiedPaths:
-        """Lay candidates, verified in another scene, into each of the copies of that scene that this one holds.
-
-        Parameters
-        ----------
-        candidates : Candidates
-        tx_index : (C,) integer array
-            Transmitter of each.
-        paths : VerifiedPaths
-            What the other solver's `verified` gave for them.
-        count : int
-            Number of copies, whose faces follow one another.
-
-        Returns
-        -------
-        VerifiedPaths
-            Those of the first copy, then those of the second, and so on.
-        """
-        import drjit as dr
-        import mitsuba as mi
-
-        faces = (len(self._shape_of_face) - 1) // count
-        places = [getattr(paths.buffer, f"vertices_{axis}").numpy() for axis in "xyz"]
-        buffer = self._buffer(in_copies_of_scene(candidates, np.stack(places, axis=2), faces, count))
-        buffer._src_indices = _to_device(mi.UInt, np.tile(tx_index, count).astype(np.uint32))
-        buffer.schedule()
-        valid = mi.Bool(np.tile(paths.valid.numpy(), count))
-        dr.eval(valid)
-        return VerifiedPaths(buffer, valid, paths.source, paths.targets, paths.diffraction)
-
-    def power(self, paths: VerifiedPaths, variables: Variables, *, differentiable: bool = True) -> Any:
-        """Power of verified candidates as a function of the materials and of the frequency, not of places.
-
-        Parameters
-        ----------
-        paths : VerifiedPaths
-        variables : Variables
-            Those of the transmitter's position do not count.
-        differentiable : bool
-            Whether derivatives are wanted, which takes the slower, evaluated loops.
-
-        Returns
-        -------
-        mitsuba.Float
-            Squared magnitude (C,) of each candidate's coefficient.
-        """
+    def _power(self, verification: _Verification, buffer: Any, ends: tuple[Any, Any], diffraction: bool) -> Any:
+        """Squared magnitude of the coefficients of verified paths."""
         import drjit as dr
 
-        chain, samples = self._evaluated if differentiable else self._symbolic, self._settings.samples_per_tx
-        paths.buffer.valid = dr.copy(paths.valid)
-        with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
-            done = chain.evaluate(self._scene, paths.buffer, paths.source, paths.targets, samples, paths.diffraction)
-            a = done.a[0][0]
-            return dr.select(done.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
+        buffer = verification.evaluate(self._scene, buffer, *ends, self._settings.samples_per_tx, diffraction)
+        a = buffer.a[0][0]
+        return dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
 
     @contextmanager
     def _changed(self, variables: Variables) -> Iterator[None]:
