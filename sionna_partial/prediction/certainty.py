@@ -23,7 +23,7 @@ from scipy import ndimage
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.unobserved import GRAZE, in_cells, map_line_shares
+from sionna_partial.prediction.unobserved import GRAZE, in_cells, map_line_fractions
 
 _ASIDE_CELLS = 1.5
 """How far to both sides a line has to run into known walls to cross one: the uncertainty of a map [cells]."""
@@ -61,7 +61,7 @@ def _beside_walls(partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[
     lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
     aside = _ASIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
     left, right = (
-        map_line_shares(partial, starts + step, ends + step)[:, CellState.WALL] > GRAZE for step in (aside, -aside)
+        map_line_fractions(partial, starts + step, ends + step)[:, CellState.WALL] > GRAZE for step in (aside, -aside)
     )
     return left & right
 

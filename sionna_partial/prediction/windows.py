@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.link_context import LinkContext
-from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_shares
+from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
 """Number of cells along each side of a window, and their edge in each of a transmitter's windows, near to far [m]."""
@@ -102,7 +102,7 @@ def _window(partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float, *, be
     free, wall = _plan(state, edges)
     centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
     starts = np.tile(start, (len(centres), 1))
-    lines = line_shares(state, starts, centres).reshape(*free.shape, -1)
+    lines = line_fractions(state, starts, centres).reshape(*free.shape, -1)
     hidden = lines[..., CellState.WALL] > GRAZE
     return _in_255ths([free, wall, 1.0 - lines[..., CellState.UNKNOWN], hidden, _detours(wall)])
 
