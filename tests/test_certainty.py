@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from sionna_partial.prediction.certainty import possible_states
 from test_context_networks import features
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.certainty import possible_states
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings
 

@@ -10,6 +10,7 @@ import pytest
 from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, make_seen_links
 from scipy.integrate import trapezoid
 from scipy.stats import norm
+from sionna_partial.prediction.map_fitting import fit_context_networks
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
@@ -17,7 +18,6 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_fitting as module
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import REACHES_M, LinkContext
-from sionna_partial.prediction.map_fitting import fit_context_networks
 from sionna_partial.prediction.map_networks import (
     LINK_INPUTS,
     LINK_NETWORK,

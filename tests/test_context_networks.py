@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from predictor_links import FREQUENCY_HZ, LOS, NLOS, OUTAGE, QUIET, make_seen_links
+from sionna_partial.prediction.certainty import possible_states
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
-from sionna_partial.prediction.certainty import possible_states
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import REACHES_M, LinkContext
 from sionna_partial.prediction.map_networks import (

@@ -160,7 +160,9 @@ class TestHomeScores:
         other = dataclasses.replace(
             right,
             home=np.full(len(links), "home 10"),
-            phi=dataclasses.replace(right.phi, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db),
+            features=dataclasses.replace(
+                right.features, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db
+            ),
             link_state=np.where(third, OUTAGE, LOS).astype(np.uint8),
             gain_db=gain_db + 3.0,
         )

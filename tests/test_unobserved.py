@@ -109,7 +109,9 @@ def test_no_segments(measure):
 def test_many_segments_are_measured_as_few():
     """By several threads."""
     starts, ends = np.random.default_rng(2).uniform(-1.0, 11.0, (2, 50_000, 2))
-    blocks = [line_fractions(HALF.state, *ends_of) for ends_of in zip(np.split(starts, 10), np.split(ends, 10), strict=True)]
+    blocks = [
+        line_fractions(HALF.state, *ends_of) for ends_of in zip(np.split(starts, 10), np.split(ends, 10), strict=True)
+    ]
     np.testing.assert_array_equal(line_fractions(HALF.state, starts, ends), np.concatenate(blocks))
 
 

@@ -41,7 +41,10 @@ class PlacementViews:
         new = {place.tobytes(): place for place in places_m if place.tobytes() not in self._values}
         if new:
             self._paths = {key: self._trace(place) for key, place in new.items()}
-            features = [link_features(self._scene.partial, paths.links()) for paths in self._paths.values()]
+            scene = self._scene
+            windows = scene.predictor.reads_maps and not scene.partial.is_complete
+            traced = (paths.links() for paths in self._paths.values())
+            features = [link_features(scene.partial, links, windows=windows) for links in traced]
             prediction = self._predict(LinkFeatures.concatenate(features))
             parts = np.split(self._objective.values(prediction), np.cumsum([len(each) for each in features])[:-1])
             for (key, place), part in zip(new.items(), parts, strict=True):

@@ -212,6 +212,6 @@ def _unpack(path: Path, archive: bytes) -> "keras.Model":
             )
         except Exception as error:
             raise PredictorError(f"path = '{path}' cannot be loaded by Keras ({error}): train it anew.") from error
-    if not any(inputs == _INPUTS | more.inputs and outputs == _OUTPUTS | more.outputs for more in CONTEXT_SHAPES):
+    if not any(inputs == _INPUTS | more[0] and outputs == _OUTPUTS | more[1] for more in CONTEXT_SHAPES):
         raise PredictorError(f"path = '{path}' has inputs {sorted(inputs)} and outputs {outputs}: train it anew.")
     return model
