@@ -51,7 +51,7 @@ def corridors():
 
 
 def corridor_of(phi):
-    """Return the corridor of each link; the transmitter is seen up to 10 m, the receiver where less than 2 m are not."""
+    """Return the corridor of each link; transmitters are seen up to 10 m, receivers where less than 2 m are unknown."""
     return 2 * (phi.distance_m < 10.0) + (phi.unobserved_distance_m < 2.0)
 
 
@@ -81,6 +81,33 @@ def make_seen_links(count, seed=0):
     phi, state, gain_db = make_links(count, seed)
     phi = dataclasses.replace(phi, context=make_context(phi))
     return phi.with_windows(corridors(), corridor_of(phi)), state, gain_db
+
+
+def features(
+    partial, rx_m, *, tx_m=(0.0, 0.0, 1.5), unobserved_m=0.0, state=LOS, gain_db=-70.0, indirect_db=-150.0, windows=True
+):
+    """Return features of links on one map, or several with one for each link, with a context and windows.
+
+    All paths but the direct one have the gains `indirect_db`.
+    """
+    rx_m = np.atleast_2d(np.asarray(rx_m, dtype=np.float64))
+    count = len(rx_m)
+    maps, map_index = partial if isinstance(partial, tuple) else ((partial,), np.zeros(count, dtype=np.int64))
+    tx_m = np.broadcast_to(np.asarray(tx_m, dtype=np.float64), (count, 3))
+    unobserved_m, state = np.full(count, unobserved_m), np.full(count, state, dtype=np.uint8)
+    context = LinkContext.on_maps(
+        maps,
+        map_index,
+        tx_m=tx_m,
+        rx_m=rx_m,
+        link_state=state,
+        unobserved_distance_m=unobserved_m,
+        indirect_gain_db=np.full((count, len(ATTENUATION_LENGTHS_M)), indirect_db),
+        strongest_unobserved_m=unobserved_m,
+    )
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    phi = LinkFeatures(state, unobserved_m, distance_m, np.full(count, gain_db), context)
+    return phi.with_windows(maps, map_index) if windows else phi
 
 
 def p_kept(phi):

@@ -15,6 +15,7 @@ from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, WALL_PARTS, predict
 from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.windows import map_windows
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 
 
@@ -130,7 +131,7 @@ class TestReceiversAnywhere:
         assert coverage.attrs["receivers"] == "indoor"
         assert coverage["p_los"].attrs["long_name"].endswith(", given that the receiver is indoors")
         assert anywhere.attrs["receivers"] == "anywhere"
-        assert anywhere["link_state"].attrs["long_name"].endswith(", of a receiver that may be outside, in outage")
+        assert anywhere["link_state"].attrs["long_name"].endswith(", of a receiver that may be outdoors, in outage")
 
     def test_on_a_complete_map_outside_is_outage_for_certain(self, fakes):
         indoor, anywhere = (
@@ -296,13 +297,13 @@ def test_a_predictor_is_used_as_it_is(fakes):
     assert predict_map(map_of(PICTURE), TX, spacing_m=0.5, predictor=predictor).attrs["predictor"] == "mine"
 
 
-def test_the_predictor_is_told_where_links_run(fakes, monkeypatch):
+def test_the_predictor_gets_context_and_windows(fakes, monkeypatch):
     predictor, seen = FakePredictor(), []
     monkeypatch.setattr(predictor, "predict", lambda phi: seen.append(phi) or FakePredictor().predict(phi))
     partial = map_of(PICTURE)
     coverage = predict_map(partial, TX, spacing_m=0.5, predictor=predictor)
     (phi,) = seen
-    assert phi.context.maps == (partial,)
+    np.testing.assert_array_equal(phi.context.windows, map_windows(partial, np.array([TX])))
     receivers = np.stack(np.meshgrid(coverage["x"], coverage["y"]), axis=-1)[coverage["valid"].to_numpy()]
     np.testing.assert_allclose(phi.context.rx_m, np.column_stack([receivers, np.full(len(receivers), 1.5)]))
     np.testing.assert_allclose(phi.context.tx_m, np.tile([*TX, 1.5], (len(receivers), 1)))
@@ -319,7 +320,7 @@ def test_a_predictor_trained_at_another_frequency_is_warned_about(fakes, caplog)
 def test_a_predictor_trained_with_diffraction_is_warned_about_without(fakes, caplog):
     predict_map(map_of(PICTURE), TX, spacing_m=0.5, trace_settings=TraceSettings(diffraction=False))
     (message,) = caplog.messages
-    assert message.startswith("predictor 'fake' was trained with diffraction, and is used without diffraction: what it")
+    assert message.startswith("predictor 'fake' was trained with diffraction, and is used without diffraction: its")
 
 
 def test_settings_reach_the_tracer_and_the_attributes(fakes):

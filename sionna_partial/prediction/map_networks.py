@@ -277,7 +277,7 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
 
 
 def distribution(outputs: Any, free_db: Any, possible: NDArray[np.bool_]) -> tuple[Any, Any, Any]:
-    """Return probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
+    """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
     `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not `possible` (N, 3) have probability 0.
     """
@@ -335,7 +335,7 @@ def fit_context_networks(
     *,
     progress: Progress | None = None,
 ) -> dict[str, "keras.Model"]:
-    """Fit the networks of `settings` to links with a context and their true states and gains [dB] (N,), by proper scores.
+    """Fit the networks of `settings` to links with a context, and their true states and gains [dB] (N,).
 
     Windows are turned and mirrored at random. The same links and settings give the same weights.
     """

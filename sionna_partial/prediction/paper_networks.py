@@ -121,7 +121,7 @@ def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleTy
 
 
 def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
-    """Build a logistic classifier on clamped inputs, by softmax or, of one class, sigmoid; `bias` are its first logits."""
+    """Build a logistic classifier on clamped inputs: by softmax or, for one event, sigmoid; `bias` (K,) are logits."""
     keras = import_keras()
     count = np.size(bias)
     tensors, scaled = _scaled_inputs(inputs, ranges)
