@@ -22,7 +22,7 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.unobserved import is_enclosed
+from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
 from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
 from sionna_partial.tracing.trace import SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
 
@@ -52,15 +52,14 @@ _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 
 _log = logging.getLogger(__name__)
 
-_LINK_FLAGS = {
-    "flag_values": np.array([*LinkState, NO_RECEIVER], dtype=np.uint8),
-    "flag_meanings": " ".join([*(state.name.lower() for state in LinkState), "no_receiver"]),
-}
-_CELL_FLAGS = {
-    "flag_values": np.array([*CellState], dtype=np.uint8),
-    "flag_meanings": " ".join(state.name.lower() for state in CellState),
-}
-_YES_NO = {"flag_values": np.array([0, 1], dtype=np.int8), "flag_meanings": "no yes"}
+
+def _flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+    return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
+
+
+_LINK_FLAGS = _flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
+_CELL_FLAGS = _flags({state.name.lower(): state for state in CellState})
+_YES_NO = _flags({"no": 0, "yes": 1}, np.int8)
 
 ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     "p_los": {"long_name": "probability of line of sight", "units": "1"},
@@ -94,11 +93,11 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
 class _Receivers:
     """Receivers at the centres of a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
 
-    x_m: NDArray[np.float64]
-    y_m: NDArray[np.float64]
+    x_m: Floats
+    y_m: Floats
     cell_state: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
-    rx_m: NDArray[np.float64]
+    valid: Bools
+    rx_m: Floats
 
 
 def predict_map(
@@ -228,15 +227,15 @@ def require_coverage(coverage: xr.Dataset) -> None:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
 
 
-def clear_of_walls(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
-    clear: NDArray[np.bool_] = partial.state_at(points_m) != CellState.WALL
+    clear: Bools = partial.state_at(points_m) != CellState.WALL
     for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
         clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
     return clear
 
 
-def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
+def _transmitter(partial: PartialMap, tx: ArrayLike) -> Floats:
     with suppress(ValueError):
         if np.shape(tx) == (2,):
             tx = np.append(np.asarray(tx, dtype=np.float64), DEFAULT_HEIGHT_M)
@@ -260,7 +259,7 @@ def _warn_of_other_traces(model: Predictor, settings: TraceSettings) -> None:
 
 
 def _receivers(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_height_m: float, spacing_m: float, frequency_hz: float
+    partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
 ) -> _Receivers:
     """Return the receivers, those that are too near the transmitter or a wall masked."""
     low_m, high_m = partial.height_range_m
@@ -285,7 +284,7 @@ def _receivers(
     return _Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
-def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
     """Return the x (nx,) and y (ny,) of all cell centres that lie on the map [m]."""
     low = partial.resolution_m / 10
     require_number("spacing_m", spacing_m, low, 1e6)
@@ -363,7 +362,7 @@ def _wall_parts(partial: PartialMap, receivers: _Receivers, spacing_m: float) ->
 
 
 def _part_spans(
-    centre_m: NDArray[np.float64], origin_m: float, resolution_m: float, count: int, spacing_m: float
+    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
 ) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """Return the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
     edge = (centre_m - origin_m - spacing_m / 2) / resolution_m

@@ -84,7 +84,16 @@ def make_seen_links(count, seed=0):
 
 
 def features(
-    partial, rx_m, *, tx_m=(0.0, 0.0, 1.5), unobserved_m=0.0, state=LOS, gain_db=-70.0, indirect_db=-150.0, windows=True
+    partial,
+    rx_m,
+    *,
+    tx_m=(0.0, 0.0, 1.5),
+    unobserved_m=0.0,
+    state=LOS,
+    gain_db=-70.0,
+    indirect_db=-150.0,
+    distance_m=None,
+    windows=True,
 ):
     """Return features of links on one map, or several with one for each link, with a context and windows.
 
@@ -105,7 +114,7 @@ def features(
         indirect_gain_db=np.full((count, len(ATTENUATION_LENGTHS_M)), indirect_db),
         strongest_unobserved_m=unobserved_m,
     )
-    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1) if distance_m is None else np.full(count, distance_m)
     phi = LinkFeatures(state, unobserved_m, distance_m, np.full(count, gain_db), context)
     return phi.with_windows(maps, map_index) if windows else phi
 

@@ -102,11 +102,6 @@ def test_the_answers_of_tracer_and_predictor_are_laid_out_row_by_row(coverage):
     assert int(far["link_state"]) == LinkState.OUTAGE
 
 
-def test_probabilities_sum_to_one(coverage):
-    total = (coverage["p_los"] + coverage["p_nlos"] + coverage["p_outage"]).to_numpy()
-    np.testing.assert_allclose(total[coverage["valid"].to_numpy()], 1.0, atol=1e-6)
-
-
 def test_what_is_seen_to_be_free_is_indoors_for_certain(coverage):
     free = (coverage["cell_state"] == CellState.FREE).to_numpy()
     unknown = (coverage["cell_state"] == CellState.UNKNOWN).to_numpy()
@@ -270,10 +265,6 @@ def test_moving_the_map_moves_the_answer(fakes):
         np.testing.assert_allclose(near[name], far[name], atol=1e-4, err_msg=name)
 
 
-def test_the_transmitter_is_at_1_5_m_where_no_height_is_given(coverage):
-    np.testing.assert_array_equal(coverage.attrs["transmitter_m"], (0.6, 3.6, 1.5))
-
-
 def test_a_path_is_read(fakes, tmp_path):
     save_map(map_of(PICTURE), tmp_path / "map.yaml")
     xr.testing.assert_identical(
@@ -402,10 +393,6 @@ def test_bad_input_is_refused_before_any_heavy_work(no_work, arguments, error, m
     arguments = {"scene": map_of(PICTURE), "tx": TX} | arguments
     with pytest.raises(error, match=message):
         predict_map(arguments.pop("scene"), arguments.pop("tx"), **arguments)
-
-
-def test_the_spacing_that_the_error_proposes_is_accepted():
-    coverage_module._grid_axes(unknown_map(400, 600), 0.19)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import re
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from predictor_links import features
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
-from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
@@ -296,32 +294,6 @@ class TestSeen:
 
     def test_a_complete_map_with_both_ends_in_the_unknown(self):
         assert not context_of(1, partial=WHOLE, tx=(-1.0, -1.0, 1.5), rx=(11.0, 6.0, 1.5)).complete.any()
-
-
-class TestRefused:
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"tx_m": np.zeros(3)}, "tx_m has shape (3,): give (3, 3), a row for each link."),
-            ({"rx_m": np.zeros((2, 3))}, "rx_m has shape (2, 3): give (3, 3), a row for each link."),
-            ({"indirect_gain_db": np.zeros((3, 2))}, "indirect_gain_db has shape (3, 2): give (3, 5), a row for each"),
-            ({"strongest_unobserved_m": np.zeros(4)}, "strongest_unobserved_m has shape (4,): give (3,), a row for"),
-            ({"map_index": np.array([0, 1, 0])}, "map_index[1] = 1 is not allowed: give indices of maps, which has 1,"),
-            ({"map_index": np.array([0, 0, -1])}, "map_index[2] = -1 is not allowed: give indices of maps"),
-            ({"maps": ()}, "map_index[0] = 0 is not allowed: give indices of maps, which has 0"),
-        ],
-    )
-    def test_bad_arrays(self, change, message):
-        arrays = {
-            "maps": (HALF,),
-            "map_index": np.zeros(3, dtype=np.int64),
-            **dict.fromkeys(("tx_m", "rx_m"), np.zeros((3, 3))),
-            "link_state": np.zeros(3, dtype=np.uint8),
-            **dict.fromkeys(("unobserved_distance_m", "strongest_unobserved_m"), np.zeros(3)),
-            "indirect_gain_db": np.zeros((3, len(ATTENUATION_LENGTHS_M))),
-        }
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            LinkContext.on_maps(**arrays | change)
 
 
 OUTAGE, LOS, NLOS = LinkState.OUTAGE, LinkState.LOS, LinkState.NLOS

@@ -72,11 +72,6 @@ def test_stock_keras_loads_networks_that_see_where_links_run(tmp_path):
     np.testing.assert_array_equal(mine.predict(phi).p_los, context_predictor("map").predict(phi).p_los)
 
 
-def test_same_bytes_however_many_were_made_before(quick):
-    again = Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
-    assert again.archive == quick.archive
-
-
 class TestSameBytes:
     """Of a training by seed, however many were before it, and in a process of its own."""
 
@@ -93,9 +88,6 @@ class TestSameBytes:
         )
         assert result.returncode == 0, result.stderr
         assert result.stdout.split() == [context_predictor(name).fingerprint for name in ("map", "paths")]
-
-    def test_other_seeds_give_others(self):
-        assert fit_context_predictor("paths", seed=1).archive != context_predictor("paths").archive
 
 
 @pytest.mark.parametrize("networks", ["paths", "map"])
@@ -287,12 +279,6 @@ def test_bad_card(saved, change, message):
 def test_card_that_is_no_json(saved, text):
     saved.with_suffix(".json").write_bytes(text.encode("latin-1"))
     with pytest.raises(PredictorError, match=r"mine\.json' is not JSON"):
-        Predictor.load(saved)
-
-
-def test_card_that_is_no_object(saved):
-    saved.with_suffix(".json").write_text("[]")
-    with pytest.raises(PredictorError, match="format = None, but this version reads"):
         Predictor.load(saved)
 
 

@@ -93,13 +93,6 @@ def test_zero_everywhere_on_a_complete_map():
     assert unobserved_lengths_m(room, np.array([2.5, 2.5, 1.0]), ends).tolist() == [0.0, 0.0, 0.0]
 
 
-def test_everything_on_an_unknown_map():
-    nothing = PartialMap(np.full((4, 6), CellState.UNKNOWN), 0.5)
-    starts, ends = np.random.default_rng(0).uniform(0.1, 1.9, (2, 50, 3))
-    lengths_m = np.linalg.norm(ends - starts, axis=1)
-    np.testing.assert_allclose(unobserved_lengths_m(nothing, starts, ends), lengths_m, rtol=1e-12)
-
-
 @pytest.mark.parametrize("measure", [unobserved_lengths_m, walled_lengths_m])
 def test_no_segments(measure):
     assert measure(HALF, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
@@ -204,31 +197,6 @@ def test_exact(state, start, end):
     assert shares(state, (start, end))[0] == pytest.approx(exact_share(state, start, end), abs=1e-9)
 
 
-@settings(max_examples=200)
-@given(grids, cells, cells)
-def test_adds_up_over_two_halves(state, start, end):
-    start, end = ([2 * (number // 2) for number in place] for place in (start, end))
-    middle = [(here + there) // 2 for here, there in zip(start, end, strict=True)]
-    whole, first, second = shares(state, (start, end), (start, middle), (middle, end))
-    assert whole == pytest.approx((first + second) / 2, abs=1e-9)
-
-
-@settings(max_examples=200)
-@given(grids, cells, cells)
-def test_same_both_ways_to_rounding(state, start, end):
-    there, back = shares(state, (start, end), (end, start))
-    assert there == pytest.approx(back, abs=1e-9)
-
-
-@given(grids, cells, cells)
-def test_turned_and_mirrored_maps(state, start, end):
-    (x0, y0), (x1, y1) = start, end
-    width = 1_000 * state.shape[1]
-    found = shares(state, (start, end))[0]
-    assert shares(state.T.copy(), ((y0, x0), (y1, x1)))[0] == pytest.approx(found, abs=1e-9)
-    assert shares(state[:, ::-1].copy(), ((width - x0, y0), (width - x1, y1)))[0] == pytest.approx(found, abs=1e-9)
-
-
 places = st.tuples(st.floats(-0.3, 1.3), st.floats(-0.3, 1.3), st.floats(0.0, 3.0))
 
 
@@ -253,14 +221,6 @@ def test_revealing_cells_never_raises_it(state, start, end, data):
     assume(not before.is_complete)
     start_m, end_m = scaled(before, start), scaled(before, end)
     assert length_m(after, start_m, end_m) <= length_m(before, start_m, end_m) + 1e-9
-
-
-@given(grids, places, places)
-def test_same_both_ways(state, start, end):
-    partial = PartialMap(state, 0.3)
-    start_m, end_m = scaled(partial, start), scaled(partial, end)
-    there_m = length_m(partial, start_m, end_m)
-    assert length_m(partial, end_m, start_m) == pytest.approx(there_m, abs=1e-5)
 
 
 @given(grids, places, places)

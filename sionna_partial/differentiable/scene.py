@@ -20,7 +20,6 @@ What gradients include, and what they do not:
 """
 
 import math
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -39,11 +38,11 @@ from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, attenu
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
-    LinkNumbers,
     binary_features,
     context_of,
     distribution,
     input_columns,
+    numeric_features,
     read_links,
     read_maps,
     reads_maps,
@@ -58,7 +57,7 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.prediction.unobserved import Bools, unobserved_lengths_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, require
 from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
@@ -226,11 +225,12 @@ class DifferentiableLinks:
         if complete.all():
             return LinkDistribution.of_parts(*trace)
         moved_m = given.get("tx_m")
-        numbers = self._moved_numbers(moved_m, gain_db)
+        numeric = self._moved_features(moved_m, gain_db)
         if LINK_NETWORK in self._scene.networks:
-            predicted = self._by_context(moved_m, self._with_indirect(numbers, moved_m, power, vertices_m))
+            numeric |= self._indirect_features(numeric["distance_m"], moved_m, power, vertices_m)
+            predicted = self._by_context(moved_m, numeric)
         else:
-            inputs = {name: tf.cast(getattr(numbers, name), tf.float32)[:, None] for name in FEATURES}
+            inputs = {name: tf.cast(numeric[name], tf.float32)[:, None] for name in FEATURES}
             predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state)
         pairs = zip(trace, predicted, strict=True)
         return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs))
@@ -251,10 +251,6 @@ class DifferentiableLinks:
         return tensor
 
     @cached_property
-    def _numbers(self) -> LinkNumbers:
-        return LinkNumbers.of(self._phi)
-
-    @cached_property
     def _legs(self) -> "_Legs":
         return _Legs(self._scene.partial, self._paths)
 
@@ -264,26 +260,25 @@ class DifferentiableLinks:
 
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
-    def _moved_numbers(self, tx_m: Any, gain_db: Any) -> LinkNumbers:
-        """Return what derives from the transmitter position alone, None being where it was, and the gain (N,)."""
+    def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
+        """Return the gain, and what derives from the transmitter position alone, None being where it was."""
         import tensorflow as tf
 
-        numbers, rx_m = replace(self._numbers, gain_db=gain_db), tf.constant(self._paths.rx_m)
+        numeric, rx_m = numeric_features(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
         if tx_m is None:
-            return numbers
+            return numeric
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
         scene, base = self._scene, (first, self._paths.rx_m)
         distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
-        unobserved_m = moved_lengths_m(scene.smooth_unknown, numbers.unobserved_distance_m, base, ends)
-        return replace(
-            numbers,
-            distance_m=distance_m,
-            unobserved_distance_m=tf.minimum(unobserved_m, distance_m),
-            walled_m=moved_lengths_m(scene.smooth_walls, numbers.walled_m, base, ends),
-        )
+        unobserved_m = moved_lengths_m(scene.smooth_unknown, numeric["unobserved_distance_m"], base, ends)
+        return numeric | {
+            "distance_m": distance_m,
+            "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
+            "walled_m": moved_lengths_m(scene.smooth_walls, numeric["walled_m"], base, ends),
+        }
 
-    def _with_indirect(self, numbers: LinkNumbers, tx_m: Any, power: Any, vertices_m: Any) -> LinkNumbers:
-        """Add what derives from the indirect paths, whose power (P,) and vertices (P, D, 3) are those now."""
+    def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
+        """Return what derives from the indirect paths, whose power (P,) and vertices (P, D, 3) are those now."""
         import tensorflow as tf
 
         legs = self._legs
@@ -294,23 +289,20 @@ class DifferentiableLinks:
         for length_m in ATTENUATION_LENGTHS_M:
             kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else attenuation(legs.unobserved_m, 0.0)
             gains_db.append(_gain_db(self._sum(indirect * kept, legs.rx)))
-        strongest = tf.gather(unobserved_m, np.maximum(legs.strongest, 0)) if len(legs.paths) else numbers.distance_m
-        return replace(
-            numbers,
-            indirect_gain_db=tf.stack(gains_db, axis=1),
-            strongest_unobserved_m=tf.where(legs.strongest >= 0, strongest, numbers.distance_m),
-        )
+        strongest_m = tf.gather(unobserved_m, np.maximum(legs.strongest, 0)) if len(legs.paths) else distance_m
+        strongest_m = tf.where(legs.strongest >= 0, strongest_m, distance_m)
+        return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
 
-    def _by_context(self, tx_m: Any, numbers: LinkNumbers) -> tuple[Any, Any, Any]:
+    def _by_context(self, tx_m: Any, numeric: dict[str, Any]) -> tuple[Any, Any, Any]:
         """Evaluate the networks that read maps and paths: see `distribution`."""
         import tensorflow as tf
 
         ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
-        columns = input_columns(tf.constant(binary_features(self._phi)), numbers, frequency_hz, ops)
+        columns = input_columns(tf.constant(binary_features(self._phi)), numeric, frequency_hz, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
         columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
         outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)
-        free_db = free_space_gain_db(numbers.distance_m, frequency_hz, ops)
+        free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops)
         return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi).possible)
 
     def _maps(self, tx_m: Any) -> list[Any]:
@@ -366,7 +358,7 @@ class _Legs:
 
 
 def _leg_nodes(
-    interacts: NDArray[np.bool_], rx: NDArray[np.int32], receivers: int
+    interacts: Bools, rx: NDArray[np.int32], receivers: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """Path, start and end of each leg of Q paths that interact at some of D vertices (Q, D), to receivers (Q,).
 

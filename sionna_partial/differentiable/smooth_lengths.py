@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.unobserved import Segment, enter_grid, leave_cells, segment_between
+from sionna_partial.prediction.unobserved import Bools, Floats, Segment, enter_grid, leave_cells, segment_between
 
 _BORDER_CELLS = 1e-6
 """Distance within which a segment runs along the border of patches [cells]."""
@@ -38,14 +38,12 @@ class SmoothLengths:
         self._first_centre_m = np.array(partial.origin_m) - 0.5 * partial.resolution_m
         self._resolution_m = partial.resolution_m
 
-    def __call__(self, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def __call__(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return the lengths (N,) [m] of segments between (N, 3) or (3,) ends [m]; NaN where an end is."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         return self._integrals(start_m, end_m)[:, 0] * np.linalg.norm(end_m - start_m, axis=1)
 
-    def slopes(
-        self, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slopes(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
         """Return the derivatives (N, 3) of the lengths with respect to start and end; 0 where the ends coincide."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         integrals, step_m = self._integrals(start_m, end_m), end_m - start_m
@@ -56,7 +54,7 @@ class SmoothLengths:
         end[:, :2] += distance_m / self._resolution_m * integrals[:, 3:5]
         return start, end
 
-    def _integrals(self, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _integrals(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return what `_fill_integrals` fills in, for segments (N, 3) [m]."""
         starts, ends = ((points[:, :2] - self._first_centre_m) / self._resolution_m for points in (start_m, end_m))
         integrals = np.zeros((len(starts), 5))
@@ -64,7 +62,7 @@ class SmoothLengths:
         return integrals
 
 
-def _even_patches(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _even_patches(mask: Bools) -> NDArray[np.int32]:
     """Return how far the next uneven patch is in every direction, corners included; 0 in uneven patches.
 
     A patch is what four cell centres enclose, and even if their cells are alike: the interpolation is constant there.
@@ -78,11 +76,7 @@ def _even_patches(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 @njit(cache=True)
 def _fill_integrals(
-    mask: NDArray[np.int8],
-    even: NDArray[np.int32],
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    integrals: NDArray[np.float64],
+    mask: NDArray[np.int8], even: NDArray[np.int32], starts: Floats, ends: Floats, integrals: Floats
 ) -> None:
     """Integrate the interpolated mask u over the parameter t of segments, from 0 at the start to 1 at the end.
 
@@ -115,7 +109,7 @@ def _aside(start: float, end: float) -> float:
 
 
 @njit(cache=True)
-def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment, sums: NDArray[np.float64]) -> None:
+def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment, sums: Floats) -> None:
     """Add the integrals of u, du/dx, du/dy, t du/dx and t du/dy along a segment to `sums` (5,)."""
     ny, nx = even.shape
     here, leave, line_x, line_y = enter_grid(segment, ny, nx)
@@ -137,13 +131,7 @@ def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment
 
 @njit(cache=True)
 def _add_patch(
-    corners: NDArray[np.int8],
-    row: int,
-    column: int,
-    segment: Segment,
-    here: float,
-    there: float,
-    sums: NDArray[np.float64],
+    corners: NDArray[np.int8], row: int, column: int, segment: Segment, here: float, there: float, sums: Floats
 ) -> None:
     """Add what `_integrate` adds between two fractions of a segment that is in one patch there, by Simpson's rule.
 

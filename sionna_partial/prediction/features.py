@@ -10,7 +10,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.link_context import IndirectPaths, LinkContext
-from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.prediction.unobserved import Bools, Floats, unobserved_lengths_m
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import TracedLinks, link_summary
 
@@ -47,9 +47,9 @@ class LinkFeatures:
     """
 
     link_state: NDArray[np.uint8]
-    unobserved_distance_m: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    gain_db: NDArray[np.float64]
+    unobserved_distance_m: Floats
+    distance_m: Floats
+    gain_db: Floats
     context: LinkContext | None = None
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ class LinkFeatures:
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name != "context")
 
 
-def link_numbers(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
+def link_numbers(name: str, values: ArrayLike, count: int) -> Floats:
     """Return numbers of links as a (count,) array; a PredictorError for another shape, or what is not finite."""
     try:
         numbers = np.asarray(values, dtype=np.float64)
@@ -148,9 +148,7 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
 
 
-def features_of_paths(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], blocks: Iterable[SolvedPaths]
-) -> LinkFeatures:
+def features_of_paths(partial: PartialMap, tx_m: Floats, rx_m: Floats, blocks: Iterable[SolvedPaths]) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
     `blocks` are all paths between them, from `Tracer.paths`; no windows are drawn.
@@ -169,7 +167,7 @@ def features_of_paths(
     return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, indirect.context(link_state, unobserved_m))
 
 
-def require_each(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], remedy: str) -> None:
+def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
     """Raise a PredictorError that names the first value that is not good."""
     if not good.all():
         index = int(np.argmin(good))

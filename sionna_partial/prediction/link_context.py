@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.unobserved import (
     GRAZE,
+    Bools,
+    Floats,
     in_cells,
     is_enclosed,
     map_line_fractions,
@@ -64,15 +65,15 @@ class LinkContext:
         The transmitter, and window, of each link.
     """
 
-    tx_m: NDArray[np.float64]
-    rx_m: NDArray[np.float64]
-    tx_seen: NDArray[np.bool_]
-    rx_seen: NDArray[np.bool_]
-    complete: NDArray[np.bool_]
-    walled_m: NDArray[np.float64]
-    possible: NDArray[np.bool_]
-    indirect_gain_db: NDArray[np.float64]
-    strongest_unobserved_m: NDArray[np.float64]
+    tx_m: Floats
+    rx_m: Floats
+    tx_seen: Bools
+    rx_seen: Bools
+    complete: Bools
+    walled_m: Floats
+    possible: Bools
+    indirect_gain_db: Floats
+    strongest_unobserved_m: Floats
     window_index: NDArray[np.intp]
     windows: NDArray[np.uint8] | None = None
 
@@ -86,32 +87,18 @@ class LinkContext:
         maps: Sequence[PartialMap],
         map_index: NDArray[np.int64],
         *,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
         link_state: NDArray[np.uint8],
-        unobserved_distance_m: NDArray[np.float64],
-        indirect_gain_db: NDArray[np.float64],
-        strongest_unobserved_m: NDArray[np.float64],
+        unobserved_distance_m: Floats,
+        indirect_gain_db: Floats,
+        strongest_unobserved_m: Floats,
     ) -> "LinkContext":
         """Compute what the maps show of links, without windows.
 
         `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`.
         """
         count = len(map_index)
-        shapes = {"tx_m": (tx_m, (3,)), "rx_m": (rx_m, (3,)), "strongest_unobserved_m": (strongest_unobserved_m, ())}
-        shapes["indirect_gain_db"] = (indirect_gain_db, (len(ATTENUATION_LENGTHS_M),))
-        for name, (values, shape) in shapes.items():
-            if np.shape(values) != (count, *shape):
-                raise PredictorError(
-                    f"{name} has shape {np.shape(values)}: give {(count, *shape)}, a row for each link."
-                )
-        there = (map_index >= 0) & (map_index < len(maps))
-        if not there.all():
-            index = int(np.argmin(there))
-            raise PredictorError(
-                f"map_index[{index}] = {map_index[index]} is not allowed: give indices of maps, which has {len(maps)}, "
-                "from 0."
-            )
         tx_seen, rx_seen, complete = (np.zeros(count, dtype=bool) for _ in range(3))
         walled_m, possible = np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
         for number in np.unique(map_index):
@@ -161,7 +148,7 @@ _COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "w
 class IndirectPaths:
     """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced."""
 
-    def __init__(self, partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
+    def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats) -> None:
         self._partial, self._tx_m, self._rx_m = partial, tx_m, rx_m
         count = len(tx_m) * len(rx_m)
         self._power, self._strongest = np.zeros((len(ATTENUATION_LENGTHS_M), count)), np.zeros(count)
@@ -177,7 +164,7 @@ class IndirectPaths:
             unobserved_m = path_unobserved_m(self._partial, self._tx_m[tx], interactions, vertices_m, self._rx_m[rx])
             self._add(tx.astype(np.int64) * len(self._rx_m) + rx, np.abs(paths.a[indirect]) ** 2, unobserved_m)
 
-    def _add(self, link: NDArray[np.int64], power: NDArray[np.float64], unobserved_m: NDArray[np.float64]) -> None:
+    def _add(self, link: NDArray[np.int64], power: Floats, unobserved_m: Floats) -> None:
         for total, length_m in zip(self._power, ATTENUATION_LENGTHS_M, strict=True):
             np.add.at(total, link, power * attenuation(unobserved_m, length_m))
         order = np.argsort(power, kind="stable")
@@ -187,7 +174,7 @@ class IndirectPaths:
         links = links[power[strongest[links]] >= self._strongest[links]]
         self._strongest[links], self._strongest_m[links] = power[strongest[links]], unobserved_m[strongest[links]]
 
-    def context(self, link_state: NDArray[np.uint8], unobserved_distance_m: NDArray[np.float64]) -> LinkContext:
+    def context(self, link_state: NDArray[np.uint8], unobserved_distance_m: Floats) -> LinkContext:
         """Return the context of all T N links, transmitter by transmitter, without windows."""
         tx_m, rx_m = np.repeat(self._tx_m, len(self._rx_m), axis=0), np.tile(self._rx_m, (len(self._tx_m), 1))
         return LinkContext.on_maps(
@@ -203,12 +190,8 @@ class IndirectPaths:
 
 
 def path_unobserved_m(
-    partial: PartialMap,
-    start_m: NDArray[np.float64],
-    interactions: NDArray[np.uint8],
-    vertices_m: NDArray[np.float64],
-    end_m: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
+) -> Floats:
     """Return the length (P,) [m] of paths in unknown cells; 0 for links that a complete map encloses.
 
     They lead from `start_m` (P, 3) by `vertices_m` (P, D, 3), where `interactions` (P, D) is not 0, to `end_m` (P, 3).
@@ -225,18 +208,14 @@ def path_unobserved_m(
     return total_m
 
 
-def attenuation(unobserved_m: NDArray[np.float64], length_m: float) -> NDArray[np.float64]:
+def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
     """Return the fraction (P,) of the power of paths that unobserved space of an attenuation length [m] lets pass."""
     return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
 
 
 def _possible_states(
-    partial: PartialMap,
-    ends_m: tuple[NDArray[np.float64], NDArray[np.float64]],
-    link_state: NDArray[np.uint8],
-    seen: NDArray[np.bool_],
-    walled: NDArray[np.bool_],
-) -> NDArray[np.bool_]:
+    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: NDArray[np.uint8], seen: Bools, walled: Bools
+) -> Bools:
     """Return which link states a map leaves possible (N, 3), whatever the networks predict.
 
     - A direct line that crosses a known wall has no LOS. It crosses one where the lines a cell and a half to its left
@@ -264,7 +243,7 @@ def _possible_states(
     return possible
 
 
-def _crosses_wall(partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
     """Whether the lines `_ASIDE_CELLS` to the left and right of direct lines (N,) both run into known walls."""
     starts, ends = in_cells(partial, tx_m), in_cells(partial, rx_m)
     along = ends - starts
@@ -276,9 +255,7 @@ def _crosses_wall(partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[
     return left & right
 
 
-def _regions(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
     """Whether both ends of links (N,) are in different regions, and whether both are in one that is wholly observed."""
     state = np.pad(partial.state, 1, constant_values=CellState.UNKNOWN)
     regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
@@ -289,7 +266,7 @@ def _regions(
     return known & (tx != rx), known & (tx == rx) & observed[tx]
 
 
-def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: NDArray[np.float64]) -> NDArray[np.int32]:
+def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats) -> NDArray[np.int32]:
     """Return the region (N,) of points (N, 3) [m], which may be in it or beside it; 0 where there is none, or two.
 
     `regions` (ny + 2, nx + 2) are those of the map's cells and of the cells around it; 0 within a cell of a wall.

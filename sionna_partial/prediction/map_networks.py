@@ -8,10 +8,10 @@ the numbers of all windows at its receiver. It returns P(link state), and mean a
 sight and without.
 """
 
+import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,8 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
+from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer
+from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
@@ -30,7 +31,7 @@ from sionna_partial.tracing.trace import Progress
 if TYPE_CHECKING:
     import keras
 
-Shapes = Mapping[str, tuple[int | None, ...]]
+Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
 Networks = Mapping[str, "keras.Model"]
 
 MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
@@ -77,46 +78,18 @@ _REPORT_STEPS = 50
 _log = logging.getLogger(__name__)
 
 
-def _shapes_beside_the_paper(networks: Mapping[str, tuple[tuple[int, ...], tuple[int, ...]]]) -> tuple[Shapes, Shapes]:
-    """Return the shapes of inputs and outputs, by name, of networks of (input, output) without the first axis."""
-    inputs: Shapes = {own_input(name): (None, *shapes[0]) for name, shapes in networks.items()}
-    return inputs, {name: (None, *shapes[1]) for name, shapes in networks.items()}
-
-
 _SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
-_MAP_SHAPES = ((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES))
 _LINK_INPUTS_WITH_MAP = LINK_INPUTS + len(CELLS_M) * MAP_FEATURES
 
-CONTEXT_SHAPES = (
-    _shapes_beside_the_paper({}),
-    _shapes_beside_the_paper({LINK_NETWORK: ((LINK_INPUTS,), (LINK_OUTPUTS,))}),
-    _shapes_beside_the_paper(
-        {LINK_NETWORK: ((_LINK_INPUTS_WITH_MAP,), (LINK_OUTPUTS,)), **dict.fromkeys(MAP_NETWORKS, _MAP_SHAPES)}
-    ),
+CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
+    {},
+    {LINK_NETWORK: ((None, LINK_INPUTS), (None, LINK_OUTPUTS))},
+    {
+        LINK_NETWORK: ((None, _LINK_INPUTS_WITH_MAP), (None, LINK_OUTPUTS)),
+        **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
+    },
 )
-"""Inputs and outputs that a predictor may have beside those of the paper's networks: none, "paths", or "map"."""
-
-
-@dataclass(frozen=True)
-class LinkNumbers:
-    """The numbers among what the trace gives of N links, (N,) arrays or tensors as in `LinkFeatures` and `LinkContext`.
-
-    `indirect_gain_db` is (N, len(ATTENUATION_LENGTHS_M)).
-    """
-
-    distance_m: Any
-    unobserved_distance_m: Any
-    walled_m: Any
-    gain_db: Any
-    indirect_gain_db: Any
-    strongest_unobserved_m: Any
-
-    @classmethod
-    def of(cls, phi: LinkFeatures) -> "LinkNumbers":
-        """Take them from features with a context."""
-        context = context_of(phi)
-        lengths_m = (phi.distance_m, phi.unobserved_distance_m, context.walled_m)
-        return cls(*lengths_m, phi.gain_db, context.indirect_gain_db, context.strongest_unobserved_m)
+"""Inputs and outputs of the networks that a predictor may have beside the paper's: none, "paths", or "map"."""
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:
@@ -125,33 +98,40 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     return phi.context
 
 
-def binary_features(phi: LinkFeatures) -> NDArray[np.float64]:
+def binary_features(phi: LinkFeatures) -> Floats:
     """Return binary features (N, `BINARY_INPUTS`) of N links, which have a context: 0 or 1."""
     context, states = context_of(phi), (phi.link_state == state for state in LinkState)
     return np.stack([*states, context.tx_seen, context.rx_seen, *context.possible.T], axis=1) * 1.0
 
 
-def input_columns(binary: Any, numbers: LinkNumbers, frequency_hz: float, ops: ModuleType = np) -> Any:
+def numeric_features(phi: LinkFeatures) -> dict[str, Floats]:
+    """Return numeric features of N links, which have a context, as named in `LinkFeatures` and `LinkContext`."""
+    of_phi = {name: getattr(phi, name) for name in ("distance_m", "unobserved_distance_m", "gain_db")}
+    names = ("walled_m", "indirect_gain_db", "strongest_unobserved_m")
+    return of_phi | {name: getattr(phi.context, name) for name in names}
+
+
+def input_columns(binary: Any, numeric: Mapping[str, Any], frequency_hz: float, ops: ModuleType = np) -> Any:
     """Scale features to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
 
-    `binary` is (N, BINARY_INPUTS), `ops` is NumPy, or keras.ops for tensors.
+    They are those of `binary_features` and `numeric_features`; `ops` is NumPy, or keras.ops for tensors.
     """
-    distance_m, unobserved_m = numbers.distance_m, numbers.unobserved_distance_m
+    distance_m, unobserved_m, gain_db = (numeric[name] for name in FEATURES)
     free_db, near_m = free_space_gain_db(distance_m, frequency_hz, ops), ops.maximum(distance_m, _NEAREST_M)
-    indirect_db = [numbers.indirect_gain_db[:, column] for column in range(len(ATTENUATION_LENGTHS_M))]
-    lengths_m = (distance_m, unobserved_m, distance_m - unobserved_m, numbers.strongest_unobserved_m)
+    traced_db = [gain_db, *(numeric["indirect_gain_db"][:, column] for column in range(len(ATTENUATION_LENGTHS_M)))]
+    lengths_m = (distance_m, unobserved_m, distance_m - unobserved_m, numeric["strongest_unobserved_m"])
     columns = [
-        *(ops.minimum(numbers.walled_m, 1.0), ops.log(near_m), unobserved_m / near_m),
+        *(ops.minimum(numeric["walled_m"], 1.0), ops.log(near_m), unobserved_m / near_m),
         *(ops.log(1.0 + length_m / _SCALE_M) for length_m in lengths_m),
-        *((gain_db - GAIN_FLOOR_DB) / _SCALE_DB for gain_db in (numbers.gain_db, free_db, *indirect_db)),
-        *(ops.clip((gain_db - free_db) / 30.0, -2.0, 0.5) for gain_db in (numbers.gain_db, *indirect_db)),
+        *((each_db - GAIN_FLOOR_DB) / _SCALE_DB for each_db in (gain_db, free_db, *traced_db[1:])),
+        *(ops.clip((each_db - free_db) / 30.0, -2.0, 0.5) for each_db in traced_db),
     ]
     return ops.concatenate([binary, ops.stack(columns, axis=1)], axis=1)
 
 
 def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
     """Return the inputs (N, `LINK_INPUTS`) of the link network for the features of N links, which have a context."""
-    return input_columns(binary_features(phi), LinkNumbers.of(phi), frequency_hz).astype(np.float32)
+    return input_columns(binary_features(phi), numeric_features(phi), frequency_hz).astype(np.float32)
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
@@ -163,25 +143,18 @@ def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
 def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
     """Build the networks, untrained, by name; the link network alone without map networks."""
     keras = import_keras()
-    start = _Seeds(keras, seed)
+    seeds = itertools.count(1000 * seed + 1)
+
+    def start() -> Any:
+        return keras.initializers.GlorotUniform(seed=next(seeds))
+
     networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else LINK_INPUTS)}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
         networks[name] = _map_network(keras, start, name, widths)
     return networks
 
 
-class _Seeds:
-    """First weights, each layer with a seed of its own."""
-
-    def __init__(self, keras: Any, seed: int) -> None:
-        self._keras, self._next = keras, 1000 * seed
-
-    def __call__(self) -> Any:
-        self._next += 1
-        return self._keras.initializers.GlorotUniform(seed=self._next)
-
-
-def _map_network(keras: Any, start: _Seeds, name: str, widths: tuple[int, ...]) -> "keras.Model":
+def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[int, ...]) -> "keras.Model":
     def convolved(x: Any, units: int, name: str) -> Any:
         options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
         x = layer(keras, "Conv2D", name, units, 3, **options)(x)
@@ -205,7 +178,7 @@ def _map_network(keras: Any, start: _Seeds, name: str, widths: tuple[int, ...]) 
     return keras.Model(window, values, name=name)
 
 
-def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
+def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.Model":
     x = link = keras.Input((inputs,), name="link", dtype="float32")
     for number in (1, 2):
         options = {"activation": "silu", "kernel_initializer": start()}
@@ -276,7 +249,7 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
 
 
-def distribution(outputs: Any, free_db: Any, possible: NDArray[np.bool_]) -> tuple[Any, Any, Any]:
+def distribution(outputs: Any, free_db: Any, possible: Bools) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
     `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not `possible` (N, 3) have probability 0.
@@ -294,7 +267,7 @@ def distribution(outputs: Any, free_db: Any, possible: NDArray[np.bool_]) -> tup
 
 def evaluate_context_networks(
     networks: Networks, phi: LinkFeatures, frequency_hz: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats]:
     """Evaluate the networks on the features of N links, which have a context: see `distribution`."""
     inputs, offsets_m = link_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
@@ -330,7 +303,7 @@ def _links_by_window(context: LinkContext) -> tuple[NDArray[np.intp], list[NDArr
 def fit_context_networks(
     phi: LinkFeatures,
     link_state: NDArray[np.uint8],
-    gain_db: NDArray[np.float64],
+    gain_db: Floats,
     settings: PredictorSettings,
     *,
     progress: Progress | None = None,
@@ -359,11 +332,7 @@ class _Examples:
     """Training links by window; their columns have the names of the arguments of a gradient step."""
 
     def __init__(
-        self,
-        phi: LinkFeatures,
-        link_state: NDArray[np.uint8],
-        gain_db: NDArray[np.float64],
-        settings: PredictorSettings,
+        self, phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: Floats, settings: PredictorSettings
     ) -> None:
         self._used, links = _links_by_window(context_of(phi))
         self._windows = context_of(phi).windows if settings.networks == "map" else None

@@ -25,6 +25,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkStat
 from sionna_partial.errors import PredictorError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class GainNetwork:
         """Whether the mean is an offset from the gain of the partial trace; else from the gain of free space."""
         return self.partial_states == (LinkState.LOS,) and "gain_db" in self.inputs
 
-    def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float64]:
+    def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> Floats:
         """Return the gain (N,) from which the network gives the offset [dB]."""
         return phi.gain_db if self.anchored_to_trace else free_space_gain_db(phi.distance_m, frequency_hz)
 
@@ -209,16 +210,14 @@ def distribution_by_paper(
     return tf.transpose(probabilities / total), tf.stack(means_db), tf.stack(stds_db)
 
 
-def evaluate_paper(
-    networks: Mapping[str, "keras.Model"], phi: LinkFeatures
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def evaluate_paper(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> tuple[Floats, Floats, Floats]:
     """Evaluate `distribution_by_paper` on the features of N links, to arrays."""
     blocks = [distribution_by_paper(networks, network_inputs(block), block.link_state) for block in _blocks(phi)]
     probabilities, means_db, stds_db = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
     return probabilities, means_db, stds_db
 
 
-def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> NDArray[np.float64]:
+def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> Floats:
     """Return P(indoor) (N,) by the network that serves the partial link state of each link."""
     p_indoor = np.zeros(len(phi))
     for state, name in INDOOR_NETWORKS.items():
@@ -276,13 +275,17 @@ def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: A
 
 
 def fit_networks(
-    phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64], settings: PredictorSettings
+    phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: Floats, settings: PredictorSettings
 ) -> "keras.Model":
     """Fit the classifiers and the gain networks to links and their true states and gains [dB] (N,), all indoors."""
     networks = {}
     for partial_state, name in STATE_NETWORKS.items():
         cell = phi.link_state == partial_state
-        networks[name] = _fit_states(name, phi.take(cell), link_state[cell], settings)
+        links, states = phi.take(cell), link_state[cell]
+        counts = np.bincount(states, minlength=len(LinkState)) + 1.0
+        networks[name] = logistic(name, STATE_INPUTS, _ranges(links, settings), np.log(counts / counts.sum()))
+        if len(links) >= settings.minimum_links:
+            _fit_logistic(networks[name], links, states)
     for row in GAIN_NETWORKS:
         cell = (link_state == row.link_state) & np.isin(phi.link_state, row.partial_states)
         networks[row.name] = _fit_gain(row, phi.take(cell), gain_db[cell], settings)
@@ -292,7 +295,7 @@ def fit_networks(
 
 
 def fit_indoor_networks(
-    model: "keras.Model", phi: LinkFeatures, inside: NDArray[np.bool_], settings: PredictorSettings
+    model: "keras.Model", phi: LinkFeatures, inside: Bools, settings: PredictorSettings
 ) -> "keras.Model":
     """Return the networks of `model` with P(indoor) fitted to N links; `inside` (N,) is whether they are indoors.
 
@@ -308,28 +311,14 @@ def fit_indoor_networks(
     return assemble(networks)
 
 
-def _fit_states(
-    name: str, phi: LinkFeatures, link_state: NDArray[np.uint8], settings: PredictorSettings
-) -> "keras.Model":
-    counts = np.bincount(link_state, minlength=len(LinkState)) + 1.0
-    network = logistic(name, STATE_INPUTS, _ranges(phi, settings), np.log(counts / counts.sum()))
-    if len(phi) >= settings.minimum_links:
-        _fit_logistic(network, phi, link_state)
-    return network
-
-
-def _fit_gain(
-    row: GainNetwork, phi: LinkFeatures, gain_db: NDArray[np.float64], settings: PredictorSettings
-) -> "keras.Model":
+def _fit_gain(row: GainNetwork, phi: LinkFeatures, gain_db: Floats, settings: PredictorSettings) -> "keras.Model":
     offsets_db = gain_db - row.anchor_db(phi, settings.frequency_hz)
     count = len(phi) + _PRIOR_LINKS
     mean_db = (offsets_db.sum() + _PRIOR_LINKS * row.prior_offset_db) / count
     prior = row.prior_std_db**2 + (row.prior_offset_db - mean_db) ** 2
     variance = (((offsets_db - mean_db) ** 2).sum() + _PRIOR_LINKS * prior) / count
-    seed = settings.seed + 10 * GAIN_NETWORKS.index(row)
-    network = gain_network(
-        row, _ranges(phi, settings), float(mean_db), math.sqrt(variance), settings.frequency_hz, seed
-    )
+    first_db, seed = (float(mean_db), math.sqrt(variance)), settings.seed + 10 * GAIN_NETWORKS.index(row)
+    network = gain_network(row, _ranges(phi, settings), *first_db, settings.frequency_hz, seed)
     if len(phi) >= settings.minimum_links:
         _train(network, phi, gain_db, settings)
     return network
@@ -354,7 +343,7 @@ def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: NDArray[np.u
     classes = max(2, network.output.shape[1])
     picked = truth[:, None] == np.arange(classes)
 
-    def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+    def loss(flat: Floats) -> tuple[float, Floats]:
         weights = flat.reshape(-1, classes)
         log_p = log_softmax(rows @ weights, axis=1)
         slope = rows.T @ (np.exp(log_p) - picked) + _WEIGHT_PENALTY * weights
@@ -375,9 +364,7 @@ def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
     return 0.5 * (log_variance + ops.square(gain_db - mean) * ops.exp(-log_variance))
 
 
-def _train(
-    network: "keras.Model", phi: LinkFeatures, gain_db: NDArray[np.float64], settings: PredictorSettings
-) -> None:
+def _train(network: "keras.Model", phi: LinkFeatures, gain_db: Floats, settings: PredictorSettings) -> None:
     """Minimise the loss of a gain network in place; the same links and settings give the same weights."""
     keras = import_keras()
     trainer = keras.Model(network.input, network.output)

@@ -30,6 +30,7 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
@@ -57,15 +58,15 @@ class LinkPrediction:
         The same given line of sight, and given paths without it [dB].
     """
 
-    p_los: NDArray[np.float64]
-    p_nlos: NDArray[np.float64]
-    p_outage: NDArray[np.float64]
-    gain_mean_db: NDArray[np.float64]
-    gain_std_db: NDArray[np.float64]
-    gain_los_mean_db: NDArray[np.float64]
-    gain_los_std_db: NDArray[np.float64]
-    gain_nlos_mean_db: NDArray[np.float64]
-    gain_nlos_std_db: NDArray[np.float64]
+    p_los: Floats
+    p_nlos: Floats
+    p_outage: Floats
+    gain_mean_db: Floats
+    gain_std_db: Floats
+    gain_los_mean_db: Floats
+    gain_los_std_db: Floats
+    gain_nlos_mean_db: Floats
+    gain_nlos_std_db: Floats
 
     @property
     def link_state(self) -> NDArray[np.uint8]:
@@ -106,7 +107,7 @@ class LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
 
-    def where(self, taken: NDArray[np.bool_], other: "LinkPrediction") -> "LinkPrediction":
+    def where(self, taken: Bools, other: "LinkPrediction") -> "LinkPrediction":
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
         columns = (column.name for column in fields(self))
         return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
@@ -318,7 +319,7 @@ class Predictor:
         prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
         return prediction.where(features.context.complete, LinkPrediction.of_trace(features))
 
-    def predict_indoor(self, features: LinkFeatures) -> NDArray[np.float64]:
+    def predict_indoor(self, features: LinkFeatures) -> Floats:
         """Predict the probability (N,) that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
         _require_features(features)
         return evaluate_indoor(parts(self.model), features)

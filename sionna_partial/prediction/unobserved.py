@@ -11,6 +11,8 @@ from sionna_partial.constants import CellState
 from sionna_partial.cores import core_count, in_order
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
 
+Floats, Bools = NDArray[np.float64], NDArray[np.bool_]
+
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
 GRAZE = 1e-9
@@ -26,9 +28,7 @@ _SEGMENTS_PER_CORE = 20_000
 """Number of segments from which another core is used."""
 
 
-def unobserved_lengths_m(
-    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
     """Return the lengths (N,) [m] of segments inside unknown cells, exact to rounding; ends are (N, 3) or (3,) [m].
 
     Everything outside the grid is unknown. On a complete map nothing unknown can be reached from a known cell, and the
@@ -41,9 +41,7 @@ def unobserved_lengths_m(
     return lengths_m
 
 
-def walled_lengths_m(
-    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
     """Return the lengths (N,) [m] of segments inside cells of known walls; ends are (N, 3) or (3,) [m].
 
     Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are.
@@ -51,40 +49,33 @@ def walled_lengths_m(
     return _lengths_m(partial, *np.broadcast_arrays(start_m, end_m), CellState.WALL)
 
 
-def _lengths_m(
-    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64], kind: CellState
-) -> NDArray[np.float64]:
+def _lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats, kind: CellState) -> Floats:
     fractions = map_line_fractions(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, kind]
     return fractions * np.linalg.norm(end_m - start_m, axis=1)
 
 
-def is_enclosed(partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def is_enclosed(partial: PartialMap, start_m: Floats, end_m: Floats) -> Bools:
     """Whether the map is complete and at least one end of each link (N,) is known, so that nothing unknown is met."""
     if not partial.is_complete:
         return np.zeros(len(end_m), dtype=bool)
     known = (partial.state_at(points_m) != CellState.UNKNOWN for points_m in (start_m, end_m))
-    enclosed: NDArray[np.bool_] = np.logical_or(*known)
+    enclosed: Bools = np.logical_or(*known)
     return enclosed
 
 
-def in_cells(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_cells(partial: PartialMap, points_m: Floats) -> Floats:
     """Return x and y of points (..., 2 or 3) [m] in cells of a map's grid, rounded to 1e-6: borders are met exactly."""
     return np.round((points_m[..., :2] - partial.origin_m) / partial.resolution_m, 6)
 
 
-def map_line_fractions(
-    partial: PartialMap, starts: NDArray[np.float64], ends: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def map_line_fractions(partial: PartialMap, starts: Floats, ends: Floats) -> Floats:
     """Return `line_fractions` on the cells of a map."""
     return line_fractions(partial.state, starts, ends, partial.alike_cells)
 
 
 def line_fractions(
-    state: NDArray[np.uint8],
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    alike: NDArray[np.int32] | None = None,
-) -> NDArray[np.float64]:
+    state: NDArray[np.uint8], starts: Floats, ends: Floats, alike: NDArray[np.int32] | None = None
+) -> Floats:
     """Return the fractions (N, 3), in [0, 1], of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
 
     All cells outside the grid are unknown. `alike` is what `alike_cells` returns of `state`, where it is at hand.
@@ -159,11 +150,7 @@ def leave_cells(
 
 @njit(cache=True, nogil=True)
 def _fill_fractions(
-    state: NDArray[np.uint8],
-    alike: NDArray[np.int32],
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    fractions: NDArray[np.float64],
+    state: NDArray[np.uint8], alike: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats
 ) -> None:
     """Add the fractions of segments in cells of each state to `fractions` (N, 3), over alike cells at once."""
     ny, nx = state.shape

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions
+from sionna_partial.prediction.unobserved import GRAZE, Floats, in_cells, line_fractions
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
 """Number of cells along each side of a window, and their edge in each of a transmitter's windows, near to far [m]."""
@@ -36,9 +36,7 @@ _LONGEST_DETOUR = 40.0
 """[cells]"""
 
 
-def transmitters(
-    map_index: NDArray[np.int64], tx_m: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, NDArray[np.intp]]:
     """Return map, x and y (W, 3) of the transmitters of links, and which is each link's (N,).
 
     `map_index` (N,) is the map of each link, `tx_m` (N, 3) its transmitter [m].
@@ -47,7 +45,7 @@ def transmitters(
     return keys, index.reshape(-1)
 
 
-def draw_windows(maps: Sequence[PartialMap], keys: NDArray[np.float64]) -> NDArray[np.uint8]:
+def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
     """Draw the windows (W, *WINDOWS) of transmitters of `transmitters`."""
     windows = np.zeros((len(keys), *WINDOWS), dtype=np.uint8)
     for number in np.unique(keys[:, 0]).astype(int):
@@ -56,7 +54,7 @@ def draw_windows(maps: Sequence[PartialMap], keys: NDArray[np.float64]) -> NDArr
     return windows
 
 
-def map_windows(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
+def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
     """Draw the windows (T, *WINDOWS) around transmitters (T, 2) [m] of one map.
 
     Row 0 of a window has the smallest y, and the transmitter is in the middle.
@@ -83,9 +81,7 @@ def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
     return PartialMap(coarse, factor * partial.resolution_m, partial.origin_m)
 
 
-def _window(
-    partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float, *, clear_around_tx: bool
-) -> NDArray[np.uint8]:
+def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
     """Draw the window with cells of `cell_m` around a transmitter, which may be in a wall that was drawn coarser."""
     state, start = _surroundings(partial, tx_m, cell_m)
     if clear_around_tx:
@@ -103,9 +99,7 @@ def _window(
     return np.round(255.0 * np.stack(layers, axis=-1)).astype(np.uint8)
 
 
-def _surroundings(
-    partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[NDArray[np.uint8], Floats]:
     """Extend or cut a map to what a window covers, and return where the transmitter is in it [cells]."""
     half = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
     start = in_cells(partial, tx_m)
@@ -120,14 +114,14 @@ def _surroundings(
     return state, start - np.array([spans[1][0], spans[0][0]])
 
 
-def _overlaps(edges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _overlaps(edges: Floats, count: int) -> Floats:
     """Fraction of each interval between `edges` (K + 1,) that each of `count` unit cells covers: (K, count)."""
     cells = np.arange(count)
     low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)
     return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
 
 
-def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
+def _detours(wall: Floats) -> Floats:
     """How much longer the route around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR`.
 
     Routes go from the four cells in the middle from cell to cell, also across corners; walls are crossed at a cost.
@@ -148,7 +142,7 @@ def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @cache
-def _neighbours() -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _neighbours() -> tuple[NDArray[np.intp], Floats]:
     """Pairs of neighbouring cells (2, E), and their distances (E,) [cells]."""
     cell = np.arange(WINDOW_CELLS**2).reshape(WINDOW_CELLS, WINDOW_CELLS)
     pairs = [(cell[:, :-1], cell[:, 1:]), (cell[:-1], cell[1:]), (cell[:-1, :-1], cell[1:, 1:])]
