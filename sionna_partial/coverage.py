@@ -197,7 +197,8 @@ def predict_map(
                 report(min(0.99, (start + fraction * at_once) / len(grid.rx_m)), message)
 
             rx_m = grid.rx_m[start : start + at_once]
-            phi = features_of_paths(partial, tx_m, rx_m, tracer.paths(tx_m, rx_m, within))
+            paths = tracer.paths(tx_m, rx_m, within)
+            phi = features_of_paths(partial, tx_m, rx_m, paths, context=model is not None)
             if model is not None and model.reads_maps:
                 phi = phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64))
             columns.append(_columns(phi, model, partial.state_at(rx_m), anywhere=receivers == "anywhere"))
@@ -352,11 +353,10 @@ def _wall_parts(partial: PartialMap, receivers: _Receivers, spacing_m: float) ->
     ny, nx = partial.shape
     columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
     bits = np.zeros(receivers.valid.shape, dtype=np.int64)
-    for row, (bottom, top) in enumerate(
-        _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
-    ):
+    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
+    for row, (bottom, top) in enumerate(rows):
+        strip = walls[top] - walls[bottom]
         for column, (left, right) in enumerate(columns):
-            strip = walls[top] - walls[bottom]
             bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
     return bits
 

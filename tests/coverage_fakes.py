@@ -70,7 +70,11 @@ class FakeTracer:
 
 
 def fake_features(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], blocks: Iterable[SolvedPaths]
+    partial: PartialMap,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    blocks: Iterable[SolvedPaths],
+    context: bool,
 ) -> LinkFeatures:
     """Trace without walls: LOS up to 2 m, NLOS up to 4 m, then outage; Friis' gain, less 20 dB for NLOS."""
     assert not list(blocks)
@@ -78,8 +82,8 @@ def fake_features(
     state = np.select([distance_m < 2.0, distance_m < 4.0], [LinkState.LOS, LinkState.NLOS], LinkState.OUTAGE)
     gain_db = -61.4 - 20.0 * np.log10(distance_m) - np.choose(state, [150.0, 0.0, 20.0])
     unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m)
-    context = IndirectPaths(partial, tx_m[None], rx_m).context(state, unobserved_m)
-    return LinkFeatures(state, unobserved_m, distance_m, np.maximum(gain_db, -150.0), context)
+    known = IndirectPaths(partial, tx_m[None], rx_m).context(state, unobserved_m) if context else None
+    return LinkFeatures(state, unobserved_m, distance_m, np.maximum(gain_db, -150.0), known)
 
 
 class FakePredictor:

@@ -178,14 +178,6 @@ def test_a_map_without_walls_and_one_that_is_all_unknown_are_answered(fakes):
         assert np.isfinite(coverage["gain_mean_db"]).all()
 
 
-def test_a_map_of_one_cell(fakes):
-    partial = unknown_map(1, 1)
-    coverage = predict_map(partial, (0.1, 0.1), spacing_m=0.5)
-    assert coverage.sizes == {"y": 1, "x": 1}
-    with pytest.raises(PositionError, match=r"no receiver can stand anywhere.*: spacing_m = 0\.5, give a smaller one"):
-        predict_map(partial, (0.25, 0.25), spacing_m=0.5)
-
-
 def test_a_frequency_too_low_for_the_map_is_named(no_work):
     message = r"every receiver is within 23\.9 m of the transmitter.* frequency_hz = 1e\+06: give a higher frequency"
     with pytest.raises(PositionError, match=message):
@@ -272,14 +264,6 @@ def test_a_path_is_read(fakes, tmp_path):
     )
     with pytest.raises(MapError, match="missing"):
         predict_map(tmp_path / "missing.yaml", TX)
-
-
-@pytest.mark.parametrize("name", [None, "map", "paper", "my.keras"])
-def test_the_predictor_is_loaded_by_its_name(fakes, monkeypatch, name):
-    calls = []
-    monkeypatch.setattr(FakePredictor, "load", lambda name: calls.append(name) or FakePredictor())
-    predict_map(map_of(PICTURE), TX, spacing_m=0.5, predictor=name)
-    assert calls == [name]
 
 
 def test_a_predictor_is_used_as_it_is(fakes):

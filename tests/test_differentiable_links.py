@@ -146,9 +146,7 @@ class TestValues:
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     @pytest.mark.parametrize(
-        "place",
-        [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])],
-        ids=["pillar", "far", "receiver"],
+        "place", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["pillar", "far", "receiver"]
     )
     def test_impossible_places_have_finite_slopes(self, place, predictor, links_of, tf):
         links, place = links_of("partial", predictor), tf.Variable(np.array(place))

@@ -1,6 +1,5 @@
 """The networks that read maps and paths: inputs, outputs, and that an empty map contributes nothing."""
 
-import itertools
 import math
 
 import numpy as np
@@ -98,13 +97,6 @@ class TestLinkInputs:
         assert all(np.isfinite(column).all() for column in found.values())
         assert max(abs(column[0]) for column in found.values()) < 7.0
 
-    def test_which_ends_are_seen(self):
-        maps = PartialMap(np.array([[FREE, UNKNOWN, WALL]]), 1.0)
-        ends = [(x, 0.5, 1.5) for x in (0.5, 1.5, 2.5)]
-        for (tx_m, tx_seen), (rx_m, rx_seen) in itertools.product(zip(ends, (1, 0, 1), strict=True), repeat=2):
-            found = inputs(features(maps, rx_m, tx_m=tx_m))
-            assert (found["tx_seen"], found["rx_seen"]) == (tx_seen, rx_seen)
-
     @pytest.mark.parametrize("cell", [FREE, UNKNOWN])
     def test_which_states_the_map_leaves_possible(self, cell):
         partial = PartialMap(np.array([[FREE, cell, FREE]]), 0.5)
@@ -167,13 +159,6 @@ class TestLinkInputs:
         ):
             for name, column in inputs(features(partial, where(rx_m), tx_m=where(tx_m))).items():
                 np.testing.assert_allclose(column, expected[name], atol=1e-6, err_msg=name)
-
-    def test_links_do_not_depend_on_each_other(self):
-        phi = make_seen_links(50)[0]
-        together = link_inputs(phi, FREQUENCY_HZ)
-        index = np.array([7, 3, 41])
-        np.testing.assert_array_equal(link_inputs(phi.take(index), FREQUENCY_HZ), together[index])
-        assert link_inputs(phi.take(slice(0)), FREQUENCY_HZ).shape == (0, LINK_INPUTS)
 
 
 class TestContextNetworks:

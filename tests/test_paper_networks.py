@@ -94,12 +94,6 @@ def test_links_do_not_depend_on_each_other(quick):
         np.testing.assert_allclose(values, arrays(together)[name][7:8], rtol=1e-5, err_msg=name)
 
 
-def test_many_blocks(quick):
-    phi, _, _ = make_links(10, seed=3)
-    many = phi.take(np.arange(140_000) % 10)
-    np.testing.assert_allclose(quick.predict(many).gain_mean_db[-10:], quick.predict(phi).gain_mean_db, rtol=1e-5)
-
-
 @pytest.mark.parametrize("partial_state", LinkState)
 def test_sane_far_beyond_the_training_links(quick, partial_state):
     distance_m = np.array([0.0, 1e-6, 0.1, 1.0, 10.0, 60.0, 1e4, 1e9, 1e200])

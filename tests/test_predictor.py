@@ -1,4 +1,5 @@
 import dataclasses
+import doctest
 import re
 
 import numpy as np
@@ -18,6 +19,7 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import PredictorError
+from sionna_partial.prediction import features as features_module
 from sionna_partial.prediction import predictor as predictor_module
 from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
@@ -41,6 +43,13 @@ def seeing(request):
 def saved(quick, tmp_path):
     quick.save(tmp_path / "mine.keras")
     return tmp_path / "mine.keras"
+
+
+@pytest.mark.parametrize("module", [features_module, predictor_module])
+def test_examples_in_the_docstrings(module):
+    result = doctest.testmod(module)
+    assert result.attempted > 0
+    assert result.failed == 0
 
 
 def test_valid_on_other_links(quick):

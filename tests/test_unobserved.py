@@ -223,30 +223,6 @@ def test_revealing_cells_never_raises_it(state, start, end, data):
     assert length_m(after, start_m, end_m) <= length_m(before, start_m, end_m) + 1e-9
 
 
-@given(grids, places, places)
-def test_moving_the_map_changes_nothing(state, start, end):
-    shift = (500_000.0, 4_500_000.0, 0.0)
-    here, there = PartialMap(state, 0.25), PartialMap(state, 0.25, origin_m=shift[:2])
-    start_m, end_m = scaled(here, start), scaled(here, end)
-    moved_m = length_m(there, start_m + shift, end_m + shift)
-    assert moved_m == pytest.approx(length_m(here, start_m, end_m), abs=1e-5)
-
-
-@settings(max_examples=30)
-@given(grids, places, places)
-def test_agrees_with_dense_samples(state, start, end):
-    partial = PartialMap(state, 0.3)
-    assume(not partial.is_complete)
-    start_m, end_m = scaled(partial, start), scaled(partial, end)
-    count = 4000
-    samples = start_m + (np.arange(count)[:, None] + 0.5) / count * (end_m - start_m)
-    share = (partial.state_at(samples) == CellState.UNKNOWN).mean()
-    whole_m = np.linalg.norm(end_m - start_m)
-    crossings = sum(state.shape) + 2
-    tolerance_m = crossings * whole_m / count + 1e-9
-    assert length_m(partial, start_m, end_m) == pytest.approx(share * whole_m, abs=tolerance_m)
-
-
 class TestCompleteMap:
     """A closed room, and unknown space around it in which another part of the building may be."""
 

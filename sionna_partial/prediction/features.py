@@ -148,23 +148,24 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
 
 
-def features_of_paths(partial: PartialMap, tx_m: Floats, rx_m: Floats, blocks: Iterable[SolvedPaths]) -> LinkFeatures:
+def features_of_paths(
+    partial: PartialMap, tx_m: Floats, rx_m: Floats, blocks: Iterable[SolvedPaths], *, context: bool = True
+) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
-    `blocks` are all paths between them, from `Tracer.paths`; no windows are drawn.
+    `blocks` are all paths between them, from `Tracer.paths`. No windows are drawn; a context is made if asked for.
     """
-    power, is_direct, indirect = (
-        np.zeros(len(rx_m)),
-        np.zeros(len(rx_m), bool),
-        IndirectPaths(partial, tx_m[None], rx_m),
-    )
+    power, is_direct = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool)
+    indirect = IndirectPaths(partial, tx_m[None], rx_m)
     for paths in blocks:
         np.add.at(power, paths.path_rx, np.abs(paths.a) ** 2)
         is_direct[paths.path_rx[paths.is_direct]] = True
-        indirect.add(paths)
+        if context:
+            indirect.add(paths)
     link_state, gain_db = link_summary(power, is_direct)
     unobserved_m, distance_m = unobserved_lengths_m(partial, tx_m, rx_m), np.linalg.norm(rx_m - tx_m, axis=-1)
-    return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, indirect.context(link_state, unobserved_m))
+    known = indirect.context(link_state, unobserved_m) if context else None
+    return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, known)
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
