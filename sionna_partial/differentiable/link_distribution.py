@@ -13,9 +13,9 @@ class LinkDistribution(LinkPrediction):
     """A `LinkPrediction` of (N,) float64 tensors with derivatives."""
 
     @classmethod
-    def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, ops: ModuleType | None = None) -> Self:
+    def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, *, ops: ModuleType | None = None) -> Self:
         """Combine the distributions given each LinkState, tensors (3, N)."""
-        return super().of_parts(probabilities, means_db, stds_db, ops or import_keras().ops)
+        return super().of_parts(probabilities, means_db, stds_db, ops=ops or import_keras().ops)
 
     @classmethod
     def of_prediction(cls, prediction: LinkPrediction) -> "LinkDistribution":

@@ -120,7 +120,7 @@ class LinkContext:
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
         """Return the links that an index array, a mask (N,) or a slice selects; the windows are shared."""
-        return LinkContext(*(getattr(self, name)[index] for name in _COLUMNS), windows=self.windows)
+        return LinkContext(**{name: getattr(self, name)[index] for name in _COLUMNS}, windows=self.windows)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkContext"]) -> "LinkContext":

@@ -74,7 +74,7 @@ class LinkPrediction:
         return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
 
     @classmethod
-    def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, ops: ModuleType = np) -> Self:
+    def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, *, ops: ModuleType = np) -> Self:
         """Combine the distributions given each LinkState (3, N), by the laws of total expectation and variance.
 
         `ops` is NumPy, or keras.ops for tensors, of which the standard deviation has finite derivatives.

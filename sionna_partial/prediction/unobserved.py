@@ -1,7 +1,7 @@
 """Fractions of straight lines in each kind of cell: the grid integral behind d_unobs (paper, Section III-C)."""
 
 import itertools
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
@@ -11,7 +11,8 @@ from sionna_partial.constants import CellState
 from sionna_partial.cores import core_count, in_order
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
 
-Floats, Bools = NDArray[np.float64], NDArray[np.bool_]
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
@@ -37,7 +38,7 @@ def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) ->
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m, open_ended = np.zeros(len(end_m)), ~is_enclosed(partial, start_m, end_m)
-    lengths_m[open_ended] = _lengths_m(partial, start_m[open_ended], end_m[open_ended], CellState.UNKNOWN)
+    lengths_m[open_ended] = _lengths_m(partial, CellState.UNKNOWN, start_m[open_ended], end_m[open_ended])
     return lengths_m
 
 
@@ -46,10 +47,10 @@ def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Flo
 
     Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are.
     """
-    return _lengths_m(partial, *np.broadcast_arrays(start_m, end_m), CellState.WALL)
+    return _lengths_m(partial, CellState.WALL, *np.broadcast_arrays(start_m, end_m))
 
 
-def _lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats, kind: CellState) -> Floats:
+def _lengths_m(partial: PartialMap, kind: CellState, start_m: Floats, end_m: Floats) -> Floats:
     fractions = map_line_fractions(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, kind]
     return fractions * np.linalg.norm(end_m - start_m, axis=1)
 
