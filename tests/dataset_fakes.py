@@ -76,7 +76,9 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
     count = 2 * settings.links_per_home * len(settings.stages)
     tx_m, rx_m = rng.uniform(0.0, 9.0, (2, count, 3))
     distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    gains_db = rng.uniform(GAIN_FLOOR_DB, -40.0, (count, len(ATTENUATION_LENGTHS_M)))
     maps = tuple(_map(rng) for _ in settings.stages)
+    strongest_m = rng.uniform(0.0, 9.0, count)
     map_index = np.repeat(np.arange(len(maps)), 2 * settings.links_per_home)
     state = rng.integers(0, 3, count).astype(np.uint8)
     context = LinkContext.on_maps(
@@ -86,8 +88,8 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
         rx_m=rx_m,
         link_state=state[::-1],
         unobserved_distance_m=distance_m / 2,
-        indirect_gain_db=rng.uniform(GAIN_FLOOR_DB, -40.0, (count, len(ATTENUATION_LENGTHS_M))),
-        strongest_unobserved_m=rng.uniform(0.0, 9.0, count),
+        indirect_gain_db=gains_db,
+        strongest_unobserved_m=strongest_m,
     )
     return LinkTable(
         home=np.full(count, name),
