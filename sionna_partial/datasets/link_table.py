@@ -84,7 +84,7 @@ class LinkTable:
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
         """Return the links that an index array, a mask (N,) or a slice selects."""
-        features = self.features.take(index)
+        features = self.__dict__.get("phi", self.features).take(index)  # with the windows, if they were drawn
         columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
         return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, **columns)
 
