@@ -186,6 +186,7 @@ def predict_map(
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings)
+    needs_context = model is not None and model.settings.networks != "paper"
     report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
     columns: list[dict[str, NDArray[Any]]] = []
@@ -198,9 +199,7 @@ def predict_map(
 
             rx_m = grid.rx_m[start : start + at_once]
             paths = tracer.paths(tx_m, rx_m, within)
-            phi = features_of_paths(partial, tx_m, rx_m, paths, context=model is not None)
-            if model is not None and model.reads_maps:
-                phi = phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64))
+            phi = features_of_paths(partial, tx_m, rx_m, paths, context=needs_context)
             columns.append(_columns(phi, model, partial.state_at(rx_m), anywhere=receivers == "anywhere"))
     variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)

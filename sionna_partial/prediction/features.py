@@ -153,7 +153,7 @@ def features_of_paths(
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
-    `blocks` are all paths between them, from `Tracer.paths`. No windows are drawn; a context is made if asked for.
+    `blocks` are all paths between them, from `Tracer.paths`. The paper's predictor needs no context.
     """
     power, is_direct = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool)
     indirect = IndirectPaths(partial, tx_m[None], rx_m)
@@ -164,8 +164,11 @@ def features_of_paths(
             indirect.add(paths)
     link_state, gain_db = link_summary(power, is_direct)
     unobserved_m, distance_m = unobserved_lengths_m(partial, tx_m, rx_m), np.linalg.norm(rx_m - tx_m, axis=-1)
-    known = indirect.context(link_state, unobserved_m) if context else None
-    return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, known)
+    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db)
+    if not context:
+        return phi
+    phi = replace(phi, context=indirect.context(link_state, unobserved_m))
+    return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64))
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
