@@ -140,8 +140,8 @@ class TestEvaluate:
             drawn.append(len(tx_m))
             return map_windows(partial, tx_m)
 
-        monkeypatch.setattr("sionna_partial.prediction.map_networks.map_windows", counted)
         predictor = dataclasses.replace(context_predictor("map"), homes=("home 0",))
+        monkeypatch.setattr("sionna_partial.prediction.windows.map_windows", counted)
         evaluate(predictor, table, baselines=fitted_baselines())
         assert drawn == [1] * (2 * 2 * len(corridors()))
 
