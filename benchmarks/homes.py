@@ -25,7 +25,7 @@ from scipy import ndimage
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
 from sionna_partial.plots.figures import figure_png
-from sionna_partial.prediction.features import unobserved_distance_m
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.scene.outlines import wall_outlines
 
 FIRST_SEED = 70_000
@@ -164,7 +164,7 @@ def random_links(
     solid = replace(home, state=np.where(free, sp.CellState.FREE, sp.CellState.UNKNOWN))
     seen = sp.explore(home, (STEPS,), seed=seed)[0]
     missing_m = [
-        np.concatenate([unobserved_distance_m(partial, place, rx) for place in tx]) for partial in (solid, seen)
+        np.concatenate([unobserved_lengths_m(partial, place, rx) for place in tx]) for partial in (solid, seen)
     ]
     return sp.trace_links(home, tx, rx), np.linalg.norm(rx - tx[:, None], axis=2).ravel(), *missing_m
 

@@ -31,8 +31,8 @@ ROOMS = {
         *("path_set", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "link_context", "features", "certainty", "windows"),
-        *("paper_networks", "paper_fitting", "map_networks", "map_fitting", "predictor_files", "predictor"),
+        *("unobserved", "windows", "link_context", "features"),
+        *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "link_distribution", "path_power", "scene"),

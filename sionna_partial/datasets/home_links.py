@@ -245,7 +245,7 @@ def _features(maps: list[PartialMap], places: _Places, settings: DatasetSettings
             features.append(features[-1])
             continue
         links = trace_each(partial, places.tx_m, places.rx_m, settings=settings.trace, scene_settings=settings.scene)
-        features.append(LinkFeatures.concatenate([link_features(partial, each) for each in links]))
+        features.append(LinkFeatures.concatenate([link_features(partial, each, windows=False) for each in links]))
     return features
 
 
@@ -262,7 +262,9 @@ def _stage_links(
     return LinkTable(
         home=np.full(len(phi), name),
         stage=np.full(len(phi), stage, dtype=np.float64),
-        phi=phi,
+        features=phi,
+        maps=(partial,),
+        map_index=np.zeros(len(phi), dtype=np.int64),
         link_state=link_state,
         gain_db=gain_db,
         inside=inside,

@@ -20,7 +20,7 @@ from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
@@ -59,10 +59,10 @@ def _of_table(name: str, kind: pa.DataType) -> _Column:
 
 
 def _of_features(name: str, field: str, kind: pa.DataType) -> _Column:
-    return _Column(name, kind, lambda table: getattr(table.phi, field))
+    return _Column(name, kind, lambda table: getattr(table.features, field))
 
 
-_INDIRECT = [f"indirect_gain_reach_{reach:g}_m_db" for reach in REACHES_M]
+_INDIRECT = [f"indirect_gain_reach_{reach:g}_m_db" for reach in ATTENUATION_LENGTHS_M]
 
 _FEATURES = {
     "partial_link_state": "link_state",
@@ -79,9 +79,9 @@ _COLUMNS = (
         _of_features(name, field, pa.uint8() if field == "link_state" else pa.float64())
         for name, field in _FEATURES.items()
     ),
-    *(_indirect_gain(index) for index in range(len(REACHES_M))),
+    *(_indirect_gain(index) for index in range(len(ATTENUATION_LENGTHS_M))),
     _of_context("strongest_unobserved_m", pa.float64()),
-    _of_context("map_index", pa.int64()),
+    _of_table("map_index", pa.int64()),
     _of_table("link_state", pa.uint8()),
     _of_table("gain_db", pa.float64()),
     *(_of_table(name, pa.bool_()) for name in ("inside", "anywhere")),
@@ -109,7 +109,7 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
         If writing fails; no half a file is left.
     """
     maps = {
-        "partial": [_packed(each) for each in table.context.maps],
+        "partial": [_packed(each) for each in table.maps],
         "complete": {name: _packed(home) for name, home in table.complete_maps.items()},
     }
     notes = {"format": FORMAT, "maps": maps, **metadata}
@@ -231,20 +231,25 @@ def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
     return Path(folder) / SHARDS_FOLDER / f"{name}.parquet"
 
 
-def _links_of(columns: dict[str, Any], maps: Any) -> LinkTable:
+def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
     positions = {
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
-    context = LinkContext(
-        maps=tuple(_unpacked(each) for each in maps["partial"]),
-        map_index=columns.pop("map_index"),
+    maps, map_index = tuple(_unpacked(each) for each in notes["partial"]), columns.pop("map_index")
+    features = {field: columns.pop(name) for name, field in _FEATURES.items()}
+    context = LinkContext.on_maps(
+        maps,
+        map_index,
+        link_state=features["link_state"],
+        unobserved_distance_m=features["unobserved_distance_m"],
         indirect_gain_db=np.column_stack([columns.pop(name) for name in _INDIRECT]),
         strongest_unobserved_m=columns.pop("strongest_unobserved_m"),
         **positions,
     )
-    phi = LinkFeatures(**{field: columns.pop(name) for name, field in _FEATURES.items()}, context=context)
-    complete_maps = {name: _unpacked(each) for name, each in maps["complete"].items()}
-    return LinkTable(home=columns.pop("home").astype(np.str_), phi=phi, complete_maps=complete_maps, **columns)
+    home = columns.pop("home").astype(np.str_)
+    complete_maps = {name: _unpacked(each) for name, each in notes["complete"].items()}
+    known = {"features": LinkFeatures(**features, context=context), "maps": maps, "map_index": map_index}
+    return LinkTable(home=home, complete_maps=complete_maps, **known, **columns)
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:

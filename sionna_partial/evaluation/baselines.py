@@ -84,7 +84,7 @@ class Baselines:
         -------
         Baselines
         """
-        blind = nothing_seen(links.phi, settings.frequency_hz)
+        blind = nothing_seen(links.features, settings.frequency_hz)
         homes = list(dict.fromkeys(map(str, links.home)))
         distance = Predictor.fit(
             blind, links.link_state, links.gain_db, homes=homes, settings=replace(settings, networks="paper")

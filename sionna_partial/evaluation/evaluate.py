@@ -220,7 +220,7 @@ class _Contestants:
 
         The predictor is asked once: the transmitters of both are the same, and so are their windows.
         """
-        given = self.predictor.predict(links.phi)
+        given = self.predictor.predict(links.phi if self.predictor.reads_maps else links.features)
         for receivers, answer in (("indoor", self._indoors), ("anywhere", self._anywhere)):
             drawn = links.anywhere == (receivers == "anywhere")
             if drawn.any():
@@ -229,12 +229,12 @@ class _Contestants:
 
     def _indoors(self, links: LinkTable, given: LinkPrediction) -> Mapping[str, LinkPrediction]:
         """Answers where receivers are indoors."""
-        others = answers(self.baselines, self.paper, links.phi, self.predictor.settings.frequency_hz)
+        others = answers(self.baselines, self.paper, links.features, self.predictor.settings.frequency_hz)
         return {"predictor": given, **others}
 
     def _anywhere(self, links: LinkTable, indoors: LinkPrediction) -> Mapping[str, LinkPrediction]:
         """Answers where receivers may be outside, from the predictor's for receivers indoors."""
-        p_indoor = np.where(links.context.rx_seen, 1.0, self.predictor.predict_indoor(links.phi))
+        p_indoor = np.where(links.context.rx_seen, 1.0, self.predictor.predict_indoor(links.features))
         outage = indoors.anywhere(np.zeros(len(links)))
         return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 

@@ -272,7 +272,8 @@ class _Objective:
         features = []
         for tx_m, kept in zip(positions_m, far, strict=True):
             paths = self.tracer.paths(tx_m, area.rx_m[kept], lambda fraction, message: None)
-            features.append(features_of_paths(area.partial, tx_m, area.rx_m[kept], paths))
+            phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
+            features.append(phi)
         phi = LinkFeatures.concatenate(features)
         prediction = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
         values[far] = link_values(prediction, self.settings)

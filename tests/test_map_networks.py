@@ -1,21 +1,16 @@
-"""The networks that see where links run: what goes in, what comes out, and what an empty map cannot say."""
+"""The networks that read maps and paths: inputs, outputs, and that an empty map contributes nothing."""
 
-import dataclasses
-import itertools
 import math
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from predictor_links import FREQUENCY_HZ, LOS, NLOS, OUTAGE, QUIET, make_seen_links
+from predictor_links import FREQUENCY_HZ, NLOS, QUIET, features, make_seen_links
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction import map_networks as module
-from sionna_partial.prediction.certainty import possible_states
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M
 from sionna_partial.prediction.map_networks import (
     CONTEXT_SHAPES,
     LINK_INPUTS,
@@ -27,10 +22,12 @@ from sionna_partial.prediction.map_networks import (
     decode,
     evaluate_context_networks,
     link_inputs,
-    look,
+    read_links,
+    read_maps,
+    receiver_offsets_m,
 )
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, own_input
-from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS, map_windows, transmitter_windows
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras
+from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS
 
 pytestmark = QUIET
 
@@ -38,23 +35,11 @@ FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 
 COLUMNS = (
     *("outage", "los", "nlos", "tx_seen", "rx_seen", "outage_possible", "los_possible", "nlos_possible"),
-    *("walled", "log_distance", "unobserved_share", "distance", "unobserved", "observed", "strongest_unobserved"),
-    *("gain", "free_gain", *(f"indirect_{reach:g}" for reach in REACHES_M)),
-    *("gain_above_free", *(f"indirect_{reach:g}_above_free" for reach in REACHES_M)),
+    *("walled", "log_distance", "unobserved_fraction", "distance", "unobserved", "observed", "strongest_unobserved"),
+    *("gain", "free_gain", *(f"indirect_{reach:g}" for reach in ATTENUATION_LENGTHS_M)),
+    *("gain_above_free", *(f"indirect_{reach:g}_above_free" for reach in ATTENUATION_LENGTHS_M)),
 )
 """What the columns of `link_inputs` are called here."""
-
-
-def features(partial, rx_m, *, tx_m=(0.0, 0.0, 1.5), unobserved_m=0.0, state=LOS, gain_db=-70.0, indirect_db=-150.0):
-    """Return features of links on one map; all paths but the direct one have `indirect_db`, however seen they are."""
-    rx_m = np.atleast_2d(np.asarray(rx_m, dtype=np.float64))
-    count = len(rx_m)
-    tx_m = np.broadcast_to(np.asarray(tx_m, dtype=np.float64), (count, 3))
-    full = np.ones(count)
-    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
-    gains_db = np.broadcast_to(np.asarray(indirect_db, dtype=np.float64), (count, len(REACHES_M)))
-    context = LinkContext((partial,), np.zeros(count, dtype=np.int64), tx_m, rx_m, gains_db, unobserved_m * full)
-    return LinkFeatures(state * full, unobserved_m * full, distance_m, gain_db * full, context)
 
 
 def inputs(phi):
@@ -112,40 +97,22 @@ class TestLinkInputs:
         assert all(np.isfinite(column).all() for column in found.values())
         assert max(abs(column[0]) for column in found.values()) < 7.0
 
-    def test_link_states(self, home):
-        phi = features(home, np.tile([1.0, 2.0, 1.5], (3, 1)), state=np.array([OUTAGE, LOS, NLOS]))
-        found = inputs(phi)
-        np.testing.assert_array_equal([found["outage"], found["los"], found["nlos"]], np.eye(3))
-
-    def test_which_ends_are_seen(self):
-        maps = PartialMap(np.array([[FREE, UNKNOWN, WALL]]), 1.0)
-        ends = [(x, 0.5, 1.5) for x in (0.5, 1.5, 2.5)]
-        for (tx_m, tx_seen), (rx_m, rx_seen) in itertools.product(zip(ends, (1, 0, 1), strict=True), repeat=2):
-            found = inputs(features(maps, rx_m, tx_m=tx_m))
-            assert (found["tx_seen"], found["rx_seen"]) == (tx_seen, rx_seen)
-
     @pytest.mark.parametrize("cell", [FREE, UNKNOWN])
     def test_which_states_the_map_leaves_possible(self, cell):
         partial = PartialMap(np.array([[FREE, cell, FREE]]), 0.5)
         phi = features(partial, (1.3, 0.2, 1.5), tx_m=(0.1, 0.2, 1.5), unobserved_m=0.5 * (cell == UNKNOWN))
         found = inputs(phi)
         columns = [found[f"{state.name.lower()}_possible"][0] for state in LinkState]
-        assert columns == possible_states(phi)[0].tolist() == ([1, 1, 1] if cell == UNKNOWN else [0, 1, 0])
+        assert columns == ([1, 1, 1] if cell == UNKNOWN else [0, 1, 0])
 
     def test_length_in_walls(self):
         """Along the line, on the link's own map, no more than 1 m."""
         thin, thick = (PartialMap(np.array([[FREE] * 2 + [WALL] * cells + [FREE] * 2] * 4), 0.25) for cells in (1, 8))
         tx_m, rx_m = np.array([0.1, 0.1, 1.5]), np.array([1.1, 0.9, 1.5])
         slant = math.hypot(1.0, 0.8)
-        phi = features(thin, [rx_m, (0.4, 0.9, 1.5), rx_m, (2.9, 0.9, 1.5)], tx_m=tx_m)
-        context = dataclasses.replace(phi.context, maps=(thin, thick), map_index=np.array([0, 0, 1, 1]))
-        found = inputs(dataclasses.replace(phi, context=context))
+        maps = ((thin, thick), np.array([0, 0, 1, 1]))
+        found = inputs(features(maps, [rx_m, (0.4, 0.9, 1.5), rx_m, (2.9, 0.9, 1.5)], tx_m=tx_m))
         np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 0.6 * slant, 1.0], rtol=1e-6)
-
-    def test_no_wall_is_known_beyond_the_map(self):
-        floor = PartialMap(np.zeros((4, 4), dtype=np.uint8), 0.25)
-        found = inputs(features(floor, (9.0, 0.3, 1.5), tx_m=(-3.0, 0.4, 1.5), unobserved_m=11.0))
-        assert found["walled"] == 0.0
 
     def test_lengths(self, home):
         found = inputs(features(home, (3.0, 4.0, 1.5), unobserved_m=2.0, state=NLOS))
@@ -153,7 +120,7 @@ class TestLinkInputs:
             "distance": math.log(8.0 / 3.0),
             "log_distance": math.log(5.0),
             "unobserved": math.log(5.0 / 3.0),
-            "unobserved_share": 0.4,
+            "unobserved_fraction": 0.4,
             "observed": math.log(2.0),
             "strongest_unobserved": math.log(5.0 / 3.0),
         }.items():
@@ -166,23 +133,20 @@ class TestLinkInputs:
         assert free_db == pytest.approx(-75.37, abs=0.01)
         for name, gain_db in (
             *(("gain", -76.0), ("free_gain", free_db)),
-            *((f"indirect_{reach:g}", gain_db) for reach, gain_db in zip(REACHES_M, indirect_db, strict=True)),
+            *(
+                (f"indirect_{reach:g}", gain_db)
+                for reach, gain_db in zip(ATTENUATION_LENGTHS_M, indirect_db, strict=True)
+            ),
         ):
             assert found[name] == pytest.approx((gain_db + 150.0) / 100.0), name
             if name != "free_gain":
                 above = min(max((gain_db - free_db) / 30.0, -2.0), 0.5)
                 assert found[f"{name}_above_free"] == pytest.approx(above, abs=1e-6), name
 
-    def test_frequency_sets_free_space_alone(self, home):
-        phi = features(home, (3.0, 4.0, 1.5), gain_db=-90.0, indirect_db=-100.0)
-        low, high = (link_inputs(phi, frequency_hz)[0] for frequency_hz in (FREQUENCY_HZ, 10.0 * FREQUENCY_HZ))
-        changed = {name for name, one, other in zip(COLUMNS, low, high, strict=True) if one != other}
-        assert changed == {"free_gain", *(name for name in COLUMNS if name.endswith("_above_free"))}
-
     def test_moving_turning_and_mirroring_everything_changes_nothing(self, home):
         rx_m = np.random.default_rng(2).uniform(-7.9, 7.9, (60, 3))
-        phi = features(home, rx_m, tx_m=(0.31, -0.17, 1.5), unobserved_m=0.0)
-        expected = inputs(phi)
+        tx_m = np.tile([0.31, -0.17, 1.5], (60, 1))
+        expected = inputs(features(home, rx_m, tx_m=tx_m))
         assert np.ptp(expected["walled"]) > 0.5
         assert np.ptp(expected["rx_seen"]) == 1.0
         moved = PartialMap(home.state, 1.0, (492.0, -8.0))
@@ -193,17 +157,8 @@ class TestLinkInputs:
             (turned, lambda at_m: at_m[:, [1, 0, 2]] * (-1.0, 1.0, 1.0)),
             (mirrored, lambda at_m: at_m * (-1.0, 1.0, 1.0)),
         ):
-            ends = {"tx_m": where(phi.context.tx_m), "rx_m": where(phi.context.rx_m)}
-            context = dataclasses.replace(phi.context, maps=(partial,), **ends)
-            for name, column in inputs(dataclasses.replace(phi, context=context)).items():
+            for name, column in inputs(features(partial, where(rx_m), tx_m=where(tx_m))).items():
                 np.testing.assert_allclose(column, expected[name], atol=1e-6, err_msg=name)
-
-    def test_links_do_not_depend_on_each_other(self):
-        phi = make_seen_links(50)[0]
-        together = link_inputs(phi, FREQUENCY_HZ)
-        index = np.array([7, 3, 41])
-        np.testing.assert_array_equal(link_inputs(phi.take(index), FREQUENCY_HZ), together[index])
-        assert link_inputs(phi.take(slice(0)), FREQUENCY_HZ).shape == (0, LINK_INPUTS)
 
 
 class TestContextNetworks:
@@ -211,8 +166,7 @@ class TestContextNetworks:
     def test_shapes_are_those_that_are_documented(self, with_map):
         found = context_networks(0, with_map=with_map)
         shapes = CONTEXT_SHAPES[1 + with_map]
-        assert {own_input(name): network.input_shape for name, network in found.items()} == shapes.inputs
-        assert {name: network.output_shape for name, network in found.items()} == shapes.outputs
+        assert {name: (network.input_shape, network.output_shape) for name, network in found.items()} == shapes
 
     def test_the_seed_sets_every_first_weight_that_is_not_0(self):
         one, again, other = (context_networks(seed) for seed in (3, 3, 4))
@@ -233,16 +187,16 @@ class TestContextNetworks:
         assert {str(weight.dtype) for network in found.values() for weight in network.weights} == {"float32"}
 
 
-class TestLook:
-    """With a map network that says where a cell is, and a link network that says what it is told of the map."""
+class TestReadMapsAndLinks:
+    """With a map network that returns the position of a cell, and a link network that returns its inputs of the map."""
 
     SCALES = len(CELLS_M)
 
     @staticmethod
-    def told(links):
+    def of_maps(links):
         """Return the first three numbers of each scale, and one of the rest."""
-        told = np.reshape(links[:, LINK_INPUTS:], (-1, len(CELLS_M), MAP_FEATURES))
-        return np.concatenate([told[:, :, :3].reshape(len(told), -1), told[:, 0, 3:4]], axis=1)
+        read = np.reshape(links[:, LINK_INPUTS:], (-1, len(CELLS_M), MAP_FEATURES))
+        return np.concatenate([read[:, :, :3].reshape(len(read), -1), read[:, 0, 3:4]], axis=1)
 
     @staticmethod
     def values(windows, training):
@@ -259,8 +213,8 @@ class TestLook:
     def seen(self, windows, offsets_m):
         offsets_m = np.asarray(offsets_m, dtype=np.float32)
         links = np.zeros((*offsets_m.shape[:2], LINK_INPUTS), dtype=np.float32)
-        network = {**dict.fromkeys(MAP_NETWORKS, self.values), LINK_NETWORK: self.told}
-        found = np.asarray(look(network, windows.astype(np.float32), links, offsets_m))
+        networks = {**dict.fromkeys(MAP_NETWORKS, self.values), LINK_NETWORK: self.of_maps}
+        found = np.asarray(read_links(networks, read_maps(networks, windows.astype(np.float32)), links, offsets_m))
         return found[..., :-1].reshape(*offsets_m.shape[:2], self.SCALES, 3), found[..., -1]
 
     @pytest.fixture
@@ -288,7 +242,7 @@ class TestLook:
         found, _ = self.seen(windows[:1], np.column_stack([x_m, 0.7 * x_m])[None])
         assert abs(np.diff(found[0, :, :, 2], axis=0)).max() < 1.0
 
-    def test_what_an_empty_window_says_is_taken_off(self, windows):
+    def test_what_an_empty_window_gives_is_subtracted(self, windows):
         _, rest = self.seen(windows, np.zeros((2, 1, 2)))
         assert not rest.any()
         found, _ = self.seen(np.zeros_like(windows), np.zeros((2, 1, 2)))
@@ -296,9 +250,8 @@ class TestLook:
 
     def test_without_a_map_network_links_alone_are_read(self):
         links = np.random.default_rng(6).normal(size=(2, 3, LINK_INPUTS)).astype(np.float32)
-        outputs = look(
-            {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]}, None, links, np.zeros((2, 3, 2), dtype=np.float32)
-        )
+        networks = {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]}
+        outputs = read_links(networks, read_maps(networks, None), links, np.zeros((2, 3, 2), dtype=np.float32))
         np.testing.assert_array_equal(outputs, links[..., :LINK_OUTPUTS])
 
 
@@ -309,7 +262,7 @@ class TestDecode:
 
     @settings(max_examples=50, deadline=None)
     @given(st.lists(st.floats(-1e4, 1e4), min_size=LINK_OUTPUTS, max_size=LINK_OUTPUTS), st.floats(-120.0, -20.0))
-    def test_a_distribution_whatever_the_network_says(self, outputs, free_db):
+    def test_a_distribution_whatever_the_network_returns(self, outputs, free_db):
         log_p, means_db, log_variances = decode(np.array([outputs]), np.array([free_db]))
         assert np.exp(log_p).sum() == pytest.approx(1.0)
         assert np.isfinite(means_db).all()
@@ -325,12 +278,6 @@ class TestDecode:
         np.testing.assert_allclose(means_db, [[-70.0, -95.0], [-75.0, -115.0]])
         middle = math.sqrt(STD_RANGE_DB[0] * STD_RANGE_DB[1])
         np.testing.assert_allclose(np.exp(0.5 * log_variances), [[middle] * 2, STD_RANGE_DB[::-1]])
-
-    def test_any_number_of_axes(self):
-        outputs = np.random.default_rng(7).normal(size=(2, 3, LINK_OUTPUTS))
-        free_db = np.random.default_rng(8).normal(-80.0, 5.0, (2, 3))
-        for found, rows in zip(decode(outputs, free_db), decode(outputs.reshape(6, -1), free_db.ravel()), strict=True):
-            np.testing.assert_allclose(found, np.reshape(rows, np.shape(found)))
 
 
 class TestEvaluateContextNetworks:
@@ -368,33 +315,26 @@ class TestEvaluateContextNetworks:
     def test_links_of_several_windows_keep_their_order(self, networks, home, nothing):
         rng = np.random.default_rng(9)
         rx_m = rng.uniform(-7.5, 7.5, (40, 3))
-        phi = features(home, rx_m, unobserved_m=0.0)
-        context = dataclasses.replace(
-            phi.context,
-            maps=(home, nothing),
-            map_index=rng.integers(0, 2, 40),
-            tx_m=rng.integers(-3, 3, (40, 3)) + 0.4,
-        )
-        phi = dataclasses.replace(phi, context=context)
-        assert len(transmitter_windows(phi.context)) > 20
+        tx_m, map_index = rng.integers(-3, 3, (40, 3)) + 0.4, rng.integers(0, 2, 40)
+        phi = features(((home, nothing), map_index), rx_m, tx_m=tx_m)
+        assert len(phi.context.windows) > 20
         together = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
         for number in range(0, 40, 7):
             alone = evaluate_context_networks(networks, phi.take(slice(number, number + 1)), FREQUENCY_HZ)
             for one, all_of_them in zip(alone, together, strict=True):
                 np.testing.assert_allclose(one[:, 0], all_of_them[:, number], rtol=1e-5, atol=1e-5)
 
-    def test_many_links_of_one_window(self, networks, home, monkeypatch):
+    def test_many_links_of_one_window(self, networks, home):
         phi = features(home, np.random.default_rng(10).uniform(-7.5, 7.5, (50, 3)))
         at_once = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
-        monkeypatch.setattr(module, "_LINKS_AT_ONCE", 7)
-        for one, other in zip(evaluate_context_networks(networks, phi, FREQUENCY_HZ), at_once, strict=True):
-            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+        many = evaluate_context_networks(networks, phi.take(np.arange(17_000) % 50), FREQUENCY_HZ)
+        for one, other in zip(at_once, many, strict=True):
+            np.testing.assert_allclose(one, other[:, -50:], rtol=1e-5, atol=1e-5)
 
-    def test_they_are_what_the_networks_say(self, networks, home):
+    def test_as_the_networks_one_by_one(self, networks, home):
         phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)], unobserved_m=1.0)
-        windows, offsets_m = transmitter_windows(phi.context), (phi.context.rx_m - phi.context.tx_m)[:, :2]
-        arguments = (windows, link_inputs(phi, FREQUENCY_HZ)[None], offsets_m[None])
-        outputs = look(networks, *(np.asarray(each, dtype=np.float32) for each in arguments))
+        maps = read_maps(networks, phi.context.windows.astype(np.float32))
+        outputs = read_links(networks, maps, link_inputs(phi, FREQUENCY_HZ)[None], receiver_offsets_m(phi)[None])
         free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
         log_p, means_db, log_variances = decode(np.asarray(outputs, dtype=np.float64)[0], free_db)
         found_p, found_db, found_std_db = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
@@ -403,19 +343,6 @@ class TestEvaluateContextNetworks:
         np.testing.assert_allclose(found_db, expected_db, rtol=1e-5)
         np.testing.assert_allclose(found_std_db, [[0.0] * 2, *np.exp(0.5 * np.transpose(log_variances))], rtol=1e-5)
         np.testing.assert_allclose(found_p.sum(axis=0), 1.0, atol=1e-12)
-
-    @pytest.mark.parametrize("with_map", [False, True])
-    def test_windows_are_drawn_for_a_map_network_alone(self, home, monkeypatch, with_map):
-        drawn = []
-
-        def counted(partial, tx_m):
-            drawn.append(len(tx_m))
-            return map_windows(partial, tx_m)
-
-        monkeypatch.setattr(module, "map_windows", counted)
-        phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)])
-        evaluate_context_networks(context_networks(0, with_map=with_map), phi, FREQUENCY_HZ)
-        assert drawn == ([1] if with_map else [])
 
     def test_gains_stay_above_the_floor(self, home):
         def low(links):

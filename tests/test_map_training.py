@@ -1,4 +1,4 @@
-"""Training of the networks that see where links run, on links of known rules that only they can see."""
+"""Training of the networks that read maps and paths, on links of known rules."""
 
 import dataclasses
 import functools
@@ -7,26 +7,26 @@ import math
 
 import numpy as np
 import pytest
-from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, make_seen_links
+from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, features, make_seen_links
 from scipy.integrate import trapezoid
 from scipy.stats import norm
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction import map_fitting as module
+from sionna_partial.prediction import map_networks as module
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
-from sionna_partial.prediction.map_fitting import fit_context_networks
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M
 from sionna_partial.prediction.map_networks import (
-    LINK_INPUTS,
     LINK_NETWORK,
     context_networks,
     evaluate_context_networks,
+    fit_context_networks,
     link_inputs,
+    receiver_offsets_m,
 )
 from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.prediction.windows import WINDOW_CELLS, WINDOWS, transmitter_places, transmitter_windows
+from sionna_partial.prediction.windows import WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
@@ -69,12 +69,12 @@ def make_room_links(maps, links, seed):
         cells = np.column_stack(np.divmod(place, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
         rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
     count = maps * links
-    full, path_seen = np.ones(count), rng.uniform(size=count) < 0.5
-    gains_db = np.full((count, len(REACHES_M)), -90.0)
+    path_seen = rng.uniform(size=count) < 0.5
+    gains_db = np.full((count, len(ATTENUATION_LENGTHS_M)), -90.0)
     gains_db[~path_seen, -1] = -150.0
-    where = (np.repeat(np.arange(maps), links), np.tile([0.01, 0.01, 1.5], (count, 1)), np.concatenate(rx_m))
-    context = LinkContext(tuple(partial), *where, gains_db, 3.0 * full)
-    phi = LinkFeatures(NLOS * full, 3.0 * full, DISTANCE_M * full, -90.0 * full, context)
+    where, tx_m = (tuple(partial), np.repeat(np.arange(maps), links)), (0.01, 0.01, 1.5)
+    known = {"unobserved_m": 3.0, "distance_m": DISTANCE_M, "state": NLOS, "gain_db": -90.0, "indirect_db": gains_db}
+    phi = features(where, np.concatenate(rx_m), tx_m=tx_m, **known)
     order = rng.permutation(count)
     return Links(phi.take(order), np.concatenate(in_seen_room)[order], path_seen[order])
 
@@ -100,7 +100,7 @@ def trained(networks, rule):
     return found, losses
 
 
-def judge(networks, rule):
+def scores(networks, rule):
     """Return accuracy, cross-entropy and mean NLOS gain [dB] on other maps."""
     links = make_room_links(*OTHERS)
     state, _ = links.truth(getattr(links, rule))
@@ -124,18 +124,18 @@ class TestFitContextNetworks:
         assert 0.4 < links.in_seen_room.mean() < 0.6
 
     def test_paths(self):
-        accuracy, entropy, gain_db = judge(trained("paths", "path_seen")[0], "path_seen")
+        accuracy, entropy, gain_db = scores(trained("paths", "path_seen")[0], "path_seen")
         assert accuracy == 1.0
         assert entropy < 0.01
         assert gain_db == pytest.approx(GAIN_DB, abs=1.0)
 
     def test_paths_do_not_show_where_receivers_are(self):
-        accuracy, entropy, _ = judge(trained("paths", "in_seen_room")[0], "in_seen_room")
+        accuracy, entropy, _ = scores(trained("paths", "in_seen_room")[0], "in_seen_room")
         assert accuracy < 0.6
         assert entropy > math.log(2.0) - 0.01
 
     def test_map(self):
-        accuracy, entropy, gain_db = judge(trained("map", "in_seen_room")[0], "in_seen_room")
+        accuracy, entropy, gain_db = scores(trained("map", "in_seen_room")[0], "in_seen_room")
         assert accuracy > 0.9
         assert entropy < 0.5 * math.log(2.0)
         assert gain_db == pytest.approx(GAIN_DB, abs=4.0)
@@ -159,22 +159,14 @@ class TestFitContextNetworks:
             np.testing.assert_array_equal(weight, same)
             assert (weight != different).any()
 
-    def test_the_seed_is_that_of_the_first_weights(self, monkeypatch):
-        monkeypatch.setattr(module, "LEARNING_RATE", 0.0)
-        found = fit_context_networks(*few_links(), PredictorSettings("paths", passes=1, seed=7))[LINK_NETWORK]
-        first = context_networks(7, with_map=False)[LINK_NETWORK]
-        for weight, expected in zip(found.get_weights(), first.get_weights(), strict=True):
-            np.testing.assert_array_equal(weight, expected)
-
-    def test_progress(self, monkeypatch, caplog):
-        monkeypatch.setattr(module, "_REPORT_STEPS", 2)
+    def test_progress(self, caplog):
         calls = []
         with caplog.at_level(logging.INFO, module.__name__):
-            fit_context_networks(
-                *few_links(), PredictorSettings("paths", passes=18), progress=lambda *call: calls.append(call)
-            )
-        assert [share for share, _ in calls] == [0.0, 0.4, 0.8]
-        assert [message.partition(", loss ")[0] for _, message in calls] == [f"step {n} of 5" for n in (0, 2, 4)]
+            settings = PredictorSettings("paths", passes=18)
+            fit_context_networks(*few_links(), settings, progress=lambda *call: calls.append(call))
+        ((done, message),) = calls
+        assert done == 0.0
+        assert message.startswith("step 0 of 5, loss ")
         (message,) = (record.message for record in caplog.records if record.name == module.__name__)
         assert message.startswith("5 steps on 4 windows: loss ")
 
@@ -184,26 +176,12 @@ class TestFitContextNetworks:
             fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
 
 
-def test_ranked_score_is_the_integral_of_the_squared_difference_of_distributions():
+def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
     gain_db = np.linspace(-60.0, 60.0, 120_001)
     errors_db, stds_db = np.array([0.0, 2.5, -7.0, 20.0]), np.array([1.0, 4.0, 3.0, 0.5])
     below = norm.cdf(gain_db / stds_db[:, None])
     expected = trapezoid((below - (gain_db >= errors_db[:, None])) ** 2, gain_db)
-    np.testing.assert_allclose(module._ranked_score(errors_db, stds_db), expected, atol=2e-3)
-
-
-class TestTurning:
-    def test_eight_ways_keep_each_place_in_its_cell(self):
-        image, half = np.arange(3 * WINDOW_CELLS**2).reshape(1, WINDOW_CELLS, WINDOW_CELLS, 3), WINDOW_CELLS / 2
-        places = np.random.default_rng(3).uniform(0.5 - half, half - 0.5, (200, 2)).astype(np.float32)
-        expected = image[0][*(places + half).T[::-1].astype(int)]
-        ways = []
-        for turn in range(8):
-            turned, moved = module._turned(image, turn), module._turned_offsets(places, turn)
-            np.testing.assert_array_equal(turned[0][*(moved + half).T[::-1].astype(int)], expected)
-            np.testing.assert_allclose(*(abs(each).sum(axis=1) for each in (moved, places)), rtol=1e-5)
-            ways.append(turned[..., 0].ravel())
-        assert len(np.unique(ways, axis=0)) == 8
+    np.testing.assert_allclose(module._crps(errors_db, stds_db), expected, atol=2e-3)
 
 
 @pytest.fixture(scope="module")
@@ -216,49 +194,33 @@ def examples(links):
     """Gains are the numbers of the links."""
     numbers = np.arange(len(links.phi), dtype=np.float64)
     state = links.truth(links.in_seen_room)[0]
-    return module._Examples.of_links(links.phi, state, numbers, PredictorSettings("map"))
+    return module._Examples(links.phi, state, numbers, PredictorSettings("map"))
 
 
 class TestExamples:
     def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
-        phi, context = links.phi, links.phi.context
-        windows, (_, index) = transmitter_windows(context), transmitter_places(context)
+        """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
+        phi, half, cell_m = links.phi, WINDOW_CELLS / 2, 0.3
         inputs, state = link_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
-        turns = []
+        turns = set()
         for batch in examples.batches(4, np.random.default_rng(4)):
             for number, drawn in enumerate(batch["gain_db"].astype(int)):
-                (window,) = set(index[drawn])
-                (turn,) = (
-                    way
-                    for way in range(8)
-                    if np.array_equal(module._turned(windows[window], way), batch["windows"][number])
-                )
-                turns.append(turn)
-                offsets_m = (context.rx_m - context.tx_m)[drawn, :2].astype(np.float32)
-                expected = module._turned_offsets(offsets_m, turn)
-                np.testing.assert_allclose(batch["offsets_m"][number], expected, atol=1e-4)
+                (window,) = set(phi.context.window_index[drawn])
+                offsets_m, moved_m = receiver_offsets_m(phi)[drawn], batch["offsets_m"][number]
+                before, after = ((each / cell_m + half).astype(int).T[::-1] for each in (offsets_m, moved_m))
+                image = batch["windows"][number, 0]
+                np.testing.assert_array_equal(image[*after], phi.context.windows[window, 0][*before])
+                swapped = not np.allclose(abs(moved_m), abs(offsets_m), atol=1e-4)
+                turns.add((swapped, *np.sign(moved_m[0] * (offsets_m[0, ::-1] if swapped else offsets_m[0]))))
                 np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
                 np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
                 free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
                 np.testing.assert_allclose(batch["free_db"][number], free_db, rtol=1e-6)
-        assert set(turns) == set(range(8))
-
-    def test_shapes_of_a_batch(self, examples):
-        (batch,) = examples.batches(1, np.random.default_rng(5))
-        size, links = module.WINDOWS_AT_ONCE, module.LINKS_OF_WINDOW
-        shapes = {
-            "windows": (size, *WINDOWS),
-            "links": (size, links, LINK_INPUTS),
-            "offsets_m": (size, links, 2),
-            **dict.fromkeys(("free_db", "link_state", "gain_db"), (size, links)),
-        }
-        assert {name: values.shape for name, values in batch.items()} == shapes
-        assert {str(values.dtype) for values in batch.values()} == {"float32", "int32"}
+        assert len(turns) == 8
 
     def test_each_pass_has_every_window_once(self, links, examples):
-        _, index = transmitter_places(links.phi.context)
         drawn = [
-            index[int(numbers[0])]
+            links.phi.context.window_index[int(numbers[0])]
             for batch in examples.batches(3, np.random.default_rng(6))
             for numbers in batch["gain_db"]
         ]
@@ -267,7 +229,6 @@ class TestExamples:
         assert passes == [list(range(count))] * 7
 
     def test_without_a_map_network_there_are_no_windows(self, links):
-        truth = links.truth(links.path_seen)
-        found = module._Examples.of_links(links.phi, *truth, PredictorSettings("paths"))
+        found = module._Examples(links.phi, *links.truth(links.path_seen), PredictorSettings("paths"))
         (batch,) = found.batches(1, np.random.default_rng(7))
         assert "windows" not in batch
