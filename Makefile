@@ -6,7 +6,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
-LEARNED_FROM := build/predictor/{camera,mixed,large}
+LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
 FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
 .PHONY: help demo test lint format lock scenes predictor wheel wheel-check clean
@@ -41,7 +41,9 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 	@rm -rf build/predictor
 	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 300 --first-seed 100000
 	@$(BIN)/sionna-partial dataset build/predictor/mixed --homes 200 --first-seed 110000 --mixed-sensors $(FRACTIONS)
-	@$(BIN)/sionna-partial dataset build/predictor/large --homes 135 --first-seed 200000 --mixed-sensors $(FRACTIONS) \
+	@$(BIN)/sionna-partial dataset build/predictor/floors --homes 100 --first-seed 220000 --mixed-sensors $(FRACTIONS) \
+		--kind floor --short-links 0.5
+	@$(BIN)/sionna-partial dataset build/predictor/large --homes 40 --first-seed 200000 --mixed-sensors $(FRACTIONS) \
 		--kind floor --kind floor --kind hall --kind warehouse --short-links 0.5
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \

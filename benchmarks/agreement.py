@@ -10,14 +10,14 @@ from stock import Paths, is_bent
 
 import sionna_partial as sp
 from sionna_partial.scene.scene import SceneGeometry, build_scene
-from sionna_partial.tracing.generator import DIFFRACTION
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, find_wedges
 
 SAME_DELAY_S = 1e-11
 """Paths to one receiver whose delays differ by less are the same [s]: 3 mm."""
 
 SAME_POINT_M = 0.03
-"""Largest distance between the points of equal paths [m]. Sionna RT mirrors at either of two nearly coplanar walls."""
+"""Largest distance between the points of equal paths [m]. Sionna RT reflects at either of two nearly coplanar walls."""
 
 TOUCH_M = 2e-3
 """Distance from the ends of a leg within which it may touch a wall [m]."""
@@ -50,11 +50,11 @@ def agreement(
     shift = np.array([*partial.origin_m, 0.0])
     geometry = build_scene(partial) if partial.mesh is None else partial.mesh.corners_m - shift
     count = dict.fromkeys(("links", "truth", "found", "extra", "real", "leaks", "same_state", "same_gain"), 0)
-    for place, ours, theirs in zip(rx, found, truth, strict=True):
+    for position, ours, theirs in zip(rx, found, truth, strict=True):
         pairs = pair_paths(ours, theirs)
         extra, alone = (np.setdiff1d(np.arange(len(p["a"])), k) for p, k in zip((ours, theirs), pairs.T, strict=True))
         real, sound = np.zeros(len(extra), bool), np.ones(len(theirs["a"]), bool)
-        ends = tx - shift, place - shift
+        ends = tx - shift, position - shift
         real[:] = [is_real(geometry, *ends, each - shift) for each in ours["vertices_m"][extra]]
         sound[alone] = [is_real(geometry, *ends, each - shift) for each in theirs["vertices_m"][alone]]
         best = {name: np.concatenate([theirs[name][sound], ours[name][extra[real]]]) for name in ("a", "interactions")}
@@ -87,12 +87,12 @@ def meant(partial: sp.PartialMap, tx: NDArray[np.float64], rx: NDArray[np.float6
     wedges, shift = find_wedges(build_scene(partial), open_ends=False), np.array([*partial.origin_m, 0.0])
     edges = cKDTree(wedges.edge_m.reshape(-1, 2))
     kept = []
-    for place, each in zip(rx, paths, strict=True):
+    for position, each in zip(rx, paths, strict=True):
         stays = ~is_bent(each)
         for k in np.flatnonzero(~stays) if edges.n else ():
             at = int((each["interactions"][k] == DIFFRACTION).argmax())
             vertices = each["vertices_m"][k][np.isfinite(each["vertices_m"][k, :, 0])]
-            points = np.concatenate([tx[None], vertices, place[None]]) - shift
+            points = np.concatenate([tx[None], vertices, position[None]]) - shift
             distance, index = edges.query(points[at + 1, :2])
             legs = points[[at, at + 2], :2] - wedges.edge_m[index]
             inside = (legs @ wedges.normal[index].T > 0.0).any(axis=1).all()
@@ -123,11 +123,11 @@ def pair_paths(first: Paths, second: Paths) -> NDArray[np.intp]:
 
 
 def _padded(paths: Paths, deep: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Interactions (P, D) and their places (P, 3 D), 0 where there is none."""
+    """Interactions (P, D) and their positions (P, 3 D), 0 where there is none."""
     missing = deep - paths["interactions"].shape[1]
     kinds = np.pad(paths["interactions"], ((0, 0), (0, missing)))
-    places = np.nan_to_num(np.pad(paths["vertices_m"], ((0, 0), (0, missing), (0, 0))))
-    return kinds, places.reshape(len(kinds), 3 * deep)
+    positions = np.nan_to_num(np.pad(paths["vertices_m"], ((0, 0), (0, missing), (0, 0))))
+    return kinds, positions.reshape(len(kinds), 3 * deep)
 
 
 def is_real(
@@ -138,12 +138,12 @@ def is_real(
 ) -> bool:
     """Check one path in double precision: its legs cross no wall of a plan, or no triangle (F, 3, 3), within them."""
     points = np.concatenate([tx[None], vertices_m[np.isfinite(vertices_m[:, 0])], rx[None]])
-    for start, way in zip(points[:-1], np.diff(points, axis=0), strict=True):
-        margin = TOUCH_M / max(float(np.linalg.norm(way)), TOUCH_M)
+    for start, leg in zip(points[:-1], np.diff(points, axis=0), strict=True):
+        margin = TOUCH_M / max(float(np.linalg.norm(leg)), TOUCH_M)
         along = (
-            _plan_crossings(geometry, start, way)
+            _plan_crossings(geometry, start, leg)
             if isinstance(geometry, SceneGeometry)
-            else _hits(geometry, start, way)
+            else _hits(geometry, start, leg)
         )
         if ((along > margin) & (along < 1 - margin)).any():
             return False
@@ -151,24 +151,24 @@ def is_real(
 
 
 def _plan_crossings(
-    geometry: SceneGeometry, start: NDArray[np.float64], way: NDArray[np.float64]
+    geometry: SceneGeometry, start: NDArray[np.float64], leg: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Shares of a leg at which it crosses walls, seen from above."""
+    """Positions along a leg, as fractions of it, at which it crosses walls in the plan."""
     wall = geometry.walls_m[:, 1] - geometry.walls_m[:, 0]
     x, y = (geometry.walls_m[:, 0] - start[:2]).T
-    area = way[0] * wall[:, 1] - way[1] * wall[:, 0]
+    area = leg[0] * wall[:, 1] - leg[1] * wall[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        along, across = (x * wall[:, 1] - y * wall[:, 0]) / area, (x * way[1] - y * way[0]) / area
+        along, across = (x * wall[:, 1] - y * wall[:, 0]) / area, (x * leg[1] - y * leg[0]) / area
     return along[(across > 0) & (across < 1)]
 
 
-def _hits(corners: NDArray[np.float64], start: NDArray[np.float64], way: NDArray[np.float64]) -> NDArray[np.float64]:
+def _hits(corners: NDArray[np.float64], start: NDArray[np.float64], leg: NDArray[np.float64]) -> NDArray[np.float64]:
     """Shares of a leg at which it passes triangles (Moeller and Trumbore 1997)."""
     first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], start - corners[:, 0]
-    normal = np.cross(way, second)
+    normal = np.cross(leg, second)
     side = np.cross(offset, first)
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = 1.0 / (first * normal).sum(axis=1)
-        u, v = (offset * normal).sum(axis=1) * scale, (side * way).sum(axis=1) * scale
+        u, v = (offset * normal).sum(axis=1) * scale, (side * leg).sum(axis=1) * scale
         along = (side * second).sum(axis=1) * scale
         return along[(u > 0) & (v > 0) & (u + v < 1)]

@@ -1,4 +1,4 @@
-"""Large procedural buildings beside real office floors: sizes, shapes, lines of sight, and how fast a robot sees them.
+"""Large procedural buildings compared with real office floors: sizes, shapes, lines of sight, observed area.
 
 Everything is measured on the cells, without tracing. Each statistic is one number per building; the table gives its
 mean and standard deviation over buildings. FOLDER holds one folder with a map.yaml for each real floor. Run it with
@@ -17,10 +17,10 @@ from homes import perimeter_cells, plain, room_count
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import ndimage
-from sionna_partial.plots.figures import figure_png
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
+from sionna_partial.plots.style import figure_png
 
 FIRST_SEED = 80_000
 KINDS = ("floor", "hall", "warehouse")
@@ -75,7 +75,7 @@ def measure(home: sp.PartialMap, seed: int) -> dict[str, float]:
 
 
 def lines_of_sight(free: NDArray[np.bool_], cell_m: float, seed: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Length [m] of links between random free places, half of them within 25 m; whether free cells join the ends."""
+    """Length [m] of links between random free positions, half of them within 25 m; whether free cells join the ends."""
     rng = np.random.default_rng(seed)
     cells = np.argwhere(free)
     start, end = cells[rng.integers(len(cells), size=(2, LINKS))] + 0.5

@@ -1,6 +1,6 @@
-"""How much of a home the robot has seen, stage by stage, beside the robot of the paper.
+"""Fraction of a home that the robot has observed at each stage, compared with the robot of the paper.
 
-Each home is explored from several random starts, and the share of its free cells that have been seen is averaged over
+Each home is explored from several random starts, and the observed fraction of its free cells is averaged over
 these. The table shows the mean over homes, its standard error, and how homes and starts differ. Run it with
 
     python benchmarks/exploration.py --seeds 8
@@ -27,9 +27,9 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=40, help="number of procedural homes")
     parser.add_argument("--seeds", type=int, default=4, help="number of explorations of each home")
     arguments = parser.parse_args()
-    seen = np.array([observed(home, range(arguments.seeds)) for home in homes(arguments.homes, arguments.count)])
-    print(f"{len(seen)} homes, {arguments.seeds} explorations each: observed fraction")
-    print_table(seen)
+    fractions = np.array([observed(home, range(arguments.seeds)) for home in homes(arguments.homes, arguments.count)])
+    print(f"{len(fractions)} homes, {arguments.seeds} explorations each: observed fraction")
+    print_table(fractions)
 
 
 def homes(folder: Path | None, count: int) -> list[sp.PartialMap]:
@@ -47,13 +47,13 @@ def observed(home: sp.PartialMap, seeds: Sequence[int]) -> NDArray[np.float64]:
     return np.array([[partial.observed_fraction for partial in sp.explore(home, tuple(AIM), seed)] for seed in seeds])
 
 
-def print_table(seen: NDArray[np.float64]) -> None:
+def print_table(fractions: NDArray[np.float64]) -> None:
     """Print a line for each stage of observed fractions (homes, seeds, stages)."""
-    of_home = seen.mean(axis=1)
-    spread = of_home.std(axis=0, ddof=1) if len(seen) > 1 else np.zeros(len(AIM))
-    between_starts = seen.std(axis=1).mean(axis=0)
+    of_home = fractions.mean(axis=1)
+    spread = of_home.std(axis=0, ddof=1) if len(fractions) > 1 else np.zeros(len(AIM))
+    between_starts = fractions.std(axis=1).mean(axis=0)
     lowest, highest = of_home.min(axis=0), of_home.max(axis=0)
-    columns = of_home.mean(axis=0), spread / np.sqrt(len(seen)), spread, lowest, highest, between_starts
+    columns = of_home.mean(axis=0), spread / np.sqrt(len(fractions)), spread, lowest, highest, between_starts
     heads = "step", "mean", "std. error", "over homes", "lowest", "highest", "over starts", "aim"
     print("".join(f"{head:>12}" for head in heads))
     for step, *numbers in zip(AIM, *columns, AIM.values(), strict=True):

@@ -1,15 +1,16 @@
-"""Gradients of the predicted distribution beside finite differences, and what they cost.
+"""Gradients of the predicted distribution compared with finite differences, and their cost.
 
-On random homes, complete and half explored, everything that `DifferentiableScene` says of a link is differentiated with
-respect to transmitter, materials and frequency, by TensorFlow through networks, features and Sionna RT. Differences are
-those of the same function at 25 places around each parameter's value: their slope, and its standard error, come from a
-polynomial of degree 4. On complete maps the answer is the trace itself; on the others it is that of both predictors.
+On random homes, complete and half explored, everything that `DifferentiableScene` returns for a link is
+differentiated with respect to transmitter, materials and frequency, by TensorFlow through networks, features and Sionna
+RT. The reference is the slope of a polynomial of degree 4, and its standard error, through 25 values of the same
+function around each parameter's value. On complete maps the prediction is the trace itself; on the others it is that of
+both predictors.
 
-Receivers are left out at which paths of more than 0.002 % of the power appear or vanish between the outermost places,
-for derivatives cannot see that, or which pass the middle of a cell of the map network's window, where its answer has a
-bend; the column "kept" has the share of the others. Sionna RT computes in single precision, so that differences can be
-unsure by more than 1 % of a small slope: errors are given as they are, with three standard errors allowed, and for the
-receivers where the standard error is below 0.3 % of the slope. Run it with
+Receivers are left out at which paths of more than 0.002 % of the power appear or vanish between the outermost values,
+which derivatives do not include, or which pass the centre of a cell of the map network's window, where the slope is
+discontinuous; the column "kept" has the fraction of the others. Sionna RT computes in single precision, so that
+differences can be inaccurate by more than 1 % of a small slope: errors are given as they are, with three standard
+errors allowed, and for the receivers where the standard error is below 0.3 % of the slope. Run it with
 
     python benchmarks/gradient.py
 """
@@ -27,7 +28,7 @@ import sionna_partial as sp
 from sionna_partial.differentiable.scene import DifferentiableLinks, DifferentiableScene
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.prediction.windows import CELLS_M
-from sionna_partial.tracing.fixed_paths import FixedPaths
+from sionna_partial.tracing.path_set import PathSet
 
 import_keras()
 import tensorflow as tf  # noqa: E402 (after LLVM)
@@ -74,7 +75,7 @@ def main() -> None:
             rx = grid[np.sort(rng.choice(len(grid), min(arguments.receivers, len(grid)), replace=False))]
             for predictor in ("paper", "map") if steps else ("trace",):
                 scene = DifferentiableScene(partial, predictor=None if predictor == "trace" else predictor)
-                for key, errors in compare(scene, tx, rx, bends=predictor == "map"):
+                for key, errors in compare(scene, tx, rx, skip_centres=predictor == "map"):
                     found.setdefault((predictor, *key), []).append(errors)
                 cost(scene, tx, grid, f"home {seed}, {steps or 'all'} steps, {predictor}")
     print(f"\n{'':8}{'':14}{'':24}{'kept':>7}{'<= 1 %':>9}{'or noise':>9}{'where sure':>17}{'median':>10}{'noise':>10}")
@@ -83,7 +84,7 @@ def main() -> None:
 
 
 def compare(
-    scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.float64], *, bends: bool
+    scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.float64], *, skip_centres: bool
 ) -> Iterator[tuple[tuple[str, str], Errors]]:
     """Yield the errors of the derivatives of every output with respect to every parameter."""
     paths = scene.paths.paths(tx, rx)
@@ -91,14 +92,14 @@ def compare(
     outputs = ["gain_mean_db"] if scene.partial.is_complete else OUTPUTS  # the rest is constant
     exact = jacobians(links, outputs)
     found: dict[tuple[str, str], Errors] = {}
-    for name, reach in REACHES.items():
-        steps = np.linspace(-reach, reach, POINTS)
+    for name, width in REACHES.items():
+        steps = np.linspace(-width, width, POINTS)
         answers = [links(**{field_of(name): moved(links, name, step)}) for step in steps]
-        left_out = changes(scene, paths, name, reach)
-        if bends and name in ("x", "y"):
+        left_out = changes(scene, paths, name, width)
+        if skip_centres and name in ("x", "y"):
             axis = "xy".index(name)
             for cell_m in CELLS_M:
-                left_out |= np.abs((rx - tx)[:, axis] / cell_m % 1.0 - 0.5) * cell_m <= reach
+                left_out |= np.abs((rx - tx)[:, axis] / cell_m % 1.0 - 0.5) * cell_m <= width
         for output in outputs:
             values = np.stack([getattr(answer, output).numpy() for answer in answers])
             errors = differences(steps, values, exact[output, name])
@@ -138,7 +139,7 @@ def moved(links: DifferentiableLinks, name: str, step: float) -> NDArray[np.floa
     return getattr(links.base, field_of(name)) + step * direction
 
 
-def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: float) -> NDArray[np.bool_]:
+def changes(scene: DifferentiableScene, paths: PathSet, name: str, reach: float) -> NDArray[np.bool_]:
     """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within reach."""
     changed = np.zeros(len(paths.rx_m), dtype=bool)
     if name not in "xyz":
@@ -147,22 +148,22 @@ def changes(scene: DifferentiableScene, paths: FixedPaths, name: str, reach: flo
         place = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
         there = scene.paths.paths(place, paths.rx_m)
         kept = paths.at(replace(paths.base, tx_m=place))[0]
-        old = np.bincount(paths.rx_of_path, weights=paths.power, minlength=len(changed))
-        gone = np.bincount(paths.rx_of_path, weights=paths.power * (kept == 0.0), minlength=len(changed))
-        fixed = np.bincount(paths.rx_of_path, weights=kept, minlength=len(changed))
-        new = np.bincount(there.rx_of_path, weights=there.power, minlength=len(changed))
+        old = np.bincount(paths.path_rx, weights=paths.power, minlength=len(changed))
+        gone = np.bincount(paths.path_rx, weights=paths.power * (kept == 0.0), minlength=len(changed))
+        fixed = np.bincount(paths.path_rx, weights=kept, minlength=len(changed))
+        new = np.bincount(there.path_rx, weights=there.power, minlength=len(changed))
         changed |= (gone > CHANGE * old) | (np.abs(new - fixed) > CHANGE * np.maximum(old, new))
     return changed
 
 
 def differences(steps: NDArray[np.float64], values: NDArray[np.float64], exact: NDArray[np.float64]) -> Errors:
     """Error, size and standard error of derivatives, from the values (K, N) at K steps."""
-    reach = steps[-1]
-    matrix = np.vander(steps / reach, DEGREE + 1, increasing=True)
+    width = steps[-1]
+    matrix = np.vander(steps / width, DEGREE + 1, increasing=True)
     fit = np.linalg.pinv(matrix) @ values
     rest = ((values - matrix @ fit) ** 2).sum(axis=0) / (len(steps) - DEGREE - 1)
-    noise = np.sqrt(rest * np.linalg.inv(matrix.T @ matrix)[1, 1]) / reach
-    return np.stack([np.abs(exact - fit[1] / reach), np.abs(fit[1] / reach), noise])
+    noise = np.sqrt(rest * np.linalg.inv(matrix.T @ matrix)[1, 1]) / width
+    return np.stack([np.abs(exact - fit[1] / width), np.abs(fit[1] / width), noise])
 
 
 def report(name: str, errors: Errors) -> None:
@@ -180,7 +181,7 @@ def report(name: str, errors: Errors) -> None:
 def cost(scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.float64], name: str) -> None:
     """Print how long gradients take, as a multiple of the trace, warm."""
     links = scene.links(tx, rx)
-    place, permittivity = tf.Variable(links.base.tx_m), tf.Variable(links.base.relative_permittivity)
+    position_m, permittivity = tf.Variable(links.base.tx_m), tf.Variable(links.base.relative_permittivity)
 
     def gradient(**values: tf.Variable) -> None:
         with tf.GradientTape() as tape:
@@ -189,8 +190,8 @@ def cost(scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.flo
 
     jobs = {
         "links": lambda: scene.links(tx, rx),
-        "second use": lambda: links(tx_m=place),
-        "gradient by place": lambda: gradient(tx_m=place),
+        "second use": lambda: links(tx_m=position_m),
+        "gradient by position": lambda: gradient(tx_m=position_m),
         "by material": lambda: gradient(relative_permittivity=permittivity),
         "all seven, forward": lambda: sp.gain_gradients(scene.partial, tx, rx),
     }

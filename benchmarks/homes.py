@@ -1,8 +1,8 @@
-"""Procedural homes beside real ones: sizes, shapes, and what links in them are like.
+"""Procedural homes compared with real ones: sizes, shapes, and statistics of links.
 
 Each statistic is one number per home; the table gives its mean and standard deviation over homes, how many standard
 deviations of the real homes apart the means are, and the ratio of the standard deviations (ours to theirs). Offices are
-listed beside: a kind of their own, which the real homes do not have. FOLDER holds one folder with a map.yaml for each
+listed as well: a kind of their own, which the real homes do not have. FOLDER holds one folder with a map.yaml for each
 real home. Run it with
 
     python benchmarks/homes.py --gibson ../shared/gibson --out docs
@@ -21,11 +21,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import ndimage
-from sionna_partial.plots.figures import figure_png
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
-from sionna_partial.prediction.features import unobserved_distance_m
+from sionna_partial.plots.style import figure_png
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.scene.outlines import wall_outlines
 
 FIRST_SEED = 70_000
@@ -49,19 +49,19 @@ class Statistics:
 
     area_m2: float
     span_m: float
-    hull_share: float
+    hull_fraction: float
     perimeter_per_area: float
     islands_per_100_m2: float
     room_m2: float
     segments_per_m: float
     segments_per_m2: float
-    visible_share: float
-    los_share: float
-    nlos_share: float
-    outage_share: float
+    visible_fraction: float
+    los_fraction: float
+    nlos_fraction: float
+    outage_fraction: float
     link_m: float
-    solid_share: float
-    unobserved_share: float
+    solid_fraction: float
+    unobserved_fraction: float
 
 
 @dataclass(frozen=True)
@@ -75,20 +75,20 @@ class Measured:
 
 LABELS = {
     "area_m2": "free area [m2]",
-    "span_m": "longest way across [m]",
-    "hull_share": "free share of the convex hull",
+    "span_m": "largest extent [m]",
+    "hull_fraction": "free fraction of the convex hull",
     "perimeter_per_area": "perimeter per free area [1/m]",
     "islands_per_100_m2": "islands per 100 m2 free",
     "room_m2": "mean room [m2]",
     "segments_per_m": "outline segments per length [1/m]",
     "segments_per_m2": "outline segments per free area [1/m2]",
-    "visible_share": "area visible from a free point",
-    "los_share": "links in LOS",
-    "nlos_share": "links in NLOS",
-    "outage_share": "links in outage",
+    "visible_fraction": "area visible from a free point",
+    "los_fraction": "links in LOS",
+    "nlos_fraction": "links in NLOS",
+    "outage_fraction": "links in outage",
     "link_m": "mean length of a link [m]",
-    "solid_share": "share of a link not in free space",
-    "unobserved_share": f"d_unobs / d after {STEPS} steps",
+    "solid_fraction": "fraction of a link not in free space",
+    "unobserved_fraction": f"d_unobs / d after {STEPS} steps",
 }
 """What the statistics are called in the table and the picture. Rooms are what remains where no passage is wider than
 0.9 m."""
@@ -134,19 +134,19 @@ def measure(home: sp.PartialMap, seed: int) -> Measured:
     statistics = Statistics(
         area_m2=area_m2,
         span_m=shapely.minimum_bounding_radius(hull) * 2,
-        hull_share=area_m2 / hull.area,
+        hull_fraction=area_m2 / hull.area,
         perimeter_per_area=perimeter_cells(free) * home.resolution_m / area_m2,
         islands_per_100_m2=100 * (ndimage.label(np.pad(~free, 1, constant_values=True))[1] - 1) / area_m2,
         room_m2=area_m2 / room_count(free, home.resolution_m),
         segments_per_m=len(outlines.segments) / outline_m,
         segments_per_m2=len(outlines.segments) / area_m2,
-        visible_share=float(np.mean(solid_m == 0)),
-        los_share=float(is_los.mean()),
-        nlos_share=float(np.mean(~is_los & ~is_outage)),
-        outage_share=float(is_outage.mean()),
+        visible_fraction=float(np.mean(solid_m == 0)),
+        los_fraction=float(is_los.mean()),
+        nlos_fraction=float(np.mean(~is_los & ~is_outage)),
+        outage_fraction=float(is_outage.mean()),
         link_m=distance_m.mean(),
-        solid_share=float(np.mean(solid_m / distance_m)),
-        unobserved_share=float(np.mean(unobserved_m / distance_m)),
+        solid_fraction=float(np.mean(solid_m / distance_m)),
+        unobserved_fraction=float(np.mean(unobserved_m / distance_m)),
     )
     return Measured(statistics, rate(distance_m, is_los), rate(distance_m, is_outage))
 
@@ -154,17 +154,17 @@ def measure(home: sp.PartialMap, seed: int) -> Measured:
 def random_links(
     home: sp.PartialMap, seed: int
 ) -> tuple[sp.TracedLinks, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Trace links between random free places; also their lengths, and those outside free and outside seen cells [m]."""
+    """Trace links between random free positions; also their lengths, and those outside free and observed cells [m]."""
     rng = np.random.default_rng(seed)
     free = home.state == sp.CellState.FREE
     cells = rng.permutation(np.argwhere(free))[: TRANSMITTERS + RECEIVERS, ::-1] + 0.5
-    places = np.column_stack([cells * home.resolution_m + home.origin_m, np.full(len(cells), HEIGHT_M)])
-    tx, rx = places[:TRANSMITTERS], places[TRANSMITTERS:]
+    positions = np.column_stack([cells * home.resolution_m + home.origin_m, np.full(len(cells), HEIGHT_M)])
+    tx, rx = positions[:TRANSMITTERS], positions[TRANSMITTERS:]
     rx = rx[np.linalg.norm(rx[:, None] - tx, axis=2).min(axis=1) > NEAREST_M]
     solid = replace(home, state=np.where(free, sp.CellState.FREE, sp.CellState.UNKNOWN))
     seen = sp.explore(home, (STEPS,), seed=seed)[0]
     missing_m = [
-        np.concatenate([unobserved_distance_m(partial, place, rx) for place in tx]) for partial in (solid, seen)
+        np.concatenate([unobserved_lengths_m(partial, place, rx) for place in tx]) for partial in (solid, seen)
     ]
     return sp.trace_links(home, tx, rx), np.linalg.norm(rx - tx[:, None], axis=2).ravel(), *missing_m
 
@@ -184,7 +184,7 @@ def room_count(free: NDArray[np.bool_], resolution_m: float) -> int:
 
 
 def rate(distance_m: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Share (bins,) of the links of each distance that are chosen; NaN where there are too few links."""
+    """Fraction (bins,) of the links of each distance that are chosen; NaN where there are too few links."""
     links, hits = (np.histogram(values, EDGES_M)[0] for values in (distance_m, distance_m[chosen]))
     return np.where(links >= FEWEST_LINKS, hits / np.maximum(links, 1), math.nan)
 

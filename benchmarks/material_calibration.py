@@ -1,8 +1,8 @@
-"""Hidden materials recovered from noisy gains, on procedural homes that nothing was made on.
+"""Hidden materials recovered from noisy gains, on procedural homes that were not used for development.
 
-Each home gets hidden materials, whose gains are traced on the complete home at places that the map shows as free; noise
-is added, and `calibrate_materials` sees the map (complete, or half explored) and the noisy gains. Errors are those of
-the loss of a reflection at angles of incidence from 0 to 75 degrees, where the loss is below 30 dB; "te" is the
+Each home gets hidden materials. Their gains are traced on the complete home at positions that are free on the map, with
+noise, and `calibrate_materials` gets the map (complete or half explored) and the noisy gains. Errors are those of the
+loss of a reflection at angles of incidence from 0 to 75 degrees, where the loss is below 30 dB; "te" is the
 polarisation of vertical antennas at walls. Gains of links that were not measured are compared with their truth. Run
 
     python benchmarks/material_calibration.py
@@ -99,10 +99,10 @@ def trial(
     """Measure with noise, calibrate, and compare."""
     rng = np.random.default_rng([seed, *hidden.encode()])
     count, material = arguments.transmitters, HIDDEN[hidden]
-    places = free_places(known, count, rng)
-    each = [free_places(known, 2 * arguments.links // count, rng) for _ in range(count)]
-    truth = gains_db(home, places, each, material)
-    tx = np.repeat(places, len(each[0]), axis=0)
+    positions = free_positions(known, count, rng)
+    each = [free_positions(known, 2 * arguments.links // count, rng) for _ in range(count)]
+    truth = gains_db(home, positions, each, material)
+    tx = np.repeat(positions, len(each[0]), axis=0)
     rx = np.concatenate(each)
     measured = np.arange(len(rx)) % 2 == 0
     noisy = truth + arguments.noise * rng.standard_normal(len(truth))
@@ -114,7 +114,7 @@ def trial(
     held = ~measured & (truth > -140.0)
     rmse = {}
     for name, scene in (("default", known), ("calibrated", result.scene), ("hidden", known)):
-        traced = gains_db(scene, places, each, material if name == "hidden" else None)
+        traced = gains_db(scene, positions, each, material if name == "hidden" else None)
         rmse[name] = float(np.sqrt(np.mean((traced - truth)[held & (traced > -150.0)] ** 2)))
     error, std = loss_errors(result, material)
     inside = {
@@ -152,7 +152,7 @@ def gains_db(
     return np.concatenate([links.gain_db for links in trace_each(scene, list(tx), rx, scene_settings=settings)])
 
 
-def free_places(partial: sp.PartialMap, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def free_positions(partial: sp.PartialMap, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Places in free cells, 1.5 m high."""
     cells = np.argwhere(partial.state == sp.CellState.FREE)
     chosen = cells[rng.choice(len(cells), count)] + rng.uniform(0.2, 0.8, (count, 2))

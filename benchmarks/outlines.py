@@ -1,9 +1,9 @@
-"""Outlines of wall cells: their number on noisy maps, leaks of partly seen walls, time.
+"""Outlines of wall cells: their number on noisy maps, leaks of partly observed walls, time.
 
 - Segments: number of outline segments per metre of outline, on maps with noise and on maps of the same buildings
   without.
 - Leaks: links that cross a wall of the complete map where the partial map has a wall cell within two cells, but cross
-  no outline of the partial map; those of them where the wall was seen on both sides of the crossing, within eight
+  no outline of the partial map; those of them where the wall was observed on both sides of the crossing, within eight
   cells; and the opposite, links that cross an outline of the partial map only.
 - Time: of a floor of 2650 x 880 cells.
 
@@ -35,12 +35,12 @@ NOISES = {
     "lidar, noise 2 cm, drift 1 %, 5 % missed": {
         "range_noise_m": 0.02,
         "drift_m_per_m": 0.01,
-        "missed_wall_share": 0.05,
+        "missed_wall_fraction": 0.05,
     },
     "lidar, noise 5 cm, drift 1 %, 5 % missed": {
         "range_noise_m": 0.05,
         "drift_m_per_m": 0.01,
-        "missed_wall_share": 0.05,
+        "missed_wall_fraction": 0.05,
     },
 }
 LINKS = 2000
@@ -88,23 +88,23 @@ def print_segments(homes: list[sp.PartialMap], floors: list[sp.PartialMap]) -> N
 
 def noise_cases(buildings: list[sp.PartialMap]) -> Iterator[tuple[str, list[sp.PartialMap], list[sp.PartialMap]]]:
     """Names, maps without and maps with noise."""
-    for share in (0.05, 0.15, 0.3):
-        noisy = [ragged(building, share, seed) for seed, building in enumerate(buildings)]
-        yield f"{share:.0%} of face cells lost, as many added", buildings, noisy
+    for fraction in (0.05, 0.15, 0.3):
+        noisy = [ragged(building, fraction, seed) for seed, building in enumerate(buildings)]
+        yield f"{fraction:.0%} of face cells lost, as many added", buildings, noisy
     exact = [explored(building, **LIDAR) for building in buildings]
     for name, errors in NOISES.items():
         yield name, exact, [explored(building, **LIDAR, **errors) for building in buildings]
 
 
-def ragged(building: sp.PartialMap, share: float, seed: int) -> sp.PartialMap:
+def ragged(building: sp.PartialMap, fraction: float, seed: int) -> sp.PartialMap:
     """Take cells off the faces of walls, and put as many on."""
     rng = np.random.default_rng(seed)
     wall = building.state == CellState.WALL
     face = wall & ndimage.binary_dilation(building.state == CellState.FREE)
     inside = ndimage.binary_opening(wall, structure=np.ones((2, 2)))
     state = building.state.copy()
-    state[face & inside & (rng.random(wall.shape) < share)] = CellState.FREE
-    state[ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < share)] = CellState.WALL
+    state[face & inside & (rng.random(wall.shape) < fraction)] = CellState.FREE
+    state[ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < fraction)] = CellState.WALL
     return sp.PartialMap(state, building.resolution_m)
 
 
@@ -123,7 +123,7 @@ def segments_per_m(maps: list[sp.PartialMap]) -> float:
 def print_leaks(homes: list[sp.PartialMap], floors: list[sp.PartialMap]) -> None:
     """Leaks and the opposite error."""
     lidar = sp.SensorSettings(**LIDAR)
-    print("| maps | steps | links | behind seen walls | leaks | between seen cells | blocked on the partial map only |")
+    print("| maps | steps | links | behind observed walls | leaks | between observed cells | partial map only |")
     print("|---|---|---|---|---|---|---|")
     cases = (
         ("homes", homes, STEPS, None),

@@ -3,7 +3,7 @@
 Made are the accuracy of the link state and the error of the path gain against the steps of exploration (paper, Fig. 6),
 the maps of one test home with nothing and with a part of it observed (paper, Fig. 5), and checks of both ends: with
 nothing observed the prediction is a function of the distance alone, and on a complete map it is the trace. The paper
-does not say how an outage counts in its error, so several ways are shown. All is repeated with other robots,
+does not say how an outage counts in its error, so several definitions are shown. All is repeated with other robots,
 transmitters, receivers and first weights; only the homes stay.
 
 Without --homes, the homes are procedural ones that the shipped predictor was not trained on: `make_home` with
@@ -25,7 +25,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from sionna_partial.plots.figures import BLUE, RED, figure_png
 
 import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links, map_area
@@ -35,6 +34,7 @@ from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.files import atomic_files
 from sionna_partial.plots.coverage_plot import plot_comparison
+from sionna_partial.plots.style import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.simulation.homes import HomeKind
 from sionna_partial.tracing.trace import trace_each
@@ -49,7 +49,7 @@ PAPER = {0: {"accuracy": 0.65, "rmse_db": 18.0}, 200: {"accuracy": 0.90, "rmse_d
 """What the paper reports of its test homes, about, by exploration steps."""
 
 EXAMPLE_STEPS, EXAMPLE_SEEN, EXAMPLE_ROBOTS = 150, 0.51, 30
-"""Of so many robots, the example shows the one that has seen most nearly the share that the paper's had seen."""
+"""Of so many robots, the example shows the one whose observed fraction is nearest to that of the paper."""
 
 DISTANCES_M = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Distances at which predictions with nothing observed are compared [m]."""
@@ -72,7 +72,7 @@ Test homes: {test}
 (a) all links; an outage counts -150 dB in truth and in the predictive mean
 (b) the same predictive mean, over the links that are not in outage in truth
 (c) over these links, the mean given the true link state
-both seen: share of links with transmitter and receiver in observed cells; accuracy and (a) over these
+both observed: fraction of links with transmitter and receiver in observed cells; accuracy and (a) over these
 """
 
 
@@ -102,8 +102,8 @@ class Score:
 class Ends:
     """Both ends of one home; spreads and errors are largest values and root mean squares.
 
-    Nothing observed: how predictions differ at equal distance. Complete: the coverage map against the trace, and what
-    the networks would say, which are not asked there.
+    Nothing observed: differences between predictions at equal distance. Complete: the coverage map and the networks,
+    which are not used there, against the trace.
     """
 
     home: str
@@ -134,8 +134,8 @@ def main() -> None:
         for kind, homes in (("train", train), ("test", test)):
             scores += rate(fitted[-1], links, homes, kind, repetition)
     example, predictor = next(iter(test)), fitted[0]
-    places = transmitters(arguments.homes, example, test[example])
-    coverages, caption = example_maps(example, test[example], places, predictor)
+    positions = transmitters(arguments.homes, example, test[example])
+    coverages, caption = example_maps(example, test[example], positions, predictor)
     ends = [check_ends(name, home, predictor) for name, home in test.items()]
     head = HEAD.format(repeats=arguments.repeats, train=", ".join(train), test=", ".join(test), links=arguments.links)
     table = "\n".join([head, score_table(scores), caption, "", comparison_table(coverages), ends_table(ends)])
@@ -238,24 +238,24 @@ def transmitters(folder: Path | None, name: str, home: sp.PartialMap) -> NDArray
 
 
 def example_maps(
-    name: str, home: sp.PartialMap, places: NDArray[np.float64], predictor: sp.Predictor
+    name: str, home: sp.PartialMap, positions: NDArray[np.float64], predictor: sp.Predictor
 ) -> tuple[dict[str, xr.Dataset], str]:
-    """Predict the coverage of a home, of nothing of it, and of a part of it, and say which part.
+    """Predict the coverage of a home, of nothing of it, and of a part of it, and describe which part.
 
-    The transmitter stands at the first of the places that the robot has seen.
+    The transmitter is at the first of the positions that the robot has observed.
     """
     area = map_area(home, 0.0)
     robots = [sp.explore(area, steps=(0, EXAMPLE_STEPS), seed=seed) for seed in range(EXAMPLE_ROBOTS)]
     chosen = int(np.argmin([abs(known.observed_fraction - EXAMPLE_SEEN) for _, known in robots]))
     nothing, known = robots[chosen]
-    tx = places[np.argmax(known.state_at(places) == sp.CellState.FREE)]
+    tx = positions[np.argmax(known.state_at(positions) == sp.CellState.FREE)]
     maps = {TRUTH: area, NOTHING: nothing, PARTIAL: known}
     coverages = {title: sp.predict_map(partial, tx, predictor=predictor) for title, partial in maps.items()}
     inside = int((coverages[TRUTH]["valid"] & (coverages[TRUTH]["cell_state"] == sp.CellState.FREE)).sum())
     x0, y0, x1, y1 = area.bounds_m
     caption = (
-        f"Example: {name}, {x1 - x0:.1f} x {y1 - y0:.1f} m, {coverages[TRUTH]['valid'].size} places 0.15 m apart, "
-        f"{inside} of them indoors;\n{100 * known.observed_fraction:.0f} % seen after {EXAMPLE_STEPS} steps "
+        f"Example: {name}, {x1 - x0:.1f} x {y1 - y0:.1f} m, {coverages[TRUTH]['valid'].size} positions 0.15 m apart, "
+        f"{inside} of them indoors;\n{100 * known.observed_fraction:.0f} % observed after {EXAMPLE_STEPS} steps "
         f"(robot {chosen} of {EXAMPLE_ROBOTS}, the nearest to the paper's {100 * EXAMPLE_SEEN:.0f} %)"
     )
     return coverages, caption
@@ -285,12 +285,12 @@ def check_ends(name: str, home: sp.PartialMap, predictor: sp.Predictor) -> Ends:
 
 
 def nothing_observed(home: sp.PartialMap, predictor: sp.Predictor) -> tuple[int, float, float]:
-    """Predict from 20 places in 20 directions to each distance: links, largest spread of probabilities, of gains."""
+    """Predict from 20 positions in 20 directions to each distance: links, largest spread of probabilities, of gains."""
     (nothing,) = sp.explore(map_area(home, max(DISTANCES_M)), steps=(0,))
     angle = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, (20, len(DISTANCES_M)))
     away = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1) * np.array(DISTANCES_M)[:, None]
     tx = list(free_places(home, 20))
-    links = trace_each(nothing, tx, [(place + away).reshape(-1, 3) for place in tx])
+    links = trace_each(nothing, tx, [(position + away).reshape(-1, 3) for position in tx])
     phi = sp.LinkFeatures.concatenate([sp.link_features(nothing, each) for each in links])
     answer = predictor.predict(phi)
     spreads = {
@@ -301,17 +301,17 @@ def nothing_observed(home: sp.PartialMap, predictor: sp.Predictor) -> tuple[int,
 
 
 def free_places(home: sp.PartialMap, count: int) -> NDArray[np.float64]:
-    """Draw places (count, 3) in free cells, 1.5 m high [m]."""
+    """Draw positions (count, 3) in free cells, 1.5 m high [m]."""
     rows, columns = np.nonzero(home.state == sp.CellState.FREE)
     index = np.random.default_rng(0).integers(len(rows), size=count)
-    place = home.origin_m + (np.stack([columns, rows], axis=1)[index] + 0.5) * home.resolution_m
-    return np.column_stack([place, np.full(count, 1.5)])
+    position = home.origin_m + (np.stack([columns, rows], axis=1)[index] + 0.5) * home.resolution_m
+    return np.column_stack([position, np.full(count, 1.5)])
 
 
 def score_table(scores: list[Score]) -> str:
-    """Tabulate scores, a line for each stage, with the paper's beside."""
-    heads = ("homes", "steps", "seen", "outages", "accuracy", "(a) [dB]", "(b) [dB]", "(c) [dB]")
-    lines = [_line(heads, "both seen", "paper")]
+    """Tabulate scores, a line for each stage, with the paper's next to them."""
+    heads = ("homes", "steps", "observed", "outages", "accuracy", "(a) [dB]", "(b) [dB]", "(c) [dB]")
+    lines = [_line(heads, "both observed", "paper")]
     for kind, step in itertools.product(("test", "train"), sorted({score.step for score in scores})):
         some = [asdict(score) for score in scores if (score.homes, score.step) == (kind, step)]
         columns = {name: np.array([score[name] for score in some]) for name in some[0] if name != "homes"}
@@ -320,8 +320,8 @@ def score_table(scores: list[Score]) -> str:
         for name in MEASURES:
             digits = 3 if name == "accuracy" else 1
             cells.append(f"{means[name]:.{digits}f} ± {columns[name].std():.{digits}f}")
-        share, accuracy, rmse_db = (means[f"both_ends_seen{name}"] for name in ("", "_accuracy", "_rmse_db"))
-        both = f"{share:.2f}: {accuracy:.3f}, {rmse_db:.1f} dB" if share else "-"
+        fraction, accuracy, rmse_db = (means[f"both_ends_seen{name}"] for name in ("", "_accuracy", "_rmse_db"))
+        both = f"{fraction:.2f}: {accuracy:.3f}, {rmse_db:.1f} dB" if fraction else "-"
         reported = PAPER.get(step) if kind == "test" else None
         paper = f"{reported['accuracy']:.2f}, {reported['rmse_db']:.0f} dB" if reported else "-"
         lines.append(_line((kind, step, *cells), both, paper))
@@ -330,7 +330,7 @@ def score_table(scores: list[Score]) -> str:
 
 def _line(cells: Sequence[object], both: str, paper: str) -> str:
     home, step, seen, outages, *figures = cells
-    narrow = f"{home:>5}{step:>7}{seen:>7}{outages:>9}"
+    narrow = f"{home:>5}{step:>7}{seen:>9}{outages:>9}"
     return narrow + "".join(f"{figure:>15}" for figure in figures) + f"{both:>24}{paper:>14}"
 
 
@@ -339,8 +339,8 @@ def ends_table(ends: list[Ends]) -> str:
     lines = [
         "Both ends. Nothing observed: largest difference between predictions at equal distance, over "
         f"{len(DISTANCES_M)} distances,",
-        "20 places and 20 directions. Complete map: the prediction against the trace, and what the networks would say,",
-        "which are not asked there.",
+        "20 positions and 20 directions. Complete map: the prediction against the trace, and against the networks,",
+        "which are not used there.",
         "",
         f"{'home':>18}{'probability':>14}{'gain [dB]':>12}{'accuracy':>12}{'RMSE [dB]':>12}{'networks alone':>20}",
     ]

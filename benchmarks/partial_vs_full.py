@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from sionna_partial.plots.figures import figure_png
 
 import sionna_partial as sp
 from sionna_partial.files import atomic_write
+from sionna_partial.plots.style import figure_png
 from sionna_partial.resources import demo_homes, scenes_folder
 
 RUNS = 3

@@ -1,17 +1,12 @@
-"""Transmitters placed by `sp.place_transmitter`, beside the best of an exhaustive search on the same partial maps.
+"""Placement of a transmitter against an exhaustive search, on homes that nothing was trained on.
 
-Homes are made from seeds that no predictor was trained on, and explored. The exhaustive search looks at every free
+Homes are made from seeds that no predictor was trained on, and explored. The exhaustive search evaluates every free
 cell of a grid of 0.5 m, with the receivers, the weights, the predictor and the objective of `sp.place_transmitter`:
-links are traced on a scene that is built once, and predicted. Every placement is judged by the full trace: the share
-of receivers in the complete home, on a grid of 0.5 m, whose gain exceeds the threshold. Times are those of the
-processor, after a warm-up. Two more searches show what the climbs bring, and whether smoothing the edges of visibility
-helps:
+links are traced on a scene that is built once, and predicted. Every placement is evaluated by the full trace: the
+fraction of receivers in the complete home, on a grid of 0.5 m, whose gain exceeds the threshold. Times are those of the
+processor, after a warm-up. "starts only" is the best of the starts, before any refinement.
 
-- "starts only": the best of the starts; nothing climbs.
-- "gradients": the same climbs along the gradients of the differentiable pipeline (`edge_smoothing_m=0`), which do not
-  see paths appear or vanish. A step costs about 1.5 times as much as a smoothed one.
-
-A run goes on where a killed one stopped. Run it with
+A run that was stopped continues with the maps that are missing. Run it with
 
     python benchmarks/placement.py --out benchmark-output/placement
 """
@@ -20,6 +15,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable, Iterator
+from functools import partial as bind
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +24,15 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.placement.area import PlacementArea, placement_area
-from sionna_partial.placement.objective import PlacementObjective
-from sionna_partial.placement.placement import TransmitterPlacement, place_transmitter
+from sionna_partial.placement.placement import link_values, placement_score
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.settings import PlacementSettings
 from sionna_partial.tracing.trace import trace_each
 
 FIRST_SEED = 50_100
 SPACING_M, HEIGHT_M = 0.5, 1.5
-PLACES_AT_ONCE = 16
-METHODS = ("ours", "gradients", "starts only")
+POSITIONS_AT_ONCE = 16
+METHODS = ("ours", "starts only")
 
 
 def main() -> None:
@@ -75,84 +71,75 @@ def maps_of(seed: int, steps: list[int]) -> Iterator[tuple[int, Callable[[], tup
 
 
 def measure(partial: sp.PartialMap, home: sp.PartialMap, threshold_db: float) -> dict[str, Any]:
-    """Place a transmitter in several ways, and judge every place."""
+    """Place a transmitter in several ways, and evaluate every position."""
     model = sp.Predictor.load()
-    objective = PlacementObjective("coverage", threshold_db)
+    settings = PlacementSettings(threshold_db=threshold_db, height_m=HEIGHT_M, rx_height_m=HEIGHT_M)
     area = placement_area(partial, HEIGHT_M, HEIGHT_M, None if partial.is_complete else model)
     grid_m = grid(partial)
-    search(partial, model, threshold_db)  # warms up
-    exhaustive(partial, area, grid_m[:2], model, objective)
-    ours, ours_s = timed(lambda: search(partial, model, threshold_db))
-    search(partial, model, threshold_db, edge_smoothing_m=0.0)
-    gradients, gradients_s = timed(lambda: search(partial, model, threshold_db, edge_smoothing_m=0.0))
-    scores, exhaustive_s = timed(lambda: exhaustive(partial, area, grid_m, model, objective))
+    search = bind(sp.place_transmitter, partial, predictor=model, threshold_db=threshold_db, height_m=HEIGHT_M)
+    search()  # warms up
+    exhaustive(area, grid_m[:2], model, settings)
+    ours, ours_s = timed(search)
+    scores, exhaustive_s = timed(lambda: exhaustive(area, grid_m, model, settings))
     start_m = ours.starts_m[int(np.argmax(ours.start_scores))]
-    places_m = np.stack([ours.position_m, gradients.position_m, start_m, grid_m[int(np.argmax(scores))]])
-    again = exhaustive(partial, area, places_m, model, objective)
-    truths = truth(home, places_m, threshold_db)
+    positions_m = np.stack([ours.position_m, start_m, grid_m[int(np.argmax(scores))]])
+    again = exhaustive(area, positions_m, model, settings)
+    truths = truth(home, positions_m, threshold_db)
     names = (*METHODS, "exhaustive")
     return {
-        "places": len(grid_m),
+        "positions": len(grid_m),
         "receivers": len(area.rx_m),
         "score": dict(zip(names, again.tolist(), strict=True)),
         "truth": dict(zip(names, truths.tolist(), strict=True)),
-        "seconds": {"ours": ours_s, "gradients": gradients_s, "exhaustive": exhaustive_s},
+        "seconds": {"ours": ours_s, "exhaustive": exhaustive_s},
     }
 
 
-def search(partial: sp.PartialMap, model: sp.Predictor, threshold_db: float, **options: float) -> TransmitterPlacement:
-    """Run our search."""
-    return place_transmitter(partial, threshold_db=threshold_db, height_m=HEIGHT_M, predictor=model, **options)
-
-
 def exhaustive(
-    partial: sp.PartialMap,
-    area: PlacementArea,
-    places_m: NDArray[np.float64],
-    model: sp.Predictor,
-    objective: PlacementObjective,
+    area: PlacementArea, positions_m: NDArray[np.float64], model: sp.Predictor, settings: PlacementSettings
 ) -> NDArray[np.float64]:
-    """Give the objective at every place, the fastest public way: scenes are built once for many places."""
+    """Return the objective at every position, the fastest public way: scenes are built once for many positions."""
     scores = []
-    for start in range(0, len(places_m), PLACES_AT_ONCE):
-        places = places_m[start : start + PLACES_AT_ONCE]
-        far = [np.linalg.norm(area.rx_m - place, axis=1) > 0.02 for place in places]
-        for links, kept in zip(trace_each(partial, list(places), [area.rx_m[each] for each in far]), far, strict=True):
-            phi = sp.link_features(partial, links)
-            prediction = LinkPrediction.of_trace(phi) if partial.is_complete else model.predict(phi)
-            values = np.full(len(kept), objective.value_at_transmitter)
-            values[kept] = objective.values(prediction)
-            scores.append(objective.score(values, area.weight))
+    for start in range(0, len(positions_m), POSITIONS_AT_ONCE):
+        some_m = positions_m[start : start + POSITIONS_AT_ONCE]
+        far = [np.linalg.norm(area.rx_m - tx_m, axis=1) > 0.02 for tx_m in some_m]
+        traced = trace_each(area.partial, list(some_m), [area.rx_m[kept] for kept in far])
+        for links, kept in zip(traced, far, strict=True):
+            phi = sp.link_features(area.partial, links)
+            prediction = LinkPrediction.of_trace(phi) if area.partial.is_complete else model.predict(phi)
+            values = np.full(len(kept), 1.0)  # a receiver at the transmitter is covered
+            values[kept] = link_values(prediction, settings)
+            scores.append(placement_score(values, area.weight, settings))
     return np.array(scores)
 
 
-def truth(home: sp.PartialMap, places_m: NDArray[np.float64], threshold_db: float) -> NDArray[np.float64]:
-    """Share of the receivers in a complete home whose gain exceeds the threshold, for each place."""
+def truth(home: sp.PartialMap, positions_m: NDArray[np.float64], threshold_db: float) -> NDArray[np.float64]:
+    """Fraction of the receivers in a complete home whose gain exceeds the threshold, for each position."""
     rx_m = np.add(grid(home), [0.03, 0.02, 0.0])
     rx_m = rx_m[home.state_at(rx_m) == sp.CellState.FREE]
-    far = [rx_m[np.linalg.norm(rx_m - place, axis=1) > 0.02] for place in places_m]
-    return np.array([np.mean(links.gain_db > threshold_db) for links in trace_each(home, list(places_m), far)])
+    far = [rx_m[np.linalg.norm(rx_m - tx_m, axis=1) > 0.02] for tx_m in positions_m]
+    return np.array([np.mean(links.gain_db > threshold_db) for links in trace_each(home, list(positions_m), far)])
 
 
 def grid(partial: sp.PartialMap) -> NDArray[np.float64]:
-    """Free places (P, 3) on a grid of 0.5 m."""
+    """Free positions (P, 3) on a grid of 0.5 m."""
     x0, y0, x1, y1 = partial.bounds_m
     x, y = np.meshgrid(np.arange(x0 + SPACING_M / 2, x1, SPACING_M), np.arange(y0 + SPACING_M / 2, y1, SPACING_M))
-    places_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT_M)])
-    return places_m[partial.state_at(places_m) == sp.CellState.FREE]
+    positions_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT_M)])
+    return positions_m[partial.state_at(positions_m) == sp.CellState.FREE]
 
 
 def timed(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Run something, and say how long the processor took [s]."""
+    """Run something, and return how long the processor took [s]."""
     start = time.process_time()
     return run(), time.process_time() - start
 
 
 def line(row: dict[str, Any]) -> str:
     """One map as a line."""
-    truths = ", ".join(f"{name} {share:.3f}" for name, share in row["truth"].items())
+    truths = ", ".join(f"{name} {fraction:.3f}" for name, fraction in row["truth"].items())
     ratio = row["seconds"]["ours"] / row["seconds"]["exhaustive"]
-    return f"{row['seed']} {row['steps']:>4}: {row['places']:>4} places, truth {truths}, time {ratio:.3f}"
+    return f"{row['seed']} {row['steps']:>4}: {row['positions']:>4} positions, truth {truths}, time {ratio:.3f}"
 
 
 def summary(rows: list[dict[str, Any]], title: str) -> None:
@@ -160,7 +147,8 @@ def summary(rows: list[dict[str, Any]], title: str) -> None:
     if not rows:
         return
     homes = sorted({row["seed"] for row in rows})
-    print(f"\n{title}: {len(rows)} maps of {len(homes)} homes, {np.mean([row['places'] for row in rows]):.0f} places")
+    positions = np.mean([row["positions"] for row in rows])
+    print(f"\n{title}: {len(rows)} maps of {len(homes)} homes, {positions:.0f} positions")
     print(f"| {'search':16} | covered in truth | minus exhaustive | predicted | minus exhaustive | time / exhaustive |")
     print("|---|---|---|---|---|---|")
     total = sum(row["seconds"]["exhaustive"] for row in rows)

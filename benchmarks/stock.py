@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.generator import DIFFRACTION
+from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
-from sionna_partial.tracing.sionna_rt import load_sionna
 from sionna_partial.tracing.stock import listed_before
 
 Paths = dict[str, NDArray[Any]]
@@ -69,7 +69,7 @@ def trace_stock(
 def true_paths(folder: str, tx: NDArray[np.float64], rx: NDArray[np.float64], **options: Any) -> dict:
     """Run `trace_stock` for the truth: with diffraction, each diffracted path is taken from a run of just its depth.
 
-    Sionna RT 2.2 counts a part of the way twice where a path is reflected after its diffraction and has fewer
+    Sionna RT 2.2 counts a part of the length twice where a path is reflected after its diffraction and has fewer
     interactions than the largest depth allows: it is some dB too weak.
     """
     result = trace_stock(folder, tx, rx, **options)
@@ -92,8 +92,8 @@ def _joined(deep: Paths, other: Paths) -> Paths:
     """Paths of both, the second with no more interactions than the first."""
     missing = deep["interactions"].shape[1] - other["interactions"].shape[1]
     kinds = np.pad(other["interactions"], ((0, 0), (0, missing)))
-    places = np.pad(other["vertices_m"], ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
-    padded = {**other, "interactions": kinds, "vertices_m": places}
+    vertices_m = np.pad(other["vertices_m"], ((0, 0), (0, missing), (0, 0)), constant_values=np.nan)
+    padded = {**other, "interactions": kinds, "vertices_m": vertices_m}
     return {name: np.concatenate([values, padded[name]]) for name, values in deep.items()}
 
 
@@ -114,7 +114,7 @@ def receiver_paths(found: Any, index: int, receivers: int, depth: int) -> tuple[
 
 
 def stock_scene(rt: Any, folder: str, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> Any:
-    """Stock scene with isotropic antennas at the given places."""
+    """Stock scene with isotropic antennas at the given positions."""
     scene = rt.load_scene(f"{folder}/scene.xml")
     scene.frequency = 28e9
     scene.tx_array = scene.rx_array = rt.PlanarArray(

@@ -1,4 +1,4 @@
-"""Our trace beside stock Sionna RT: time, memory, recall and agreement, and growth with receivers and walls.
+"""Our trace compared with stock Sionna RT: time, memory, recall and agreement, and growth with receivers and walls.
 
 By default ours leaves out weak paths that change no link's power by more than 0.1 dB; "every path" keeps them.
 Every measurement runs in a process of its own; stock and ours run on one core, and ours on all cores besides. Truth is
@@ -118,12 +118,12 @@ def _compare(
         run = runs[label]
         found = comparable([run["paths"][k] for k in sample])
         match = agreement(partial, tx, rx[sample], found, truth)
-        shares = (
+        fractions = (
             match["found"] / match["truth"],
             *(match[key] / match["links"] for key in ("same_state", "same_gain")),
         )
         first = f"{run['first_s']:>11.2f}" if "first_s" in run else f"{'':>11}"
-        numbers = "".join(f"{share:>{width}.4f}" for share, width in zip(shares, (9, 8, 8), strict=True))
+        numbers = "".join(f"{fraction:>{width}.4f}" for fraction, width in zip(fractions, (9, 8, 8), strict=True))
         print(f"{label:20}{run['seconds']:>10.2f}{first}{run['memory_gb']:>13.2f}{numbers}")
     print(
         f"on one core, ours is {runs['stock, all at once']['seconds'] / runs['ours']['seconds']:.0f} times faster;",

@@ -1,7 +1,7 @@
 """Our paths against the truth on complete and partial maps of homes, with every disagreement named.
 
 Truth is stock Sionna RT in tiles of at most 100 receivers, with 1e6 rays and a table of 3e7 entries. What counts, and
-how paths that only one side has are checked, is said in `agreement.py`. Run it with
+how paths that only one side has are checked, is stated in `agreement.py`. Run it with
 
     python benchmarks/trace_truth.py --seeds 20000 20001 --receivers 60
 """
@@ -41,7 +41,7 @@ def main() -> None:
                 print(f"{name + '/' + str(stage):22}{cells(rows[-1])}", flush=True)
         print(f"{'all':22}{cells({key: sum(row[key] for row in rows) for key in rows[0]})}")
     print(
-        "\ntruth: its paths that are real; recall: share found by ours; missed: not found; state: link state equal;"
+        "\ntruth: its paths that are real; recall: fraction found by ours; missed: not found; state: link state equal;"
         "\ngain: within 0.5 dB; extra: our paths that truth lacks; real: of them, those that cross no wall;"
         "\nleaks: paths of truth that cross a wall; twice: paths that stock listed again"
     )
@@ -50,8 +50,8 @@ def main() -> None:
 def cells(row: dict[str, int]) -> str:
     """Format the counts of one map."""
     row = {**row, "missed": row["truth"] - row["found"]}
-    shares = (row["found"] / max(1, row["truth"]), row["same_state"] / row["links"], row["same_gain"] / row["links"])
-    numbers = "".join(f"{share:>{width}.4f}" for share, width in zip(shares, (9, 8, 8), strict=True))
+    fractions = (row["found"] / max(1, row["truth"]), row["same_state"] / row["links"], row["same_gain"] / row["links"])
+    numbers = "".join(f"{fraction:>{width}.4f}" for fraction, width in zip(fractions, (9, 8, 8), strict=True))
     return f"{row['truth']:>8}{numbers}" + "".join(f"{row[name]:>8}" for name in COLUMNS)
 
 
@@ -59,9 +59,9 @@ def compare(partial: sp.PartialMap, receivers: int, rays: int, *, diffraction: b
     """Count what agrees between our trace and the truth, for a seeded transmitter and receivers in free cells."""
     rng = np.random.default_rng(0)
     cells = rng.permutation(np.argwhere(partial.state == sp.CellState.FREE))[: receivers + 1, ::-1]
-    places = (cells + 0.5) * partial.resolution_m + partial.origin_m
-    heights = np.append(1.5, rng.uniform(0.8, 2.0, len(places) - 1))
-    tx, rx = np.append(places[0], heights[0]), np.column_stack([places, heights])[1:]
+    positions = (cells + 0.5) * partial.resolution_m + partial.origin_m
+    heights = np.append(1.5, rng.uniform(0.8, 2.0, len(positions) - 1))
+    tx, rx = np.append(positions[0], heights[0]), np.column_stack([positions, heights])[1:]
     depth = 3 if diffraction else 6
     settings = sp.TraceSettings(max_depth=depth, diffraction=diffraction, power_tolerance_db=0.0)
     links = sp.trace_links(partial, tx, rx, settings=settings)

@@ -1,8 +1,8 @@
-"""Link states beside those that Wireless InSite found in real homes.
+"""Link states compared with those that Wireless InSite found in real homes.
 
 Each home is a folder with a ROS map, `tx.csv` (tx, x, y, z) and `links.csv.gz` (tx, x, y, link_state, snr_db), whose
-link states are 0 outage, 1 LOS, 2 and 3 NLOS; the places name pixels, whose centres lie half a cell to the right and
-below. Links are traced three times: with the package's defaults at the written places, with the same at the pixels'
+link states are 0 outage, 1 LOS, 2 and 3 NLOS; the positions name pixels, whose centres lie half a cell to the right and
+below. Links are traced three times: with the package's defaults at the written positions, with the same at the pixels'
 centres, and there with the settings that come closest to what the reference did. Run it with
 
     python benchmarks/wireless_insite.py --homes ../shared/gibson
@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.tracing.generator import DIFFRACTION
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.trace import TracedLinks, trace_each
 
 STATES = {sp.LinkState.OUTAGE: "outage", sp.LinkState.LOS: "LOS", sp.LinkState.NLOS: "NLOS"}
@@ -58,7 +58,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class Trial:
-    """States (L,) of a home's links in the reference and in ours, our paths, and how many places were left out."""
+    """States (L,) of a home's links in the reference and in ours, our paths, and how many positions were left out."""
 
     truth: NDArray[np.uint8]
     found: NDArray[np.uint8]
@@ -101,7 +101,7 @@ def read(folder: Path, transmitters: int, receivers: int, seed: int) -> Referenc
     with gzip.open(folder / "links.csv.gz", "rt", encoding="utf-8") as stream:
         links = list(csv.DictReader(stream))
     owner = np.array([link["tx"] for link in links])
-    places = np.array([(float(link["x"]), float(link["y"]), RX_HEIGHT_M) for link in links])
+    positions = np.array([(float(link["x"]), float(link["y"]), RX_HEIGHT_M) for link in links])
     state = np.minimum([int(link["link_state"]) for link in links], sp.LinkState.NLOS).astype(np.uint8)
     rng, drawn = np.random.default_rng(seed), []
     for row in rows:
@@ -110,7 +110,7 @@ def read(folder: Path, transmitters: int, receivers: int, seed: int) -> Referenc
         name=folder.name,
         home=sp.load_map(folder / "map.yaml"),
         tx_m=[np.array([float(row[axis]) for axis in "xyz"]) for row in rows],
-        rx_m=[places[index] for index in drawn],
+        rx_m=[positions[index] for index in drawn],
         state=[state[index] for index in drawn],
     )
 
@@ -138,17 +138,17 @@ def trace(
 
 
 def print_agreement(homes: Sequence[Reference]) -> dict[str, list[Trial]]:
-    """Print the share of links with equal states, a line for each home, and give all trials."""
+    """Print the fraction of links with equal states, a line for each home, and give all trials."""
     print(f"{'home':>12}{'links':>8}" + "".join(f"{name:>24}" for name in TRIALS))
     trials: dict[str, list[Trial]] = {name: [] for name in TRIALS}
     for reference in homes:
         for name, how in TRIALS.items():
             trials[name].append(trace(reference, *how))
-        shares = "".join(f"{each[-1].agreement:>24.3f}" for each in trials.values())
-        print(f"{reference.name:>12}{len(trials['cells, at centres'][-1].truth):>8}{shares}", flush=True)
-    shares = {name: [trial.agreement for trial in each] for name, each in trials.items()}
+        fractions = "".join(f"{each[-1].agreement:>24.3f}" for each in trials.values())
+        print(f"{reference.name:>12}{len(trials['cells, at centres'][-1].truth):>8}{fractions}", flush=True)
+    fractions = {name: [trial.agreement for trial in each] for name, each in trials.items()}
     for name, measure in {"mean": np.mean, "spread": np.std, "lowest": np.min}.items():
-        print(f"{name:>20}" + "".join(f"{measure(each):>24.3f}" for each in shares.values()))
+        print(f"{name:>20}" + "".join(f"{measure(each):>24.3f}" for each in fractions.values()))
     return trials
 
 
@@ -167,8 +167,8 @@ def print_states(trials: Sequence[Trial]) -> None:
     print("\nshare of all links: rows Wireless InSite, columns cells, at centres")
     print(" " * 10 + "".join(f"{name:>10}" for name in STATES.values()))
     for state, name in STATES.items():
-        shares = [np.mean((truth == state) & (found == other)) for other in STATES]
-        print(f"{name:>10}" + "".join(f"{share:>10.4f}" for share in shares))
+        fractions = [np.mean((truth == state) & (found == other)) for other in STATES]
+        print(f"{name:>10}" + "".join(f"{fraction:>10.4f}" for fraction in fractions))
     differs = np.mean((truth == sp.LinkState.LOS) != (found == sp.LinkState.LOS))
     print(f"line of sight differs in {differs:.2%} of all links")
 

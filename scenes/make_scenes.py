@@ -1,4 +1,4 @@
-"""Make the homes that ship with the package: complete, and as a robot knows them after so many steps.
+"""Make the homes that ship with the package: complete, and as a robot has seen them after so many steps.
 
 usage: python scenes/make_scenes.py [FOLDER]
 
@@ -29,11 +29,11 @@ HOMES: dict[str, dict[str, Any]] = {
 README = """# Homes
 
 Procedural homes without locked rooms, written by `make_scenes.py` from the seeds below. `complete` holds the whole
-home, `step050` to `step200` what a simulated robot has seen after so many steps. Each is a scene folder: `scene.xml`
-loads in stock `sionna.rt.load_scene`, and `map.yaml` is a ROS map. `homes.json` holds the same as this table, for
-programs.
+home, `step050` to `step200` what a simulated robot has observed after that many steps. Each is a scene folder:
+`scene.xml` loads in stock `sionna.rt.load_scene`, and `map.yaml` is a ROS map. `homes.json` holds the same as this
+table, for programs.
 
-| home | kind | seed | robot's seed | grid [m] | free area [m2] | seen after {steps} steps | transmitter [m] |
+| home | kind | seed | robot's seed | grid [m] | free area [m2] | observed after {steps} steps | transmitter [m] |
 |---|---|---|---|---|---|---|---|
 {rows}
 """

@@ -1,4 +1,4 @@
-"""The answer: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
+"""Coverage: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
 
 import itertools
 import json
@@ -15,6 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import require, require_number, settings_or_default
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
@@ -22,14 +23,15 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.settings import SceneSettings, TraceSettings, require, require_number, settings_or_default
+from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
+from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
 
 WALL_PARTS = 6
-"""`wall_parts` says for 6 x 6 parts of each cell where walls are, so that pictures show walls thinner than a cell."""
+"""`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
 
 NO_RECEIVER = 255
 """Value of the integer variables where no receiver can stand."""
@@ -40,10 +42,7 @@ COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_
 RECEIVERS = ("indoor", "anywhere")
 """Whose probabilities and gains they are; the first is the default."""
 
-_WHOSE = {
-    "indoor": "given that the receiver is indoors",
-    "anywhere": "of a receiver that may be outside, in outage",
-}
+_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _LIBRARIES_GB, _CELL_BYTES, _RECEIVER_BYTES, _WORK_BYTES = 1.0, 40, 400, 120_000
 """Memory of the process with all libraries [GB], of each cell of the map, of each receiver, and of each of those that
@@ -54,15 +53,14 @@ _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 
 _log = logging.getLogger(__name__)
 
-_LINK_FLAGS = {
-    "flag_values": np.array([*LinkState, NO_RECEIVER], dtype=np.uint8),
-    "flag_meanings": " ".join([*(state.name.lower() for state in LinkState), "no_receiver"]),
-}
-_CELL_FLAGS = {
-    "flag_values": np.array([*CellState], dtype=np.uint8),
-    "flag_meanings": " ".join(state.name.lower() for state in CellState),
-}
-_YES_NO = {"flag_values": np.array([0, 1], dtype=np.int8), "flag_meanings": "no yes"}
+
+def _flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+    return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
+
+
+_LINK_FLAGS = _flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
+_CELL_FLAGS = _flags({state.name.lower(): state for state in CellState})
+_YES_NO = _flags({"no": 0, "yes": 1}, np.int8)
 
 ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     "p_los": {"long_name": "probability of line of sight", "units": "1"},
@@ -80,7 +78,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     "partial_gain_db": {"long_name": "path gain traced on the known part of the map", "units": "dB"},
     "unobserved_distance_m": {"long_name": "length of the direct line in unknown cells", "units": "m"},
     "distance_m": {"long_name": "distance from the transmitter", "units": "m"},
-    "observed": {"long_name": "whether the map knows this cell", **_YES_NO},
+    "observed": {"long_name": "whether this cell was observed", **_YES_NO},
     "valid": {"long_name": "whether a receiver can stand here", **_YES_NO},
     "cell_state": {"long_name": "state of the map at the receiver", **_CELL_FLAGS},
     "wall_parts": {
@@ -96,11 +94,11 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
 class _Receivers:
     """Receivers at the centres of a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
 
-    x_m: NDArray[np.float64]
-    y_m: NDArray[np.float64]
+    x_m: Floats
+    y_m: Floats
     cell_state: NDArray[np.uint8]
-    valid: NDArray[np.bool_]
-    rx_m: NDArray[np.float64]
+    valid: Bools
+    rx_m: Floats
 
 
 def predict_map(
@@ -119,13 +117,13 @@ def predict_map(
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
 
     The known part of the map is traced, and the predictor makes distributions of what the trace found and of how much
-    was not observed (paper, Section III). On a complete map the trace itself is the answer.
+    was not observed (paper, Section III). On a complete map the trace itself is the prediction.
 
-    Probabilities and gains are those of a receiver that is indoors, as in the paper; `p_indoor` says how likely
-    that is. With ``receivers="anywhere"`` it is mixed in: outside, every link counts as an outage. On a complete map
-    a receiver is inside wherever a cell is free, and outside elsewhere.
+    Probabilities and gains are those of a receiver that is indoors, as in the paper; `p_indoor` is how likely that is.
+    With ``receivers="anywhere"`` it is mixed in: outdoors, every link counts as an outage. On a complete map
+    a receiver is indoors wherever a cell is free, and outdoors elsewhere.
 
-    No receiver stands inside a wall, within 1.1 cm of one, or at the transmitter (nearer than 1.1 cm, or than the
+    No receiver is inside a wall, within 1.1 cm of one, or at the transmitter (nearer than 1.1 cm, or than the
     distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
     variables are NaN and link states 255.
 
@@ -134,7 +132,7 @@ def predict_map(
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
     tx : (3,) or (2,) array-like
-        Transmitter position [m]; 1.5 m high where no z is given. It may stand in unknown space.
+        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
@@ -145,7 +143,7 @@ def predict_map(
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     receivers : {"indoor", "anywhere"}
-        Probabilities and gains given that a receiver is indoors, or of one that may be outside, in outage.
+        Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float
         How much memory the process may take [GB]. Receivers are traced and predicted in blocks that fit.
     progress : callable, optional
@@ -163,7 +161,7 @@ def predict_map(
     MemoryLimitError
         If the job cannot be done within `memory_gb`; nothing was begun.
     PositionError
-        For a transmitter where none can stand, or if no receiver can stand anywhere.
+        For a transmitter outside the map or in a wall, or if no receiver can be anywhere.
     SettingsError
         For a height, spacing or frequency out of range, or another value of `receivers`.
     PredictorError
@@ -173,31 +171,37 @@ def predict_map(
     """
     require(receivers in RECEIVERS, "receivers", receivers, f"give {' or '.join(map(repr, RECEIVERS))}.")
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
-    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
-    trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
+    trace_settings, scene_settings = checked_settings(
+        partial,
+        settings_or_default("trace_settings", trace_settings, TraceSettings),
+        settings_or_default("scene_settings", scene_settings, SceneSettings),
+    )
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     tx_m = _transmitter(partial, tx)
     grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
     at_once = _receivers_at_once(partial, grid, memory_gb)
-    complete = partial.is_complete and partial.state_at(tx_m) != CellState.UNKNOWN
-    chosen = None if complete and predictor is None else _predictor(predictor)
-    model = None if complete else chosen
+    complete = bool(is_enclosed(partial, tx_m[None], tx_m[None])[0])
+    model = None
+    if predictor is not None or not complete:
+        loaded = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+        model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings)
-    report = progress or (lambda share, message: None)
+    needs_context = model is not None and model.settings.networks != "paper"
+    report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
     columns: list[dict[str, NDArray[Any]]] = []
     with temporary_folder() as work:
         tracer = Tracer(partial, work, trace_settings, scene_settings)
         for start in range(0, len(grid.rx_m), at_once):
 
-            def within(share: float, message: str, start: int = start) -> None:
-                report(min(0.99, (start + share * at_once) / len(grid.rx_m)), message)
+            def within(fraction: float, message: str, start: int = start) -> None:
+                report(min(0.99, (start + fraction * at_once) / len(grid.rx_m)), message)
 
             rx_m = grid.rx_m[start : start + at_once]
-            phi = features_of_paths(partial, tx_m, rx_m, tracer.paths(tx_m, rx_m, within))
-            columns.append(_columns(partial, phi, model, anywhere=receivers == "anywhere"))
+            paths = tracer.paths(tx_m, rx_m, within)
+            phi = features_of_paths(partial, tx_m, rx_m, paths, context=needs_context)
+            columns.append(_columns(phi, model, partial.state_at(rx_m), anywhere=receivers == "anywhere"))
     variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
@@ -212,13 +216,7 @@ def predict_map(
 
 
 def require_coverage(coverage: xr.Dataset) -> None:
-    """Raise a SettingsError unless `coverage` has what `predict_map` gives.
-
-    Parameters
-    ----------
-    coverage : xarray.Dataset
-        From `predict_map`, or read from its NetCDF file.
-    """
+    """Raise a SettingsError unless `coverage` has what `predict_map` returns."""
     remedy = "give the xarray.Dataset that predict_map returned, or load it from its .nc file."
     kind = type(coverage).__name__
     if not isinstance(coverage, xr.Dataset):
@@ -230,15 +228,15 @@ def require_coverage(coverage: xr.Dataset) -> None:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
 
 
-def clear_of_walls(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether receivers can stand at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
-    clear: NDArray[np.bool_] = partial.state_at(points_m) != CellState.WALL
+def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
+    """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
+    clear: Bools = partial.state_at(points_m) != CellState.WALL
     for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
         clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
     return clear
 
 
-def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
+def _transmitter(partial: PartialMap, tx: ArrayLike) -> Floats:
     with suppress(ValueError):
         if np.shape(tx) == (2,):
             tx = np.append(np.asarray(tx, dtype=np.float64), DEFAULT_HEIGHT_M)
@@ -248,27 +246,23 @@ def _transmitter(partial: PartialMap, tx: ArrayLike) -> NDArray[np.float64]:
     return tx_m
 
 
-def _predictor(predictor: Predictor | str | Path | None) -> Predictor:
-    return predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
-
-
 def _warn_of_other_traces(model: Predictor, settings: TraceSettings) -> None:
     """Warn if a predictor is used on traces of another kind than it was trained on."""
-    trained, ways = model.settings, {True: "with diffraction", False: "without diffraction"}
+    trained = model.settings
     if not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
         then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
     elif trained.diffraction != settings.diffraction:
-        then, now = ways[trained.diffraction], ways[bool(settings.diffraction)]
+        then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
     else:
         return
-    message = "predictor %r was trained %s, and is used %s: what it says of unobserved links is biased"
+    message = "predictor %r was trained %s, and is used %s: its predictions of unobserved links are biased"
     _log.warning(message, model.name, then, now)
 
 
 def _receivers(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_height_m: float, spacing_m: float, frequency_hz: float
+    partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
 ) -> _Receivers:
-    """Place the receivers, and mask those that cannot be there."""
+    """Return the receivers, those that are too near the transmitter or a wall masked."""
     low_m, high_m = partial.height_range_m
     require_number("rx_height_m", rx_height_m, low_m, high_m, open_low=True)
     require(rx_height_m < high_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {high_m:g} m.")
@@ -278,24 +272,20 @@ def _receivers(
     cell_state = partial.state_at(points)
     far = np.linalg.norm(points - tx_m, axis=-1) >= limit_m
     valid = far & clear_of_walls(partial, points)
-    if not valid.any():
-        raise _no_receiver(spacing_m, frequency_hz, limit_m, near=not far.any())
-    return _Receivers(x_m, y_m, cell_state, valid, points[valid])
-
-
-def _no_receiver(spacing_m: float, frequency_hz: float, limit_m: float, *, near: bool) -> PositionError:
-    if near and limit_m > SHORTEST_M:
-        return PositionError(
+    if not far.any() and limit_m > SHORTEST_M:
+        raise PositionError(
             f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
             f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
         )
-    return PositionError(
-        "no receiver can stand anywhere, all are inside walls or at the transmitter: "
-        f"spacing_m = {spacing_m:g}, give a smaller one."
-    )
+    if not valid.any():
+        raise PositionError(
+            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
+            f"spacing_m = {spacing_m:g}, give a smaller one."
+        )
+    return _Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
-def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
     """Return the x (nx,) and y (ny,) of all cell centres that lie on the map [m]."""
     low = partial.resolution_m / 10
     require_number("spacing_m", spacing_m, low, 1e6)
@@ -325,13 +315,11 @@ def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: fl
 
 
 def _columns(
-    partial: PartialMap, phi: LinkFeatures, model: Predictor | None, *, anywhere: bool
+    phi: LinkFeatures, model: Predictor | None, cell_state: NDArray[np.uint8], *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Predict links: values (N,) of each variable that depends on them."""
+    """Predict links to receivers in cells of these states: values (N,) of each variable that depends on them."""
     prediction = LinkPrediction.of_trace(phi) if model is None else model.predict(phi)
-    assert phi.context is not None
-    free = partial.state_at(phi.context.rx_m) == CellState.FREE
-    p_indoor = np.where(free, 1.0, 0.0 if model is None else model.predict_indoor(phi))
+    p_indoor = np.where(cell_state == CellState.FREE, 1.0, 0.0 if model is None else model.predict_indoor(phi))
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
     columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
@@ -345,45 +333,38 @@ def _columns(
 
 
 def _variables(receivers: _Receivers, columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Lay all results out on the grid."""
-    fill = {name: np.uint8(NO_RECEIVER) for name in ("link_state", "partial_link_state")}
-    layers = {
-        name: _spread(values, receivers.valid, fill.get(name, np.float32(np.nan))) for name, values in columns.items()
-    }
-    return layers | {
+    """Return all results on the grid."""
+    variables = {
         "observed": receivers.cell_state != CellState.UNKNOWN,
         "valid": receivers.valid,
         "cell_state": receivers.cell_state,
     }
-
-
-def _spread(values: NDArray[Any], valid: NDArray[np.bool_], fill: np.generic) -> NDArray[Any]:
-    """Put the values (N,) of the valid receivers on the grid (ny, nx)."""
-    layer = np.full(valid.shape, fill)
-    layer[valid] = values
-    return layer
+    for name, values in columns.items():
+        fill = np.uint8(NO_RECEIVER) if name.endswith("link_state") else np.float32(np.nan)
+        variables[name] = np.full(receivers.valid.shape, fill)
+        variables[name][receivers.valid] = values
+    return variables
 
 
 def _wall_parts(partial: PartialMap, receivers: _Receivers, spacing_m: float) -> NDArray[np.int64]:
-    """Say, bit by bit, which parts of each receiver's cell hold a wall."""
+    """Return, bit by bit, which parts of each receiver's cell hold a wall."""
     walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
     walls = walls.cumsum(axis=1, dtype=np.int32)
     ny, nx = partial.shape
     columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
     bits = np.zeros(receivers.valid.shape, dtype=np.int64)
-    for row, (bottom, top) in enumerate(
-        _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
-    ):
+    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
+    for row, (bottom, top) in enumerate(rows):
+        strip = walls[top] - walls[bottom]
         for column, (left, right) in enumerate(columns):
-            strip = walls[top] - walls[bottom]
             bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
     return bits
 
 
 def _part_spans(
-    centre_m: NDArray[np.float64], origin_m: float, resolution_m: float, count: int, spacing_m: float
+    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
 ) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Give the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
+    """Return the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
     edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
     step = spacing_m / resolution_m / WALL_PARTS
     return [
@@ -398,7 +379,7 @@ def _part_spans(
 def _provenance(
     partial: PartialMap, model: Predictor | None, scene_settings: SceneSettings, trace_settings: TraceSettings
 ) -> dict[str, Any]:
-    """Global attributes that say where the numbers come from. No time of day: equal input gives equal files."""
+    """Global attributes on where the numbers come from. No time of day: equal input gives equal files."""
     versions = {}
     for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
         with suppress(PackageNotFoundError):
@@ -418,7 +399,7 @@ def _provenance(
         "map_complete": int(partial.is_complete),
         "scene_settings": json.dumps(asdict(scene_settings), sort_keys=True),
         "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
-        "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
+        "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
         "predictor_sha256": "" if model is None else model.fingerprint,
     }
 

@@ -12,7 +12,7 @@ from sionna_partial.errors import SionnaPartialError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.predictor import SHIPPED
 from sionna_partial.resources import PREDICTORS_FOLDER, demo_homes
-from sionna_partial.tracing.contract import TESTED_VERSIONS, contract_breaches, contract_remedy, sionna_version
+from sionna_partial.tracing.engine import REMEDY, engine_fault
 
 LIBRARIES = ("sionna-rt", "mitsuba", "drjit", "tensorflow-cpu", "keras", "numpy")
 """PyPI packages whose versions matter in a report; the others are named where they are missing."""
@@ -68,20 +68,19 @@ def _llvm() -> Iterator[Finding]:
     except SionnaPartialError as error:
         yield Finding("LLVM", "not usable", str(error))
     else:
-        yield Finding("LLVM", f"{library.version}, solves paths")
+        yield Finding("LLVM", library.version)
         yield Finding("LLVM library", str(library.path))
         yield Finding("LLVM source", library.source)
         yield _fast_engine()
 
 
 def _fast_engine() -> Finding:
-    """Say whether paths are found by the fast engine, which leans on internal parts of Sionna RT."""
-    breaches = contract_breaches()
-    if breaches:
-        return Finding("fast engine", f"off: {'; '.join(breaches)}", contract_remedy())
-    if sionna_version() not in TESTED_VERSIONS:
-        return Finding("fast engine", "on, if it passes a trial in the first trace: this sionna-rt was not tested")
-    return Finding("fast engine", "on")
+    """Report whether the fast engine runs, which leans on internal parts of Sionna RT."""
+    try:
+        fault = engine_fault()
+    except (ImportError, SionnaPartialError) as error:
+        return Finding("fast engine", "off", str(error))
+    return Finding("fast engine", f"off: {fault}", REMEDY) if fault else Finding("fast engine", "on")
 
 
 def _other_libraries() -> list[str]:

@@ -3,13 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
-from sionna_partial.checks import Checked, Within
-from sionna_partial.checks import are_stages as are_stages
-from sionna_partial.checks import is_whole as is_whole
-from sionna_partial.checks import require as require
-from sionna_partial.checks import require_number as require_number
-from sionna_partial.checks import require_whole as require_whole
-from sionna_partial.checks import settings_or_default as settings_or_default
+from sionna_partial.checks import Checked, Within, are_stages, is_whole, require, require_number
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
@@ -389,3 +383,37 @@ class PredictorSettings(Checked):
     learning_rate: Annotated[float, Within(0.0, 1.0, open_low=True)] = 0.01
     minimum_links: Count = 100
     seed: Annotated[int, Within(0, 1_000_000_000)] = 0
+
+
+@dataclass(frozen=True)
+class PlacementSettings(Checked):
+    """What a transmitter is placed for, and how high it stands.
+
+    Parameters
+    ----------
+    objective : {"coverage", "percentile"}
+        "coverage" maximises the weighted mean over receivers of P(gain > threshold). "percentile" maximises the mean
+        predicted gain [dB] of the worst tenth of the receivers, an outage counting -150 dB: sorted by mean gain, they
+        count in full up to 5 % of the weight, and linearly less up to 15 %, so that no single one decides.
+    threshold_db : float
+        Path gain above which a receiver is covered [dB], in (-150, 0].
+    height_m, rx_height_m : float
+        Heights of transmitter and receivers [m], below the ceiling.
+    seed : int
+        Seed of the grid of positions that are compared. The same seed gives the same bytes.
+
+    Raises
+    ------
+    SettingsError
+        For values outside these ranges.
+    """
+
+    objective: Objective = "coverage"
+    threshold_db: Annotated[float, Within(-150.0, 0.0, open_low=True)] = -100.0
+    height_m: float = DEFAULT_HEIGHT_M
+    rx_height_m: float = DEFAULT_HEIGHT_M
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(is_whole(self.seed), "seed", self.seed, "give a whole number of 0 or more.")

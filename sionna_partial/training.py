@@ -126,14 +126,14 @@ def train(
     indoors, unsure = links.take(~links.anywhere), links.take(links.anywhere & ~links.context.rx_seen)
     report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
     predictor = Predictor.fit(
-        indoors.phi,
+        indoors.phi if settings.networks == "map" else indoors.features,
         indoors.link_state,
         indoors.gain_db,
         homes=train_homes,
         settings=settings,
         progress=lambda done, message: report(0.6 * done, message),
     )
-    predictor = predictor.fit_indoor(unsure.phi, unsure.inside)
+    predictor = predictor.fit_indoor(unsure.features, unsure.inside)
     report(0.6, "training the baselines")
     baselines = Baselines.fit(indoors, settings)
     run = TrainingRun(predictor, baselines, train_homes, test_homes, test_fraction, None)

@@ -12,9 +12,10 @@ from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkFeatures, unobserved_distance_m
-from sionna_partial.prediction.link_context import ContextSums
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.link_context import IndirectPaths
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import PredictorSettings, SceneSettings, TraceSettings
 from sionna_partial.tracing.paths import SolvedPaths
 
@@ -69,20 +70,21 @@ class FakeTracer:
 
 
 def fake_features(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], blocks: Iterable[SolvedPaths]
+    partial: PartialMap,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    blocks: Iterable[SolvedPaths],
+    context: bool,
 ) -> LinkFeatures:
     """Trace without walls: LOS up to 2 m, NLOS up to 4 m, then outage; Friis' gain, less 20 dB for NLOS."""
     assert not list(blocks)
     distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
     state = np.select([distance_m < 2.0, distance_m < 4.0], [LinkState.LOS, LinkState.NLOS], LinkState.OUTAGE)
     gain_db = -61.4 - 20.0 * np.log10(distance_m) - np.choose(state, [150.0, 0.0, 20.0])
-    return LinkFeatures(
-        state.astype(np.uint8),
-        unobserved_distance_m(partial, tx_m, rx_m),
-        distance_m,
-        np.maximum(gain_db, -150.0),
-        ContextSums(partial, tx_m[None], rx_m).context(),
-    )
+    unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m)
+    known = IndirectPaths(partial, tx_m[None], rx_m).context(state, unobserved_m) if context else None
+    phi = LinkFeatures(state, unobserved_m, distance_m, np.maximum(gain_db, -150.0), known)
+    return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64))
 
 
 class FakePredictor:
@@ -90,7 +92,7 @@ class FakePredictor:
 
     name = "fake"
     fingerprint = "0" * 64
-    settings = PredictorSettings()
+    settings = PredictorSettings(networks="map")
 
     @classmethod
     def load(cls, name: object = None) -> "FakePredictor":

@@ -18,7 +18,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
 from sionna_partial.settings import DatasetSettings
 
 KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670
@@ -76,30 +76,37 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
     settings = settings or DatasetSettings()
     rng = np.random.default_rng([settings.seed, *hashlib.sha256(name.encode()).digest()])
     count = 2 * settings.links_per_home * len(settings.stages)
-    context = _context(rng, len(settings.stages), 2 * settings.links_per_home)
-    distance_m = np.linalg.norm(context.rx_m - context.tx_m, axis=1)
+    tx_m, rx_m = rng.uniform(0.0, 9.0, (2, count, 3))
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+    gains_db = rng.uniform(GAIN_FLOOR_DB, -40.0, (count, len(ATTENUATION_LENGTHS_M)))
+    maps = tuple(_map(rng) for _ in settings.stages)
+    strongest_m = rng.uniform(0.0, 9.0, count)
+    map_index = np.repeat(np.arange(len(maps)), 2 * settings.links_per_home)
     state = rng.integers(0, 3, count).astype(np.uint8)
+    context = LinkContext.on_maps(
+        maps,
+        map_index,
+        tx_m=tx_m,
+        rx_m=rx_m,
+        link_state=state[::-1],
+        unobserved_distance_m=distance_m / 2,
+        indirect_gain_db=gains_db,
+        strongest_unobserved_m=strongest_m,
+    )
     return LinkTable(
         home=np.full(count, name),
         stage=np.repeat(settings.stages, 2 * settings.links_per_home).astype(np.float64),
-        phi=LinkFeatures(
+        features=LinkFeatures(
             state[::-1].copy(), distance_m / 2, distance_m, rng.uniform(GAIN_FLOOR_DB, -40.0, count), context
         ),
+        maps=maps,
+        map_index=map_index,
         link_state=state,
         gain_db=rng.uniform(GAIN_FLOOR_DB, -40.0, count),
         **{column: _coins(rng, count) for column in ("inside", "anywhere")},
         observed_fraction=rng.uniform(0.0, 1.0, count),
         complete_maps={name: _map(rng)},
     )
-
-
-def _context(rng: np.random.Generator, stages: int, links: int) -> LinkContext:
-    """Make up a map for each stage, and where as many links run on each."""
-    count = stages * links
-    tx_m, rx_m = rng.uniform(0.0, 9.0, (2, count, 3))
-    gains_db = rng.uniform(GAIN_FLOOR_DB, -40.0, (count, len(REACHES_M)))
-    maps = tuple(_map(rng) for _ in range(stages))
-    return LinkContext(maps, np.repeat(np.arange(stages), links), tx_m, rx_m, gains_db, rng.uniform(0.0, 9.0, count))
 
 
 def _map(rng: np.random.Generator) -> PartialMap:

@@ -10,10 +10,10 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
-from sionna_partial.tracing.plan.beams import trace_beams
+from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.plan.bounds import Strengths, strengths_of
-from sionna_partial.tracing.plan.candidates import Candidates, Room, Wedges, specular_candidates
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
+from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
 Blocks = list[tuple[Candidates, float]]
 
@@ -193,13 +193,11 @@ def specular_blocks(
     tx_m: NDArray[np.float64],
     rx_m: NDArray[np.float64],
     max_depth: int,
-    pairs_per_block: int = 200_000,
+    pairs_at_once: int = 200_000,
 ) -> Blocks:
     """List all specular candidates, and the fraction of the work done with each block."""
-    beams = trace_beams(geometry.plan, tx_m[:2], rx_m[:, :2], max_depth)
-    room, strengths = Room.of(geometry, tx_m, rx_m), everything(len(rx_m))
-    best = np.zeros(len(beams.pair_rx), np.uint8)
-    return list(specular_candidates(beams, geometry, room, max_depth, strengths, best, pairs_per_block=pairs_per_block))
+    candidates = SpecularCandidates(geometry, Room.of(geometry, tx_m, rx_m), max_depth)
+    return list(candidates.blocks(everything(len(rx_m)), pairs_at_once=pairs_at_once))
 
 
 def diffracted_blocks(

@@ -4,7 +4,7 @@ import dataclasses
 import json
 
 import numpy as np
-from predictor_links import corridors, make_context, make_links, quick_predictor
+from predictor_links import corridor_of, corridors, make_context, make_links, quick_predictor
 
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.datasets.shards import INDEX_FILE, shard_path, write_shard
@@ -26,7 +26,9 @@ def make_table(homes=4, links=300, stages=(0, 100), seed=0):
             LinkTable(
                 home=np.full(2 * links, f"home {home}"),
                 stage=np.full(2 * links, stage),
-                phi=dataclasses.replace(phi, context=make_context(phi)),
+                features=dataclasses.replace(phi, context=make_context(phi)),
+                maps=corridors(),
+                map_index=corridor_of(phi),
                 link_state=np.where(inside, state, 0).astype(np.uint8),
                 gain_db=np.where(inside, gain_db, -150.0),
                 inside=inside,
@@ -54,7 +56,7 @@ def assert_same(first, second):
     """Check that two tables hold the same links on the same maps."""
     for one, other, names in (
         (first, second, COLUMNS),
-        (first.phi, second.phi, ("link_state", "unobserved_distance_m", "distance_m", "gain_db")),
+        (first.features, second.features, ("link_state", "unobserved_distance_m", "distance_m", "gain_db")),
         (
             first.context,
             second.context,
@@ -67,8 +69,8 @@ def assert_same(first, second):
             assert left.dtype == right.dtype, name
     for home in set(first.home):
         assert first.complete_maps[home] == second.complete_maps[home]
-    pairs = set(zip(first.context.map_index, second.context.map_index, strict=True))
-    assert all(first.context.maps[one] == second.context.maps[other] for one, other in pairs)
+    pairs = set(zip(first.map_index, second.map_index, strict=True))
+    assert all(first.maps[one] == second.maps[other] for one, other in pairs)
 
 
 def fitted_baselines():

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.calibration.material_fit import MaterialTarget, Point
-from sionna_partial.calibration.material_paths import MaterialPaths
+from sionna_partial.calibration.measured_building import LinkPaths
 from sionna_partial.tracing.slab import reflection_loss_db
 
 FREQUENCY_HZ, THICKNESS_M = 28e9, 0.03
@@ -18,17 +18,12 @@ class FakePaths:
 
     link = np.arange(len(ANGLES_DEG))
     is_direct = np.zeros(len(ANGLES_DEG), dtype=bool)
-    at_once = 7
 
     def power(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
         loss_db = reflection_loss_db(
             float(permittivity[0]), float(conductivity_s_m[0]), THICKNESS_M, FREQUENCY_HZ, ANGLES_DEG
         )
         return np.asarray(10.0 ** (-(80.0 + loss_db) / 10.0))
-
-    def powers(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        assert len(permittivity) <= self.at_once
-        return np.stack([self.power(*pair) for pair in zip(permittivity, conductivity_s_m, strict=True)])
 
     def slopes(
         self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]
@@ -42,7 +37,7 @@ class FakePaths:
 def fake_target(permittivity: float, conductivity_s_m: float, noise_db: float = 1.0) -> MaterialTarget:
     gain_db = 10.0 * np.log10(FakePaths().power(np.array([permittivity]), np.array([conductivity_s_m])))
     noise = noise_db * np.random.default_rng(0).standard_normal(len(gain_db))
-    return MaterialTarget(cast(MaterialPaths, FakePaths()), gain_db + noise)
+    return MaterialTarget(cast(LinkPaths, FakePaths()), gain_db + noise)
 
 
 def quiet(share: float, message: str) -> None:
@@ -51,4 +46,4 @@ def quiet(share: float, message: str) -> None:
 
 
 def point(target: MaterialTarget, permittivity: float, conductivity_s_m: float) -> Point:
-    return target.at(np.array([permittivity]), np.array([conductivity_s_m]))
+    return target.at(np.array([[permittivity], [conductivity_s_m]]))

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.sionna_rt import open_scene
+from sionna_partial.tracing.engine import open_scene
 
 MATERIAL = (
     '<bsdf type="radio-material" id="material"><float name="relative_permittivity" value="3.0"/>'

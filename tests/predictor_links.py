@@ -10,7 +10,7 @@ import pytest
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
@@ -50,27 +50,73 @@ def corridors():
     return tuple(maps)
 
 
+def corridor_of(phi):
+    """Return the corridor of each link; transmitters are seen up to 10 m, receivers where less than 2 m are unknown."""
+    return 2 * (phi.distance_m < 10.0) + (phi.unobserved_distance_m < 2.0)
+
+
 def make_context(phi):
-    """Return where links along the corridor run; the transmitter is seen from 10 m, the receiver if 2 m are not."""
+    """Return the context of links along the corridor."""
     count = len(phi)
     tx_m = np.tile([0.0, 0.0, 1.5], (count, 1))
     linked, crossed_m = phi.link_state != OUTAGE, phi.unobserved_distance_m
-    kept = np.stack([np.exp(-crossed_m / reach) if reach else crossed_m < 1e-3 for reach in REACHES_M], axis=1)
+    kept = np.stack(
+        [np.exp(-crossed_m / reach) if reach else crossed_m < 1e-3 for reach in ATTENUATION_LENGTHS_M], axis=1
+    )
     power = 10.0 ** ((phi.gain_db - 6.0 * (phi.link_state == LOS)) / 10.0) * linked
-    return LinkContext(
-        maps=corridors(),
-        map_index=2 * (phi.distance_m < 10.0) + (crossed_m < 2.0),
+    return LinkContext.on_maps(
+        corridors(),
+        corridor_of(phi),
         tx_m=tx_m,
         rx_m=tx_m + np.column_stack([phi.distance_m, np.zeros((count, 2))]),
         indirect_gain_db=10.0 * np.log10(np.maximum(power[:, None] * kept, 1e-15)),
         strongest_unobserved_m=np.where(linked, crossed_m, phi.distance_m),
+        link_state=phi.link_state,
+        unobserved_distance_m=crossed_m,
     )
 
 
 def make_seen_links(count, seed=0):
-    """Return the links of `make_links` with a context."""
+    """Return the links of `make_links` with a context and windows."""
     phi, state, gain_db = make_links(count, seed)
-    return dataclasses.replace(phi, context=make_context(phi)), state, gain_db
+    phi = dataclasses.replace(phi, context=make_context(phi))
+    return phi.with_windows(corridors(), corridor_of(phi)), state, gain_db
+
+
+def features(
+    partial,
+    rx_m,
+    *,
+    tx_m=(0.0, 0.0, 1.5),
+    unobserved_m=0.0,
+    state=LOS,
+    gain_db=-70.0,
+    indirect_db=-150.0,
+    distance_m=None,
+    windows=True,
+):
+    """Return features of links on one map, or several with one for each link, with a context and windows.
+
+    All paths but the direct one have the gains `indirect_db`.
+    """
+    rx_m = np.atleast_2d(np.asarray(rx_m, dtype=np.float64))
+    count = len(rx_m)
+    maps, map_index = partial if isinstance(partial, tuple) else ((partial,), np.zeros(count, dtype=np.int64))
+    tx_m = np.broadcast_to(np.asarray(tx_m, dtype=np.float64), (count, 3))
+    unobserved_m, state = np.full(count, unobserved_m), np.full(count, state, dtype=np.uint8)
+    context = LinkContext.on_maps(
+        maps,
+        map_index,
+        tx_m=tx_m,
+        rx_m=rx_m,
+        link_state=state,
+        unobserved_distance_m=unobserved_m,
+        indirect_gain_db=np.full((count, len(ATTENUATION_LENGTHS_M)), indirect_db),
+        strongest_unobserved_m=unobserved_m,
+    )
+    distance_m = np.linalg.norm(rx_m - tx_m, axis=1) if distance_m is None else np.full(count, distance_m)
+    phi = LinkFeatures(state, unobserved_m, distance_m, np.full(count, gain_db), context)
+    return phi.with_windows(maps, map_index) if windows else phi
 
 
 def p_kept(phi):

@@ -64,20 +64,18 @@ def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, 
     from extruded import everything
 
     from sionna_partial.scene.scene import SHAPES, write_scene
-    from sionna_partial.tracing.plan.beams import trace_beams
-    from sionna_partial.tracing.plan.candidates import Room, specular_candidates
+    from sionna_partial.tracing.engine import SceneSolver
     from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
-    from sionna_partial.tracing.solver import SceneSolver
+    from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
     geometry = extrude(walls)
     tx, rx = np.array([1.07, 1.93, 1.2]), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4], [2.2, 3.4, 1.2]])
     room, wedges = Room.of(geometry, tx, rx), find_wedges(geometry, open_ends=False)
     solver = SceneSolver(write_scene(geometry, tmp_path, offset_m=(0.0, 0.0)), SHAPES, sp.TraceSettings())
-    beams = trace_beams(geometry.plan, tx[:2], rx[:, :2], 4)
     for kind in ("reflected", "diffracted"):
         strengths = everything(len(rx))
         blocks = (
-            specular_candidates(beams, geometry, room, 4, strengths, np.zeros(len(beams.pair_rx), np.uint8))
+            SpecularCandidates(geometry, room, 4).blocks(strengths)
             if kind == "reflected"
             else DiffractionCandidates(geometry, wedges, room, 3).blocks(strengths)
         )

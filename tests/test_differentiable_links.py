@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from pillar_room import TX_M, small_room
 from predictor_links import QUIET
 
 import sionna_partial as sp
@@ -16,8 +17,7 @@ from sionna_partial.differentiable import scene as differentiable_links
 from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras
-from sionna_partial.tracing.fixed_paths import MATERIAL_PARAMETERS, PARAMETERS
-from sionna_partial.tracing.probe import TX_M, small_room
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS
 
 pytestmark = QUIET
 
@@ -100,9 +100,6 @@ class TestValues:
         np.testing.assert_allclose(found.gain_mean_db, links.gain_db, rtol=1e-9)
         assert not found.gain_std_db.numpy().any()
 
-    def test_map_is_the_default(self, links_of):
-        assert links_of("partial")._scene.predictor.name == "map"
-
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     @pytest.mark.parametrize("kind", MAPS)
     def test_moved_by_nothing(self, kind, predictor, links_of):
@@ -149,9 +146,7 @@ class TestValues:
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     @pytest.mark.parametrize(
-        "place",
-        [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])],
-        ids=["pillar", "far", "receiver"],
+        "place", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["pillar", "far", "receiver"]
     )
     def test_impossible_places_have_finite_slopes(self, place, predictor, links_of, tf):
         links, place = links_of("partial", predictor), tf.Variable(np.array(place))
@@ -236,38 +231,6 @@ class TestSlopes:
 
 
 class TestSecondUse:
-    def test_nothing_is_traced_again(self, tf, monkeypatch):
-        scene = scene_of("partial")
-        written, calls = scene.paths.written, []
-
-        def counted(*arguments):
-            calls.append(1)
-            return written.paths(*arguments)
-
-        monkeypatch.setattr(scene.paths, "written", replace(written, paths=counted))
-        links = scene.links(TX_M, RX_M)
-        assert len(calls) == 1
-        variable = tf.Variable(TX_M)
-        for _ in range(2):
-            with tf.GradientTape() as tape:
-                value = tf.reduce_sum(links(tx_m=variable).gain_mean_db)
-            tape.gradient(value, variable)
-        links()
-        assert len(calls) == 1
-        scene.links(TX_M, RX_M)
-        assert len(calls) == 2
-
-    def test_base_stays(self, links_of, tf):
-        links = links_of("partial", "paper")
-        variable = tf.Variable(links.base.tx_m)
-        variable.assign_add([1.0, 1.0, 0.0])
-        np.testing.assert_array_equal(links.base.tx_m, TX_M)
-
-    def test_progress(self):
-        shares = []
-        scene_of("partial", "paper").links(TX_M, RX_M, progress=lambda share, message: shares.append(share))
-        assert shares[-1] == pytest.approx(1.0)
-
     def test_map_from_a_file(self, tmp_path, links_of):
         sp.export_scene(MAPS["partial"], tmp_path / "scene")
         scene = sp.DifferentiableScene(

@@ -8,7 +8,7 @@ from extruded import ROOM, SPLINTERS, chains_between, diffracted_blocks, extrude
 from numpy.typing import NDArray
 
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.plan.candidates import EDGE, Candidates
+from sionna_partial.tracing.candidates import EDGE, Candidates
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, find_wedges
 
 TX = np.array([1.07, 1.93, 1.2])
@@ -170,17 +170,6 @@ class TestDiffractionCandidates:
                     along = np.diff(ROOM[number // 2], axis=0)[0]
                     normal = np.array([along[1], -along[0], 0.0]) / np.hypot(*along)
                 np.testing.assert_allclose(after, before - 2 * np.dot(before, normal) * normal, atol=1e-9)
-
-    def test_a_floor_alone_is_met_once(self) -> None:
-        geometry = extrude(ROOM, ceiling=False)
-        found = _join(geometry, np.array([[4.5, 0.7, 2.1]]))
-        flats = found.face >= geometry.floor_face
-        assert set(flats.sum(axis=1).tolist()) == {0, 1}
-        assert set(found.face[flats].tolist()) == {geometry.floor_face}
-
-    def test_without_floor_and_ceiling_only_walls_reflect(self) -> None:
-        geometry = extrude(ROOM, floor_m=())
-        assert _join(geometry, np.array([[4.5, 0.7, 2.1]])).face.max() < 2 * len(ROOM)
 
     @pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 6])
     def test_depth_limits_the_reflections(self, max_depth: int) -> None:

@@ -135,8 +135,8 @@ class TestEvaluate:
             drawn.append(len(tx_m))
             return map_windows(partial, tx_m)
 
-        monkeypatch.setattr("sionna_partial.prediction.map_networks.map_windows", counted)
         predictor = dataclasses.replace(context_predictor("map"), homes=("home 0",))
+        monkeypatch.setattr("sionna_partial.prediction.windows.map_windows", counted)
         evaluate(predictor, table, baselines=fitted_baselines())
         assert drawn == [1] * (2 * 2 * len(corridors()))
 
@@ -155,7 +155,9 @@ class TestHomeScores:
         other = dataclasses.replace(
             right,
             home=np.full(len(links), "home 10"),
-            phi=dataclasses.replace(right.phi, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db),
+            features=dataclasses.replace(
+                right.features, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db
+            ),
             link_state=np.where(third, OUTAGE, LOS).astype(np.uint8),
             gain_db=gain_db + 3.0,
         )

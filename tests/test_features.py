@@ -5,12 +5,12 @@ import re
 import extruded
 import numpy as np
 import pytest
+from predictor_links import features
 
 from sionna_partial.constants import LinkState
-from sionna_partial.errors import MapError, PositionError, PredictorError
-from sionna_partial.prediction.features import LinkFeatures, link_features, unobserved_distance_m
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
-from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.errors import MapError, PredictorError
+from sionna_partial.prediction.features import LinkFeatures, link_features
+from sionna_partial.prediction.windows import map_windows
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import TracedLinks
 
@@ -28,13 +28,6 @@ HALF = drawn("""
 def phi_of(count=3):
     ones = np.ones(count)
     return LinkFeatures(np.full(count, LinkState.LOS), 0.5 * ones, ones * np.arange(1, count + 1), -60.0 * ones)
-
-
-def context_of(count=3):
-    tx_m = np.zeros((count, 3))
-    rx_m = tx_m + np.arange(1, count + 1)[:, None] * (1.0, 0.0, 0.0)
-    gains_db = np.full((count, len(REACHES_M)), -90.0)
-    return LinkContext((HALF,), np.zeros(count, dtype=np.int64), tx_m, rx_m, gains_db, np.zeros(count))
 
 
 def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
@@ -57,31 +50,6 @@ def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
     )
 
 
-def test_unobserved_distance_is_that_of_the_direct_lines():
-    rx = np.array([(4.5, 2.5, 1.5), (7.5, 2.5, 1.5), (12.0, 2.5, 1.5), (6.5, 3.5, 2.5)])
-    found_m = unobserved_distance_m(HALF, (1.5, 2.5, 1.5), rx)
-    assert found_m == pytest.approx([0.0, 2.5, 6.0, np.sqrt(27) * 0.3], abs=1e-12)
-    np.testing.assert_array_equal(found_m, unobserved_lengths_m(HALF, np.array([1.5, 2.5, 1.5]), rx))
-
-
-def test_no_receivers():
-    assert unobserved_distance_m(HALF, (1.5, 2.5, 1.5), np.zeros((0, 3))).shape == (0,)
-
-
-@pytest.mark.parametrize(
-    ("tx", "rx", "message"),
-    [
-        ((1.0, 2.0), [(1.0, 2.0, 3.0)], "tx has shape (2,): give x, y, z in metres, (3,)."),
-        ((1.0, 2.0, 1.0), (1.0, 2.0, 3.0), "rx has shape (3,): give x, y, z in metres, (N, 3)."),
-        ((1.0, np.nan, 1.0), [(1.0, 2.0, 3.0)], "tx holds a position that is not finite"),
-        ((1.0, 2.0, 1.0), [(1.0, np.inf, 3.0)], "rx holds a position that is not finite"),
-    ],
-)
-def test_bad_positions(tx, rx, message):
-    with pytest.raises(PositionError, match=re.escape(message)):
-        unobserved_distance_m(HALF, tx, rx)
-
-
 def test_link_features():
     rx = np.array([(4.5, 2.5, 1.5), (7.5, 2.5, 1.5)])
     phi = link_features(HALF, traced((1.5, 2.5, 1.5), rx, -72.0))
@@ -90,7 +58,7 @@ def test_link_features():
     assert phi.distance_m.tolist() == [3.0, 6.0]
     assert phi.unobserved_distance_m == pytest.approx([0.0, 2.5])
     assert phi.gain_db.tolist() == [-72.0, -72.0]
-    assert phi.context.maps == (HALF,)
+    np.testing.assert_array_equal(phi.context.windows, map_windows(HALF, np.array([[1.5, 2.5]])))
     assert phi.context.rx_m.tolist() == rx.tolist()
     assert phi.context.rx_seen.tolist() == [True, False]
 
@@ -109,7 +77,7 @@ def test_take_and_concatenate():
 
 
 def test_take_and_concatenate_with_context():
-    phi = dataclasses.replace(phi_of(3), context=context_of(3))
+    phi = features(HALF, [(1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (3.0, 0.0, 0.0)], tx_m=(0.0, 0.0, 0.0))
     some = phi.take(np.array([2, 0]))
     assert some.context.rx_m[:, 0].tolist() == some.distance_m.tolist() == [3.0, 1.0]
     joined = LinkFeatures.concatenate([some, phi])
@@ -119,7 +87,7 @@ def test_take_and_concatenate_with_context():
 
 def test_context_of_other_links():
     with pytest.raises(PredictorError, match="context has 2 links: give one of the same 3 links"):
-        dataclasses.replace(phi_of(3), context=context_of(2))
+        dataclasses.replace(phi_of(3), context=features(HALF, np.ones((2, 3))).context)
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from meshes import room
 from numpy.typing import NDArray
+from pillar_room import RX_M, TX_M, small_room
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.errors import BackendError, PositionError, SettingsError
-from sionna_partial.tracing import fixed_paths, gradients
+from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.tracing import gradients
 from sionna_partial.tracing.gradients import GainGradients, gain_gradients
-from sionna_partial.tracing.probe import RX_M, TX_M, small_room
 
 SLOPES = (
     *("tx_db_per_m", "relative_permittivity_db", "conductivity_db_per_s_m", "thickness_db_per_m"),
@@ -191,11 +191,6 @@ class TestGainGradients:
     def test_two_runs_give_the_same_bytes(self, found: GainGradients) -> None:
         assert same_bytes(found, gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS))
 
-    def test_blocks_change_nothing(self, found: GainGradients, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "PATHS_PER_BLOCK", 29)
-        in_blocks = gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS)
-        np.testing.assert_allclose(all_slopes(in_blocks), all_slopes(found), rtol=1e-6)
-
     def test_no_receivers(self) -> None:
         found = gain_gradients(FIELD, TX, [])
         assert found.tx_db_per_m.shape == (0, 3)
@@ -238,20 +233,8 @@ class TestErrors:
         with pytest.raises(PositionError, match=r"tx has shape \(2, 3\): give one transmitter as \(3,\)\."):
             gain_gradients(FIELD, [TX, TX], RX)
 
-    def test_places_and_settings_as_for_the_trace(self) -> None:
+    def test_positions_and_settings_as_for_the_trace(self) -> None:
         with pytest.raises(PositionError, match="rx"):
             gain_gradients(FIELD, TX, [(99.0, 1.0, 1.0)])
         with pytest.raises(SettingsError, match="frequency_hz"):
             gain_gradients(FIELD, TX, RX, scene_settings=sp.SceneSettings(material=sp.Material(itu="wet_ground")))
-
-    def test_places_are_checked_before_the_scene_is_opened(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: pytest.fail("opened"))
-        with pytest.raises(PositionError, match="rx"):
-            gain_gradients(FIELD, TX, [(99.0, 1.0, 1.0)])
-        assert len(gain_gradients(FIELD, TX, []).gain_db) == 0
-
-    def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(fixed_paths, "fast_engine_works", lambda: False)
-        message = r'Gradients need .* that the fast engine has: run pip install "sionna-rt=='
-        with pytest.raises(BackendError, match=message):
-            gain_gradients(FIELD, TX, RX)

@@ -143,8 +143,8 @@ class TestTruthAndFeatures:
 
         monkeypatch.setattr(module, "explore", noted)
         assert_same(home_links(home, "two rooms", SETTINGS), table)
-        assert table.context.maps == tuple(maps)
-        np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.context.map_index], table.stage)
+        assert table.maps == tuple(maps)
+        np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.map_index], table.stage)
         partial = maps[1]
         here = table.take(table.stage == 3)
         assert here.observed_fraction == pytest.approx(partial.observed_fraction)
@@ -185,11 +185,11 @@ class TestSeeds:
         sensor = SensorSettings(range_noise_m=0.1, drift_m_per_m=0.1)
         wrong = home_links(home, "two rooms", replace(SETTINGS, sensor=sensor))
         area = map_area(home, SETTINGS.margin_m)
-        for number, partial in enumerate(wrong.context.maps):
-            here = wrong.context.map_index == number
+        for number, partial in enumerate(wrong.maps):
+            here = wrong.map_index == number
             for places_m in (wrong.context.tx_m[here], wrong.context.rx_m[here]):
                 assert (partial.state_at(places_m) != CellState.WALL).all()
-        walls = np.logical_or.reduce([each.state == CellState.WALL for each in wrong.context.maps])
+        walls = np.logical_or.reduce([each.state == CellState.WALL for each in wrong.maps])
         assert (walls & (area.state == CellState.FREE)).any()
 
     def test_mixed_sensors_are_drawn_by_name_and_seed(self) -> None:
@@ -249,8 +249,8 @@ class TestRefused:
 
     def test_table_without_context(self) -> None:
         table = make_table(homes=1, links=3)
-        with pytest.raises(PredictorError, match=r"phi has no context: give the LinkFeatures of link_features\."):
-            replace(table, phi=replace(table.phi, context=None))
+        with pytest.raises(PredictorError, match=r"features has no context: give the LinkFeatures of link_features\."):
+            replace(table, features=replace(table.features, context=None))
 
     def test_truth_that_is_none(self) -> None:
         table = make_table(homes=1, links=3)

@@ -20,45 +20,25 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
-    "foundations": (
-        "constants",
-        "errors",
-        "checks",
-        "settings",
-        "resources",
-        "files",
-        "planar",
-        "cores",
-        "llvm",
-        "llvm_probe",
-    ),
-    "maps": (
-        *("mesh.cut", "mesh.mesh", "partial_map", "map_turn", "ros_map"),
-        *("mesh.files", "mesh.mitsuba_xml", "mesh.cells", "map_files"),
-    ),
+    "foundations": ("constants", "errors", "checks", "settings", "resources", "files", "planar", "cores", "llvm"),
+    "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
-    "scene": (
-        *("lines", "wall_cells", "polylines", "graph", "outlines", "lattice"),
-        *("floor_plan", "scene_xml", "scene"),
-    ),
+    "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
-        *("slab", "plan.bounds", "plan.beams", "plan.candidates", "plan.diffraction"),
-        *("mesh.rays", "mesh.planes", "mesh.sequences", "mesh.candidates"),
-        *("paths", "sionna_rt", "contract", "stock", "chain", "solver", "generator", "probe", "trace"),
-        *("fixed_paths", "gradients"),
+        *("candidates", "paths", "engine", "slab"),
+        *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
+        *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "stock", "trace"),
+        *("path_set", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "link_context", "features", "certainty", "windows"),
-        *("paper_networks", "paper_fitting", "map_networks", "map_fitting", "predictor_files", "predictor"),
+        *("unobserved", "windows", "link_context", "features"),
+        *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "link_distribution", "path_power", "scene"),
-    "checkpoint": ("checkpoint",),
     "measurements": ("measurements",),
-    "calibration": (
-        *("gain_errors", "material_paths", "material_fit", "material_search", "measured_building", "calibration"),
-    ),
-    "placement": ("area", "objective", "climb", "state", "views", "placement"),
+    "calibration": ("measured_building", "material_fit", "calibration"),
+    "placement": ("area", "placement"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
@@ -68,7 +48,7 @@ ROOMS = {
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "checkpoint", "training", "results"}
+FILES = {"foundations", "coverage", "training", "results"}
 """Rooms whose modules are files of the package itself."""
 
 MODULES = tuple(

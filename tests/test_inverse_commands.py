@@ -1,4 +1,4 @@
-"""The command line back from measurements: what is written, what is said, and what is refused."""
+"""The command calibrate: files, printed table and errors."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
-from sionna_partial.calibration import material_search
+from sionna_partial.calibration import material_fit
 from sionna_partial.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("command_line")
@@ -40,8 +40,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"COARSE_PARTS": 8, "MOST_TEETH": 1, "MOST_CELLS": 40, "FEW_TEETH": 1}.items():
-        monkeypatch.setattr(material_search, name, value)
+    for name, value in {"COARSE_CELLS": 8, "MOST_FRINGES": 1, "MOST_CELLS": 40, "FEW_FRINGES": 1}.items():
+        monkeypatch.setattr(material_fit, name, value)
 
 
 def run(*arguments: object) -> Result:

@@ -1,20 +1,24 @@
-"""What the paths of hand-made links cross, and where the links run."""
+"""What the paths of hand-made links cross, and what maps show of links and leave possible."""
 
 import dataclasses
 import math
-import re
 
 import numpy as np
 import pytest
-from hypothesis import given
+from extruded import drawn
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from predictor_links import features
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState
-from sionna_partial.errors import PredictorError
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.link_context import REACHES_M, ContextSums, LinkContext
+from sionna_partial.prediction.features import link_features
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSettings
+from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.trace import TracedLinks, trace_links
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
@@ -63,9 +67,7 @@ def traced(tx, rx, *paths):
 
 def link_context(partial, links):
     """Return the context of all links."""
-    sums = ContextSums(partial, links.tx.reshape(-1, 3), links.rx)
-    sums.add(links)
-    return sums.context()
+    return link_features(partial, links).context
 
 
 def of_paths(*paths, partial=HALF, rx=FAR):
@@ -77,16 +79,10 @@ def gains_db(power, crossed_m):
     """Return the gain at each reach of paths that cross so much unobserved space."""
     power, crossed_m = np.array(power), np.array(crossed_m)
     totals = []
-    for reach in REACHES_M:
+    for reach in ATTENUATION_LENGTHS_M:
         kept = (crossed_m == 0.0) if reach == 0.0 else np.exp(-crossed_m / reach)
         totals.append((power * kept).sum())
     return [max(10 * math.log10(total), -150.0) if total else -150.0 for total in totals]
-
-
-def test_reaches_go_from_all_paths_to_those_wholly_observed():
-    assert REACHES_M[0] == math.inf
-    assert REACHES_M[-1] == 0.0
-    assert list(REACHES_M) == sorted(REACHES_M, reverse=True)
 
 
 class TestPaths:
@@ -109,19 +105,6 @@ class TestPaths:
         assert found.strongest_unobserved_m == pytest.approx([crossed_m], abs=1e-9)
         assert found.indirect_gain_db[0] == pytest.approx(gains_db([1e-4], [crossed_m]), abs=1e-9)
 
-    def test_powers_add_up_whatever_the_phases(self):
-        above, behind = [(3.0, 4.0, 1.5)], [(6.5, 2.5, 1.5)]
-        found = of_paths((0.01, above), (-0.02j, behind), (0.003 + 0.004j, behind), rx=NEAR)
-        expected = gains_db([1e-4, 4e-4, 0.25e-4], [0.0, 3.0, 3.0])
-        assert found.indirect_gain_db[0] == pytest.approx(expected, abs=1e-9)
-        assert expected[-1] == pytest.approx(-40.0)
-
-    @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
-    def test_strongest_path(self, order):
-        paths = [(0.01, [(3.0, 4.0, 1.5)]), (-0.02j, [(6.5, 2.5, 1.5)]), (0.0199, [(9.5, 2.5, 1.5)])]
-        found = of_paths(*(paths[index] for index in order), rx=NEAR)
-        assert found.strongest_unobserved_m == pytest.approx([3.0], abs=1e-9)
-
     def test_direct_path_is_left_out(self):
         bounced = (1e-4, [(6.5, 2.5, 1.5)])
         assert same(of_paths((0.5, []), bounced, rx=NEAR), of_paths(bounced, rx=NEAR))
@@ -130,11 +113,8 @@ class TestPaths:
     @pytest.mark.parametrize("partial", [HALF, WHOLE])
     def test_no_path_but_the_direct_one(self, paths, partial):
         found = of_paths(*paths, partial=partial)
-        assert found.indirect_gain_db.tolist() == [[GAIN_FLOOR_DB] * len(REACHES_M)]
+        assert found.indirect_gain_db.tolist() == [[GAIN_FLOOR_DB] * len(ATTENUATION_LENGTHS_M)]
         assert found.strongest_unobserved_m.tolist() == [6.0]
-
-    def test_a_faint_path_is_at_the_floor(self):
-        assert of_paths((1e-9, [(3.0, 4.0, 1.5)]), rx=NEAR).indirect_gain_db.tolist() == [[-150.0] * len(REACHES_M)]
 
     def test_rounding_at_the_border_of_the_unknown_hides_no_path(self):
         found = of_paths((0.01, [(5.0 + 1e-5, 2.5, 1.5)]), rx=NEAR)
@@ -143,7 +123,7 @@ class TestPaths:
 
     def test_on_a_complete_map_every_reach_is_the_same(self):
         found = of_paths((0.01, [(9.5, 2.5, 1.5)]), (0.02, [(12.0, 9.0, 1.5)]), partial=WHOLE)
-        assert found.indirect_gain_db[0] == pytest.approx([10 * math.log10(5e-4)] * len(REACHES_M))
+        assert found.indirect_gain_db[0] == pytest.approx([10 * math.log10(5e-4)] * len(ATTENUATION_LENGTHS_M))
         assert found.strongest_unobserved_m.tolist() == [0.0]
 
     @given(st.integers(0, 2**32))
@@ -163,18 +143,6 @@ class TestPaths:
         assert (np.diff(found.indirect_gain_db[0]) <= 1e-9).all()
         expected_m = crossed_m[int(np.argmax(power))] if paths else 6.0
         assert found.strongest_unobserved_m == pytest.approx([expected_m], abs=1e-9)
-
-    @pytest.mark.parametrize(("resolution_m", "origin_m"), [(0.1, (0.0, 0.0)), (0.25, (-7.0, 300.5))])
-    def test_other_resolutions_and_origins(self, resolution_m, origin_m):
-        def placed(place):
-            return np.array(place) * resolution_m + (*origin_m, 0.0)
-
-        partial = room(resolution_m, origin_m)
-        links = traced(placed(TX), [placed(FAR)], (0, 0, 0.01, [placed((9.5, 2.5, 1.5))]))
-        crossed_m = 5.5 * resolution_m
-        found = link_context(partial, links)
-        assert found.strongest_unobserved_m == pytest.approx([crossed_m], abs=1e-6)
-        assert found.indirect_gain_db[0] == pytest.approx(gains_db([1e-4], [crossed_m]), abs=1e-4)
 
 
 class TestLinks:
@@ -197,19 +165,13 @@ class TestLinks:
         assert same(both, LinkContext.concatenate(parts))
         assert both.tx_m.tolist() == [list(tx) for tx in self.TXS for _ in self.RXS]
         assert both.rx_m.tolist() == [list(rx) for rx in self.RXS] * 2
-        assert both.maps == (HALF,)
         assert len(both) == 6
-
-    def test_a_link_does_not_know_of_the_others(self):
-        both = link_context(HALF, traced(self.TXS, self.RXS, *self.PATHS))
-        alone = link_context(HALF, traced(self.TXS[1], [self.RXS[2]], *((0, 0, *path[2:]) for path in self.PATHS[3:])))
-        assert same(both.take(slice(5, 6)), alone)
 
     @pytest.mark.parametrize("tx", [TX, TXS])
     def test_no_receivers(self, tx):
         found = link_context(HALF, traced(tx, []))
         assert len(found) == 0
-        assert found.indirect_gain_db.shape == (0, len(REACHES_M))
+        assert found.indirect_gain_db.shape == (0, len(ATTENUATION_LENGTHS_M))
         assert found.tx_seen.shape == found.complete.shape == (0,)
 
     def test_with_the_direct_path_it_is_the_gain_of_the_trace(self):
@@ -226,45 +188,40 @@ class TestLinks:
 
 
 def same(first, second):
-    names = ("tx_m", "rx_m", "indirect_gain_db", "strongest_unobserved_m")
+    names = {field.name for field in dataclasses.fields(LinkContext)} - {"windows", "window_index"}
+    windows = (each.windows[each.window_index] for each in (first, second))
     pairs = [(getattr(first, name), getattr(second, name)) for name in names]
-    maps = [[each.maps[number] for number in each.map_index] for each in (first, second)]
-    return maps[0] == maps[1] and all(np.array_equal(one, other) for one, other in pairs)
+    return np.array_equal(*windows) and all(np.array_equal(one, other) for one, other in pairs)
 
 
 def context_of(count=3, partial=HALF, tx=TX, rx=NEAR):
-    tx_m, rx_m = (np.broadcast_to(np.array(place, dtype=float), (count, 3)) for place in (tx, rx))
-    gain_db = np.arange(count * len(REACHES_M), dtype=float).reshape(count, -1) - 140.0
-    return LinkContext((partial,), np.zeros(count, dtype=np.int64), tx_m, rx_m, gain_db, np.arange(count) / 2)
+    return features(partial, np.tile(rx, (count, 1)), tx_m=tx).context
 
 
 class TestTakeAndConcatenate:
     @pytest.mark.parametrize("index", [slice(1, 3), np.array([2, 0]), np.array([True, False, True])], ids=str)
     def test_take(self, index):
-        some = context_of(3).take(index)
-        assert some.strongest_unobserved_m.tolist() == context_of(3).strongest_unobserved_m[index].tolist()
-        assert some.indirect_gain_db.tolist() == context_of(3).indirect_gain_db[index].tolist()
+        links = features(HALF, (NEAR, FAR, NEAR), unobserved_m=[0.0, 2.5, 0.0], indirect_db=-80.0).context
+        some = links.take(index)
+        assert some.strongest_unobserved_m.tolist() == links.strongest_unobserved_m[index].tolist()
+        assert some.rx_seen.tolist() == links.rx_seen[index].tolist()
+        assert some.windows is links.windows
         assert len(some) == 2
 
-    def test_maps_are_shared(self):
+    def test_windows_are_shared(self):
         one, two = context_of(2), context_of(3, partial=WHOLE)
         both = LinkContext.concatenate([one, two, one.take(slice(1)), two.take(np.array([2]))])
-        assert [id(each) for each in both.maps] == [id(HALF), id(WHOLE)]
-        assert both.map_index.tolist() == [0, 0, 1, 1, 1, 0, 1]
-        assert both.take(slice(2, 5)).maps is both.maps
+        assert both.windows.tolist() == [*one.windows.tolist(), *two.windows.tolist()]
+        assert both.window_index.tolist() == [0, 0, 1, 1, 1, 0, 1]
         assert same(both.take(slice(2, 5)), two)
-        again = LinkContext.concatenate([both.take(np.array([3])), both])
-        assert again.maps == both.maps
-        assert again.map_index.tolist() == [1, *both.map_index]
+        assert LinkContext.concatenate([both.take(np.array([3])), both]).windows is both.windows
 
-    def test_order_of_maps_is_that_of_their_links_parts(self):
-        both = LinkContext.concatenate([context_of(1, partial=WHOLE), context_of(1), context_of(1, partial=WHOLE)])
-        assert both.maps == (WHOLE, HALF)
-        assert both.map_index.tolist() == [0, 1, 0]
-
-    def test_nothing(self):
-        with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkContext\."):
-            LinkContext.concatenate([])
+    def test_without_windows(self):
+        bare = dataclasses.replace(context_of(2), windows=None)
+        both = LinkContext.concatenate([bare, dataclasses.replace(bare)])
+        assert both.windows is None
+        assert both.window_index.tolist() == [0, 0, 1, 1]
+        assert LinkContext.concatenate([context_of(1), bare]).windows is None
 
 
 class TestSeen:
@@ -287,35 +244,154 @@ class TestSeen:
         assert context_of(2, tx=place).tx_seen.tolist() == [seen, seen]
         assert context_of(1, rx=place).tx_seen.tolist() == [True]
 
-    def test_free_cells_at_the_border_of_the_map(self):
-        bare = PartialMap(np.full((2, 2), FREE), 1.0)
-        assert context_of(1, partial=bare, rx=(2.0, 2.0, 1.0)).rx_seen.tolist() == [True]
-        assert context_of(1, partial=bare, rx=(2.1, 2.0, 1.0)).rx_seen.tolist() == [False]
-
     def test_each_link_on_its_own_map(self):
-        both = LinkContext.concatenate([context_of(1, rx=FAR), context_of(2, rx=FAR, partial=WHOLE)])
-        assert both.rx_seen.tolist() == [False, True, True]
+        both = features(((HALF, WHOLE), np.array([0, 1, 1])), (FAR, FAR, (0.5, -1.0, 1.5)), tx_m=TX).context
+        assert both.rx_seen.tolist() == [False, True, False]
         assert both.tx_seen.tolist() == [True, True, True]
         assert both.complete.tolist() == [False, True, True]
-        assert both.take(np.array([2, 0])).rx_seen.tolist() == [True, False]
+        assert both.take(np.array([2, 0])).complete.tolist() == [True, False]
+        assert both.window_index.tolist() == [0, 1, 1]
+
+    def test_a_complete_map_with_both_ends_in_the_unknown(self):
+        assert not context_of(1, partial=WHOLE, tx=(-1.0, -1.0, 1.5), rx=(11.0, 6.0, 1.5)).complete.any()
 
 
-class TestRefused:
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"tx_m": np.zeros(3)}, "tx_m has shape (3,): give (3, 3), a row for each link."),
-            ({"rx_m": np.zeros((2, 3))}, "rx_m has shape (2, 3): give (3, 3), a row for each link."),
-            ({"indirect_gain_db": np.zeros((3, 2))}, "indirect_gain_db has shape (3, 2): give (3, 5), a row for each"),
-            ({"strongest_unobserved_m": np.zeros(4)}, "strongest_unobserved_m has shape (4,): give (3,), a row for"),
-            (
-                {"map_index": np.array([0, 1, 0])},
-                "map_index[1] = 1 is not allowed: give places in maps, which has 1, from 0.",
-            ),
-            ({"map_index": np.array([0, 0, -1])}, "map_index[2] = -1 is not allowed: give places in maps"),
-            ({"maps": ()}, "map_index[0] = 0 is not allowed: give places in maps, which has 0"),
-        ],
-    )
-    def test_bad_arrays(self, change, message):
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            dataclasses.replace(context_of(3), **change)
+OUTAGE, LOS, NLOS = LinkState.OUTAGE, LinkState.LOS, LinkState.NLOS
+ALL = {OUTAGE, LOS, NLOS}
+
+
+def possible(partial, tx, rx, state):
+    """Return the states that are possible for a link between points counted in cells, which is traced in a state."""
+    tx_m, rx_m = (np.array([0.5 * x, 0.5 * y, 1.5]) for x, y in (tx, rx))
+    unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m[None])
+    phi = features(partial, rx_m, tx_m=tx_m, unobserved_m=unobserved_m, state=state, windows=False)
+    return {LinkState(each) for each in np.flatnonzero(phi.context.possible[0])}
+
+
+SCREEN = drawn(
+    """
+    ??????????
+    .....#....
+    .....#....
+    .....#....
+    .....#....
+    .....#....
+    ..........
+    ..........
+    """
+)
+"""A wall one cell thick, seen from both sides, which ends at the height of 2 cells."""
+
+DOUBLE = drawn("?????????? .....##?.. .....##?.. .....##?.. .....##?.. .....##?.. .....##?.. ??????????")
+
+SLANTED = drawn(
+    """
+    ????????
+    ?#......
+    ..#.....
+    ...#....
+    ....#...
+    .....#..
+    ......#?
+    ????????
+    """
+)
+
+ROOM = drawn(
+    """
+    ?#######????
+    ?#.....#.???
+    ?#.....#.???
+    ?#.....#.???
+    ?#.....#.???
+    ?#######.???
+    ?........???
+    """
+)
+"""A closed room, and a little of what is around it."""
+
+
+class TestWalls:
+    @pytest.mark.parametrize("state", [OUTAGE, LOS, NLOS])
+    @pytest.mark.parametrize("rx", [(9.5, 5.5), (8.5, 6.2), (6.5, 4.5)])
+    def test_nothing_is_seen_through_a_known_wall(self, rx, state):
+        """Nor is it if the outline of the wall has a gap; all of the line being observed, the trace is right."""
+        if state != LOS:
+            assert possible(SCREEN, (1.5, 4.5), rx, state) == ALL - {LOS}
+        cut = dataclasses.replace(SCREEN, state=np.where(np.arange(10) == 4, CellState.UNKNOWN, SCREEN.state))
+        assert LOS not in possible(cut, (1.5, 4.5), rx, state)
+
+    def test_past_the_end_of_a_wall_and_along_its_face_the_trace_is_in_doubt(self):
+        assert possible(SCREEN, (0.5, 3.5), (9.5, 1.5), NLOS) == ALL
+        assert possible(SCREEN, (4.9, 6.5), (5.1, 0.5), LOS) == ALL
+
+    @pytest.mark.parametrize("y", [1.5, 3.0, 5.5])
+    def test_double_walls(self, y):
+        for state in (OUTAGE, LOS, NLOS):
+            assert LOS not in possible(DOUBLE, (1.5, 3.5), (9.5, y), state)
+
+    @pytest.mark.parametrize("shift", np.linspace(0.0, 1.0, 5))
+    def test_walls_whose_cells_touch_at_corners(self, shift):
+        """A line may slip between two cells, but not through the wall that they stand for."""
+        assert LOS not in possible(SLANTED, (2.0 + shift, 2.0 + shift), (4.5 + shift, 5.5 + shift), NLOS)
+
+    def test_where_nothing_is_known_everything_is_possible(self):
+        nothing = PartialMap(np.full((9, 9), CellState.UNKNOWN), 0.5)
+        for state in (OUTAGE, LOS, NLOS):
+            assert possible(nothing, (1.5, 1.5), (6.5, 3.5), state) == ALL
+
+    def test_a_free_line_that_is_observed_is_as_traced(self):
+        assert possible(SCREEN, (1.5, 1.0), (9.5, 0.6), LOS) == {LOS}
+        assert possible(SCREEN, (1.5, 1.0), (9.5, 0.6), NLOS) == ALL - {LOS}
+
+
+class TestRegions:
+    def test_a_closed_room_keeps_its_outages(self):
+        assert possible(ROOM, (4.5, 4.5), (8.4, 3.5), OUTAGE) == {OUTAGE}
+        assert possible(ROOM, (8.4, 3.5), (4.5, 4.5), OUTAGE) == {OUTAGE}
+        assert possible(ROOM, (4.5, 4.5), (11.5, 6.5), OUTAGE) == {OUTAGE}
+
+    def test_what_is_not_in_outage_in_it_is_in_none(self):
+        assert possible(ROOM, (3.5, 3.5), (5.5, 4.5), LOS) == {LOS}
+        assert OUTAGE not in possible(ROOM, (3.5, 3.5), (5.5, 4.5), NLOS)
+
+    def test_a_door_makes_one_region_of_two(self):
+        state = ROOM.state.copy()
+        state[2:5, 7] = CellState.FREE
+        assert {OUTAGE, NLOS} <= possible(dataclasses.replace(ROOM, state=state), (4.5, 4.5), (8.4, 1.2), OUTAGE)
+
+
+grids = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9)), elements=st.sampled_from([0, 0, 1, 2]))
+points = st.tuples(st.floats(0.0, 9.0), st.floats(0.0, 9.0))
+
+
+@settings(max_examples=100, deadline=None)
+@given(grids, points, points, st.sampled_from(LinkState))
+def test_some_state_is_always_possible_and_swapping_the_ends_changes_nothing(state, tx, rx, traced):
+    partial = PartialMap(state, 0.5)
+    found = possible(partial, tx, rx, traced)
+    assert found
+    assert found == possible(partial, rx, tx, traced)
+    assert possible(PartialMap(state.T, 0.5), tx[::-1], rx[::-1], traced) == found
+
+
+@settings(max_examples=100, deadline=None)
+@given(grids, points, points)
+def test_a_trace_without_walls_is_not_contradicted(state, tx, rx):
+    """LOS traced on an observed line is possible; without a wall on it, it is certain."""
+    found = possible(PartialMap(np.where(state == CellState.UNKNOWN, CellState.FREE, state), 0.5), tx, rx, LOS)
+    inside = max(*tx, *rx) <= min(state.shape)
+    assert not inside or LOS in found
+
+
+def test_rules_hold_on_explored_homes():
+    """Where the true home is traced, at most one link in a thousand contradicts them."""
+    chosen = DatasetSettings(links_per_home=200, transmitters_per_home=2, stages=(50, 150))
+    tables = [home_links(make_home(seed), f"home {seed}", chosen) for seed in (91000, 91001, 91002)]
+    decided = wrong = 0
+    for table in tables:
+        states = table.context.possible
+        decided += (~states.all(axis=1)).sum()
+        wrong += (~states[np.arange(len(table)), table.link_state]).sum()
+    assert decided > 800
+    assert wrong <= decided / 1000

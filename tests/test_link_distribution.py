@@ -96,10 +96,6 @@ class TestCoverage:
         assert certain.coverage(THRESHOLD_DB).numpy().tolist() == [1.0, 0.0, 0.0]
         np.testing.assert_allclose(certain.coverage(THRESHOLD_DB, 1.0), stats.norm.cdf([1.0, 0.0, -1.0]), rtol=1e-12)
 
-    def test_outage_covers_nothing(self, tf):
-        outage = of(tf, [[1.0], [0.0], [0.0]], [[-150.0], [-60.0], [-60.0]], np.zeros((3, 1)))
-        assert outage.coverage(THRESHOLD_DB, 5.0).numpy().tolist() == [0.0]
-
     @pytest.mark.parametrize("softness_db", [0.0, 3.0])
     def test_slopes(self, tf, softness_db):
         """Those of the Gaussian density, and 0 where there is no spread; nowhere NaN, be the gain where it may."""

@@ -44,36 +44,19 @@ partials = st.builds(
 SMALL = PartialMap(np.array([[0, 1], [2, 0]]), 0.05, (1.5, -2.0), 2.5, 3)
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("suffix", [".yaml", ".yml", ".YAML", ".npz", ".NPZ"])
 @given(partial=partials)
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, suffix: str, partial: PartialMap) -> None:
     folder = tmp_path_factory.mktemp("map")
     save_map(partial, folder / f"home{suffix}")
-    read = load_map(folder / f"home{suffix}")
-    assert read == partial
+    assert load_map(folder / f"home{suffix}") == partial
+    assert load_map(f"{folder}/home{suffix}", wall_height_m=4.0) == replace(partial, wall_height_m=4.0)
     assert len(list(folder.iterdir())) == (1 if "NPZ" in suffix.upper() else 2)
 
 
-def test_paths_may_be_texts(tmp_path: Path) -> None:
-    save_map(SMALL, f"{tmp_path}/home.npz")
-    assert load_map(f"{tmp_path}/home.npz") == SMALL
-
-
-def test_npz_wall_height_can_be_given(tmp_path: Path) -> None:
-    save_map(SMALL, tmp_path / "home.npz")
-    assert load_map(tmp_path / "home.npz", wall_height_m=4.0).wall_height_m == 4.0
-
-
-def test_no_map_is_not_written(tmp_path: Path) -> None:
+def test_what_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"partial is of type ndarray: give a PartialMap, such as load_map returns\."):
         save_map(SMALL.state, tmp_path / "home.npz")  # type: ignore[arg-type]
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_other_suffix_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(OutputError, match=r"home.pgm' has the suffix '.pgm': choose .yaml, .yml or .npz"):
         save_map(SMALL, tmp_path / "home.pgm")
     assert list(tmp_path.iterdir()) == []
@@ -85,17 +68,6 @@ def test_material_comes_back(tmp_path: Path, name: str, material: Material) -> N
     partial = replace(SMALL, material=material)
     save_map(partial, tmp_path / name)
     assert load_map(tmp_path / name) == load_map(tmp_path / name, wall_height_m=2.5) == partial
-
-
-@pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
-def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    def fail(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", fail)
-    with pytest.raises(OutputError, match=r"No space left on device\): the disk is full"):
-        save_map(SMALL, tmp_path / "new" / name)
-    assert list(tmp_path.iterdir()) == []
 
 
 def export(folder: Path, image: str = "map.pgm") -> Path:
@@ -144,26 +116,23 @@ def test_no_such_file(tmp_path: Path, name: str) -> None:
         load_map(path)
 
 
-@pytest.mark.parametrize("name", ["map.pgm", "map.png", "map.bmp"])
-def test_bare_image(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("map.png", r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"),
+        ("map.dae", r"map\.dae' is of no known kind: give a ROS map YAML"),
+    ],
+)
+def test_other_files(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / name).write_bytes(b"P5\n1 1\n255\n\x00")
-    with pytest.raises(MapError, match=r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"):
+    with pytest.raises(MapError, match=message):
         load_map(tmp_path / name)
 
 
-def test_unknown_kind(tmp_path: Path) -> None:
-    (tmp_path / "map.dae").write_bytes(b"dae")
-    with pytest.raises(MapError, match=r"map\.dae' is of no known kind: give a ROS map YAML"):
-        load_map(tmp_path / "map.dae")
-
-
-@pytest.mark.parametrize("path", [None, 3, SMALL, ["map.yaml"]])
+@pytest.mark.parametrize("path", [None, SMALL])
 def test_not_a_path(path: object) -> None:
     with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
         load_map(path)  # type: ignore[arg-type]
-
-
-# --- meshes -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -237,9 +206,6 @@ def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
         load_map(folder, up="z")
 
 
-# --- damaged npz ------------------------------------------------------------------------------------------------------
-
-
 def npz_bytes(**arrays: object) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
@@ -271,14 +237,6 @@ def test_damaged_npz(tmp_path: Path, content: bytes) -> None:
         MapError, match=rf"path = '{re.escape(str(path))}' is damaged or was not written by save_map \(.*save"
     ):
         load_map(path)
-
-
-def test_every_truncation_of_an_npz(tmp_path: Path) -> None:
-    content = npz_bytes(**WHOLE)
-    for size in range(0, len(content), 37):
-        (tmp_path / "home.npz").write_bytes(content[:size])
-        with pytest.raises(MapError, match="is damaged"):
-            load_map(tmp_path / "home.npz")
 
 
 @pytest.mark.parametrize(
@@ -317,35 +275,10 @@ def test_npz_with_a_lying_header(tmp_path: Path) -> None:
         load_map(lying)
 
 
-# --- arrays -----------------------------------------------------------------------------------------------------------
-
-
 def test_array_row_0_is_the_smallest_y() -> None:
     partial = map_from_array([[0, 1], [2, 2]], 0.5, origin_m=(10.0, 20.0), wall_height_m=2.5)
     assert partial == PartialMap(np.array([[0, 1], [2, 2]]), 0.5, (10.0, 20.0), 2.5)
     assert partial.state_at(np.array([10.6, 20.1])) == WALL
-
-
-@pytest.mark.parametrize(
-    ("array", "message"),
-    [
-        ([[0.0, 1.0]], "array has dtype float64: give integers"),
-        ([[np.nan]], "array has dtype float64: give integers"),
-        ([["wall"]], "array has dtype <U4: give integers"),
-        ([[None]], "array has dtype object: give integers"),
-        ([[1 + 2j]], "array has dtype complex128: give integers"),
-        ([[0, 1], [0]], "array is not a rectangular array: give a two-dimensional array (ny, nx)"),
-        ([0, 1], "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
-        (np.zeros((2, 2, 3), int), "array has shape (2, 2, 3): give a two-dimensional array"),
-        (np.zeros((0, 2), int), "array has shape (0, 2): give a two-dimensional array"),
-        (3, "array has shape (): give a two-dimensional array"),
-        ([[0, 3]], "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
-        ([[-1, 0]], "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
-    ],
-)
-def test_wrong_array(array: object, message: str) -> None:
-    with pytest.raises(MapError, match=re.escape(message)):
-        map_from_array(array, 0.05)  # type: ignore[arg-type]
 
 
 def test_occupancy_grid() -> None:
@@ -358,26 +291,6 @@ def test_occupancy_grid() -> None:
     flat = np.array([-1, 0, 100], dtype=np.int8)
     assert map_from_occupancy(flat.reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
     assert map_from_occupancy(flat.view(np.uint8).reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
-
-
-@pytest.mark.parametrize(
-    ("data", "options", "message"),
-    [
-        ([[0, 101]], {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
-        ([[-2]], {}, "data holds -2: give -1 for unknown"),
-        ([[0.5]], {}, "data has dtype float64: give integers"),
-        ([0, 100], {}, "data has shape (2,): give a two-dimensional array"),
-        ([[0]], {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
-        ([[0]], {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
-        ([[0]], {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
-    ],
-)
-def test_wrong_occupancy(data: object, options: dict[str, float], message: str) -> None:
-    with pytest.raises(MapError, match=re.escape(message)):
-        map_from_occupancy(data, 0.05, **options)  # type: ignore[arg-type]
-
-
-# --- Habitat ----------------------------------------------------------------------------------------------------------
 
 
 def test_habitat_with_border() -> None:
@@ -411,25 +324,6 @@ def test_habitat_zero_is_never_free_and_hidden_never_free(top_down: np.ndarray, 
     assert (state[~seen & (top_down != 0)] == UNKNOWN).all()
 
 
-@pytest.mark.parametrize(
-    ("top_down", "seen", "message"),
-    [
-        ([[0, 1]], [[1]], "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
-        ([[0.0]], [[1]], "top_down has dtype float64: give integers"),
-        ([[True]], [[1]], "top_down has dtype bool: give integers"),
-        ([[1]], [[0.5]], "fog_of_war has dtype float64: give integers"),
-        ([[1, -1]], [[1, 1]], "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
-        ([[1, 256]], [[1, 1]], "top_down holds values 1 to 256: give Habitat's map, 0 to 255"),
-    ],
-)
-def test_wrong_habitat(top_down: object, seen: object, message: str) -> None:
-    with pytest.raises(MapError, match=re.escape(message)):
-        map_from_habitat(top_down, seen, 0.05)  # type: ignore[arg-type]
-
-
-# --- Active Neural SLAM -----------------------------------------------------------------------------------------------
-
-
 def test_slam_channels() -> None:
     """An obstacle that was not explored is unknown; row 0 is the smallest y."""
     obstacle, explored = [[0.0, 0.9, 0.9], [0.5, 0.49, 0.0]], [[1.0, 1.0, 0.2], [0.5, 0.6, 0.49]]
@@ -440,23 +334,49 @@ def test_slam_channels() -> None:
     assert booleans.state.tolist() == [[WALL, UNKNOWN, FREE]]
 
 
+FUNCTIONS = {
+    "array": map_from_array,
+    "occupancy": map_from_occupancy,
+    "habitat": map_from_habitat,
+    "slam": map_from_slam,
+}
+
+
 @pytest.mark.parametrize(
-    ("obstacle", "explored", "options", "message"),
+    ("kind", "arrays", "options", "message"),
     [
-        ([[0, 1]], [[1]], {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
-        ([[np.nan]], [[1]], {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or booleans"),
-        ([[0]], [[255]], {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
-        ([["a"]], [[1]], {}, "obstacle has dtype <U1: give numbers"),
-        ([[0]], [[1]], {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
-        ([[0]], [[1]], {"threshold": np.nan}, "threshold = nan is not allowed"),
+        ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
+        ("array", ([["wall"]],), {}, "array has dtype <U4: give integers"),
+        ("array", ([[None]],), {}, "array has dtype object: give integers"),
+        ("array", ([[0, 1], [0]],), {}, "array is not a rectangular array: give a two-dimensional array (ny, nx)"),
+        ("array", ([0, 1],), {}, "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
+        ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
+        ("array", (np.zeros((0, 2), int),), {}, "array has shape (0, 2): give a two-dimensional array"),
+        ("array", (3,), {}, "array has shape (): give a two-dimensional array"),
+        ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ("array", ([[-1, 0]],), {}, "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
+        ("occupancy", ([[-2]],), {}, "data holds -2: give -1 for unknown"),
+        ("occupancy", ([[0.5]],), {}, "data has dtype float64: give integers"),
+        ("occupancy", ([[0]],), {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
+        ("occupancy", ([[0]],), {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
+        ("occupancy", ([[0]],), {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
+        ("habitat", ([[0, 1]], [[1]]), {}, "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
+        ("habitat", ([[True]], [[1]]), {}, "top_down has dtype bool: give integers"),
+        ("habitat", ([[1]], [[0.5]]), {}, "fog_of_war has dtype float64: give integers"),
+        ("habitat", ([[1, -1]], [[1, 1]]), {}, "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
+        ("habitat", ([[1, 256]], [[1, 1]]), {}, "top_down holds values 1 to 256: give Habitat's map, 0 to 255"),
+        ("slam", ([[0, 1]], [[1]]), {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
+        ("slam", ([[np.nan]], [[1]]), {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or"),
+        ("slam", ([[0]], [[255]]), {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
+        ("slam", ([["a"]], [[1]]), {}, "obstacle has dtype <U1: give numbers"),
+        ("slam", ([[0]], [[1]]), {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
+        ("slam", ([[0]], [[1]]), {"threshold": np.nan}, "threshold = nan is not allowed"),
     ],
 )
-def test_wrong_slam(obstacle: object, explored: object, options: dict[str, float], message: str) -> None:
+def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, float], message: str) -> None:
     with pytest.raises(MapError, match=re.escape(message)):
-        map_from_slam(obstacle, explored, 0.05, **options)  # type: ignore[arg-type]
-
-
-# --- real maps --------------------------------------------------------------------------------------------------------
+        FUNCTIONS[kind](*arrays, 0.05, **options)  # type: ignore[operator]
 
 
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="the Gibson plans are not here")
@@ -467,14 +387,11 @@ def test_every_gibson_plan_loads(tmp_path: Path) -> None:
         partial = load_map(sheet)
         assert partial.shape == (480, 480)
         assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
-        assert partial.is_complete == (sheet.parent.name != "Kerrtown"), (
-            "that of Kerrtown is cut off at its right border"
-        )
+        assert partial.is_complete == (sheet.parent.name != "Kerrtown"), "Kerrtown is cut off at its right border"
         save_map(partial, tmp_path / "copy.yaml")
         assert load_map(tmp_path / "copy.yaml") == partial
-        assert (tmp_path / "copy.pgm").read_bytes()[-partial.state.size :] == (sheet.parent / "map.pgm").read_bytes()[
-            -partial.state.size :
-        ]
+        written, shipped = (path.read_bytes() for path in (tmp_path / "copy.pgm", sheet.parent / "map.pgm"))
+        assert written[-partial.state.size :] == shipped[-partial.state.size :]
 
 
 @pytest.mark.skipif(not (SHARED / "ros").is_dir(), reason="the ROS maps are not here")

@@ -93,11 +93,6 @@ class TestMeasurements:
         assert found.is_outage.tolist() == [False, True, True]
         assert len(found) == 3
 
-    def test_take(self) -> None:
-        found = Measurements(TX, RX, GAIN_DB).take(np.array([2, 0]))
-        np.testing.assert_array_equal(found.rx, RX[[2, 0]])
-        assert found.gain_db.tolist() == [-99.25, -70.5]
-
     @pytest.mark.parametrize(
         ("changes", "message"),
         [

@@ -13,7 +13,7 @@ from meshes import areas_m2, box, open_edges, scene_mesh, surface_m2
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh import mesh as mesh_module
 from sionna_partial.maps.mesh.cut import clip_slab, merge_points
-from sionna_partial.maps.mesh.mesh import SceneMesh, mesh_arrays, mesh_of_arrays
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.settings import Material
 
 CONCRETE = Material(itu="concrete")
@@ -82,11 +82,6 @@ class TestSceneMesh:
         assert mesh.corners_m.shape == (0, 3, 3)
         assert mesh.within(shapely.box(0, 0, 1, 1)) == mesh
 
-    def test_arrays_give_the_mesh_back(self) -> None:
-        mesh = SceneMesh(**SQUARE)
-        assert mesh_of_arrays({name: np.asarray(array) for name, array in mesh_arrays(mesh).items()}) == mesh
-        assert mesh_of_arrays({}) is None
-
     @pytest.mark.parametrize(
         ("change", "message"),
         [
@@ -103,7 +98,7 @@ class TestSceneMesh:
             ({"material": [0]}, "material has 1 entries for 2 triangles: give one for each."),
             ({"materials": ("brick", None)}, "materials = ('brick', None) is not allowed: give Material(...) or None"),
             ({"materials": (None,) * 257}, "materials has 257 entries, more than 256: give like ones the same"),
-            ({"height_range_m": (3, 3)}, "height_range_m = (3, 3) is not allowed: give (low, high) in metres"),
+            ({"height_range_m": (3, 3)}, "height_range_m = (3, 3) is not allowed: give (low, high), z in metres"),
             ({"height_range_m": (3, None)}, "height_range_m = (3, None) is not allowed"),
         ],
     )

@@ -9,9 +9,9 @@ import trimesh
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 from numpy.typing import NDArray
 
+from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.candidates import mesh_candidates
-from sionna_partial.tracing.mesh.rays import shoot_rays
-from sionna_partial.tracing.plan.candidates import Candidates
+from sionna_partial.tracing.mesh.sequences import shoot_rays
 
 SIZE = np.array([8.0, 6.0, 3.0])
 TX = np.array([0.3, -0.2, 0.1])
@@ -34,10 +34,7 @@ def candidates_of(
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
-    fields = (
-        np.concatenate([getattr(part, name) for part, _ in parts]) for name in ("rx", "face", "vertices_m", "wedge")
-    )
-    return Candidates(*fields)
+    return Candidates.concatenate([part for part, _ in parts])
 
 
 def lengths_m(candidates: Candidates, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map, raised
+from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap
 
@@ -159,12 +159,6 @@ class TestKnown:
     def test_plans_stay(self) -> None:
         plan = PartialMap(np.zeros((3, 3), int), 0.5)
         assert cut_to_known(plan) is plan
-        assert raised(plan) is plan
-
-
-def test_height_above_the_mesh() -> None:
-    partial = mesh_map(ROOM, MeshReading(), wall_height_m=8.0)
-    assert (partial.height_range_m, partial.wall_height_m) == ((0.0, 8.0), 8.0)
 
 
 @pytest.mark.parametrize(

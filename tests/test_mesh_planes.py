@@ -17,7 +17,7 @@ def fine_box(turn: NDArray[np.float64] | None = None) -> trimesh.Trimesh:
 
 
 def looked_up(planes: MeshPlanes, plane: NDArray[np.int32], points: NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.array([face_at(planes[5:], p, *point) for p, point in zip(plane, points, strict=True)])
+    return np.array([face_at(planes.bins, p, *point) for p, point in zip(plane, points, strict=True)])
 
 
 class TestGroupPlanes:
@@ -81,7 +81,7 @@ class TestFaceAt:
         planes = group_planes(np.concatenate([np.zeros((1, 3)), corners]), triangles)
         middle = (corners[:-1] + corners[1:]) / 3
         np.testing.assert_array_equal(looked_up(planes, planes.plane, middle), np.arange(199))
-        assert len(planes.face) < 199 * 60
+        assert len(planes.bins.face) < 199 * 60
 
     def test_holes_and_surroundings_hold_no_face(self) -> None:
         corners = np.array([[0, 0], [1, 0], [0, 1], [5, 5], [5, 4], [4, 5]], float)

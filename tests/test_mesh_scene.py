@@ -9,10 +9,9 @@ import pytest
 from meshes import box, surface_m2
 
 from sionna_partial.errors import MapError
-from sionna_partial.maps.mesh import mitsuba_xml as mesh_scene
-from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.mesh.mitsuba_xml import exported_record, read_exported_mesh, read_mitsuba_scene
-from sionna_partial.maps.ros_map import MapWarning
+from sionna_partial.maps.mesh import files as mesh_files
+from sionna_partial.maps.mesh.files import read_exported_mesh, read_mitsuba_scene
+from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
 
 SCENES = Path(sysconfig.get_paths()["purelib"]) / "sionna" / "rt" / "scenes"
@@ -196,32 +195,29 @@ def test_no_scene(tmp_path: Path, text: str, message: str) -> None:
 def test_unreadable_and_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MapError, match=r"gone.xml' cannot be read \(No such file or directory\): check the path"):
         read_mitsuba_scene(tmp_path / "gone.xml")
-    monkeypatch.setattr(mesh_scene, "MAX_XML_BYTES", 10)
+    monkeypatch.setattr(mesh_files, "MAX_XML_BYTES", 10)
     with pytest.raises(MapError, match=r"any.xml' has more than 10 bytes: split the scene"):
         read_mitsuba_scene(scene(tmp_path, RADIO))
 
 
-class TestExportedMesh:
-    MESH = SceneMesh(np.eye(3), [[0, 1, 2]], [1], (None, CONCRETE))
+def test_other_shapes_than_exported(tmp_path: Path) -> None:
+    scene(tmp_path, shape("cube")).rename(tmp_path / "scene.xml")
+    with pytest.raises(MapError, match="has a shape 'it' that was not exported: export the scene again"):
+        read_exported_mesh(tmp_path, {"height_range": [0, 1], "materials": [None]}, [0, 0, 0])
 
-    def test_other_shapes(self, tmp_path: Path) -> None:
-        scene(tmp_path, shape("cube")).rename(tmp_path / "scene.xml")
-        sheet = {"mesh": exported_record(self.MESH), "scene_offset": [0, 0, 0]}
-        with pytest.raises(MapError, match="has a shape 'it' that was not exported: export the scene again"):
-            read_exported_mesh(tmp_path, sheet)
 
-    @pytest.mark.parametrize(
-        "change",
-        [
-            {"mesh": None},
-            {"mesh": {}},
-            {"mesh": {"height_range": [0, 1], "materials": ["concrete"]}},
-            {"mesh": {"height_range": [0, 1], "materials": [{"itu": "cheese"}]}},
-            {"mesh": {"height_range": [0], "materials": []}},
-            {"scene_offset": [0, 0]},
-        ],
-    )
-    def test_damaged_entry(self, tmp_path: Path, change: dict) -> None:  # type: ignore[type-arg]
-        sheet = {"mesh": exported_record(self.MESH), "scene_offset": [0, 0, 0]} | change
-        with pytest.raises(MapError, match=r"map.yaml' has a damaged mesh entry \(.*\): export it again"):
-            read_exported_mesh(tmp_path, sheet)
+@pytest.mark.parametrize(
+    ("record", "offset_m"),
+    [
+        (None, [0, 0, 0]),
+        ({}, [0, 0, 0]),
+        ({"height_range": [0, 1], "materials": ["concrete"]}, [0, 0, 0]),
+        ({"height_range": [0, 1], "materials": [{"itu": "cheese"}]}, [0, 0, 0]),
+        ({"height_range": [0], "materials": []}, [0, 0, 0]),
+        ({"height_range": [0, 1], "materials": [None]}, [0, 0]),
+        ({"height_range": [0, 1], "materials": [None]}, None),
+    ],
+)
+def test_damaged_entry_of_an_exported_mesh(tmp_path: Path, record: dict | None, offset_m: list[float] | None) -> None:  # type: ignore[type-arg]
+    with pytest.raises(MapError, match=r"map.yaml' has a damaged mesh entry \(.*\): export it again"):
+        read_exported_mesh(tmp_path, record, offset_m)  # type: ignore[arg-type]

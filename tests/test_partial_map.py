@@ -18,19 +18,7 @@ from sionna_partial.settings import Material
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
-# Row 0 is the smallest y: the plan is upside down when read as text.
-PLAN = PartialMap(
-    np.array(
-        [
-            [1, 1, 1, 1],
-            [1, 0, 0, 2],
-            [1, 1, 1, 1],
-        ]
-    ),
-    resolution_m=0.5,
-    origin_m=(10.0, -4.0),
-    wall_height_m=2.5,
-)
+PLAN = PartialMap(np.array([[1, 1, 1, 1], [1, 0, 0, 2], [1, 1, 1, 1]]), 0.5, (10.0, -4.0), wall_height_m=2.5)
 states = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=8), elements=st.integers(0, 2))
 
 
@@ -70,9 +58,6 @@ def test_equality(other: object) -> None:
 def test_ragged_state_is_refused() -> None:
     with pytest.raises(MapError, match=r"state is not a rectangular array: give a two-dimensional array \(ny, nx\)\."):
         PartialMap([[0], [0, 1]], 0.1)  # type: ignore[arg-type]
-
-
-# --- cells ------------------------------------------------------------------------------------------------------------
 
 
 def test_cell_index() -> None:
@@ -131,16 +116,9 @@ def test_a_corner_has_the_freest_state_around_it(block: list[list[int]], state: 
 
 
 def test_an_edge_has_the_freer_state_of_its_two_cells() -> None:
-    assert PLAN.state_at(np.array([[10.5, -3.25], [10.75, -3.5], [11.5, -3.25], [11.75, -3.5]])).tolist() == [
-        0,
-        0,
-        0,
-        2,
-    ]
+    points = np.array([[10.5, -3.25], [10.75, -3.5], [11.5, -3.25], [11.75, -3.5]])
+    assert PLAN.state_at(points).tolist() == [FREE, FREE, FREE, UNKNOWN]
     assert PLAN.state_at(np.array([[10.5, -3.75], [10.25, -3.5]])).tolist() == [WALL, WALL]
-
-
-# --- completeness -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -149,9 +127,6 @@ def test_an_edge_has_the_freer_state_of_its_two_cells() -> None:
         ([[1, 1, 1], [1, 0, 1], [1, 1, 1]], True),
         ([[2, 1, 2], [1, 0, 1], [2, 1, 2]], True),
         ([[1, 1, 1], [1, 0, 2], [1, 1, 1]], False),
-        ([[1, 1, 1], [2, 0, 1], [1, 1, 1]], False),
-        ([[1, 2, 1], [1, 0, 1], [1, 1, 1]], False),
-        ([[1, 1, 1], [1, 0, 1], [1, 2, 1]], False),
         ([[1, 0, 1], [1, 0, 1], [1, 1, 1]], False),
         ([[1, 1, 1], [1, 0, 0], [1, 1, 1]], False),
         ([[0]], False),
@@ -183,11 +158,6 @@ def test_observed_fraction() -> None:
     assert PartialMap(np.array([[2]]), 0.1, interior_cells=0).observed_fraction == 0.0
 
 
-@given(states)
-def test_observed_fraction_is_a_share(state: np.ndarray) -> None:
-    assert 0.0 <= PartialMap(state, 0.1).observed_fraction <= 1.0
-
-
 @given(states, st.data())
 def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data: st.DataObject) -> None:
     """As long as the map stays incomplete, or ends complete."""
@@ -197,9 +167,6 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
     assert before.is_complete or before.observed_fraction <= after.observed_fraction
 
 
-# --- wrong maps -------------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -207,7 +174,7 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
         ({"state": np.zeros((0, 3), int)}, "state has shape (0, 3): give a two-dimensional array"),
         ({"state": [[0, 3]]}, "state has values 0 to 3: use CellState integers FREE 0, WALL 1, UNK"),
         ({"state": [[-1]]}, "values -1 to -1: use CellState integers"),
-        ({"state": [[0.0]]}, "state has dtype float64: use CellState integers"),
+        ({"state": [[0.0]]}, "state has dtype float64: give CellState integers"),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
         ({"resolution_m": 50}, "resolution_m = 50 is not allowed"),
         ({"resolution_m": np.nan}, "resolution_m = nan is not allowed"),
@@ -227,13 +194,8 @@ def test_wrong_map(arguments: dict[str, object], message: str) -> None:
 
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(partial_map, "MAX_CELLS", 11)
-    with pytest.raises(
-        MapError, match="state has 3 x 4 cells, more than 11: cut the map to the building or coarsen it"
-    ):
+    with pytest.raises(MapError, match="state has 3 x 4 cells, more than 11: cut the map to the building or coarsen"):
         PartialMap(PLAN.state, 0.5)
-
-
-# --- positions --------------------------------------------------------------------------------------------------------
 
 
 def test_positions_may_be_free_or_unknown() -> None:
@@ -256,24 +218,13 @@ def test_positions_may_be_free_or_unknown() -> None:
         ([(1, 2, 3), (1, 2)], "is not numeric: give x, y, z in metres"),
         ((np.nan, -3.25, 1.5), "tx = (nan, -3.25, 1.5) is not finite: give finite numbers in metres"),
         ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),
-        (
-            (9.0, -3.25, 1.5),
-            "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: "
-            "move it inside, or extend the map with unknown cells",
-        ),
+        ((9, -3.25, 1.5), "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: m"),
         ((12.5, -3.25, 1.5), "is outside the map"),
         ((10.75, -4.1, 1.5), "is outside the map"),
         ((10.75, -2.4, 1.5), "is outside the map"),
-        (
-            (10.75, -3.25, 2.5),
-            "tx = (10.75, -3.25, 2.5) is not between floor and ceiling (0 to 2.5 m): change its height z or the map's "
-            "wall_height_m",
-        ),
+        ((10.75, -3.25, 2.5), "tx = (10.75, -3.25, 2.5) is not between floor and ceiling (0 to 2.5 m): change its hei"),
         ((10.75, -3.25, 0.0), "is not between floor and ceiling"),
-        (
-            (10.25, -3.25, 1.5),
-            "tx = (10.25, -3.25, 1.5) is inside a wall: move it to a free or unknown cell",
-        ),
+        ((10.25, -3.25, 1.5), "tx = (10.25, -3.25, 1.5) is inside a wall: move it to a free or unknown cell"),
         (
             [(10.75, -3.25, 1.5), (10.25, -3.25, 1.5), (10.75, -2.75, 1.5)],
             "tx[1] = (10.25, -3.25, 1.5) (and 1 more) is inside a wall",
@@ -299,9 +250,6 @@ def test_positions_pass_where_the_map_allows_them(state: np.ndarray, points: np.
         else:
             with pytest.raises(PositionError, match="rx = "):
                 partial.require_positions("rx", point)
-
-
-# --- meshes -----------------------------------------------------------------------------------------------------------
 
 
 def test_mesh_says_how_high_radios_may_be() -> None:

@@ -2,26 +2,21 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from coverage_fakes import map_of
 from PIL import Image
-from placement_fakes import HALF_SEEN, use_fake_search
+from placement_cases import TWO_ROOMS, home
 from typer.testing import CliRunner, Result
 
-import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.maps.map_files import save_map
-from sionna_partial.placement import placement
 
 pytestmark = pytest.mark.usefixtures("command_line")
 
 
 @pytest.fixture
-def map_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    use_fake_search(monkeypatch)
-    save_map(map_of(HALF_SEEN, 0.5, (0.0, 0.0)), tmp_path / "map.yaml")
+def map_path(tmp_path: Path) -> Path:
+    save_map(home(TWO_ROOMS), tmp_path / "map.yaml")
     return tmp_path / "map.yaml"
 
 
@@ -45,34 +40,19 @@ def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
         assert picture.width > 500
 
 
-def test_worst_places(map_path: Path, tmp_path: Path) -> None:
+def test_worst_tenth(map_path: Path, tmp_path: Path) -> None:
     result = run(map_path, "--out", tmp_path / "place", "--objective", "percentile")
     assert "m: the worst tenth of the receivers is predicted at " in result.stdout
 
 
-def test_what_it_passes_on(map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[dict[str, Any]] = []
-    true = placement.place_transmitter
-
-    def place_transmitter(scene: Any, **options: Any) -> placement.TransmitterPlacement:
-        calls.append(options)
-        return true(scene, seed=options["seed"])
-
-    monkeypatch.setattr(sp, "place_transmitter", place_transmitter)
-    options = ["--threshold", -90, "--height", 2, "--rx-height", 1, "--seed", 3, "--frequency", 27e9, "--max-depth", 2]
-    options += ["--predictor", "paper", "--material", "concrete"]
-    assert run(map_path, "--out", tmp_path / "place", *options).exit_code == 0
-    (found,) = calls
-    assert {name: found[name] for name in ("threshold_db", "height_m", "rx_height_m", "seed", "predictor")} == {
-        "threshold_db": -90.0,
-        "height_m": 2.0,
-        "rx_height_m": 1.0,
-        "seed": 3,
-        "predictor": "paper",
-    }
-    assert (found["trace_settings"].frequency_hz, found["trace_settings"].max_depth) == (27e9, 2)
-    assert found["scene_settings"].material.itu == "concrete"
-    assert found["objective"] == "coverage"
+def test_options(map_path: Path, tmp_path: Path) -> None:
+    options = ["--threshold", -90, "--height", 2, "--rx-height", 1, "--seed", 3, "--frequency", 27e9, "--max-depth", 0]
+    assert run(map_path, "--out", tmp_path / "place", *options, "--material", "concrete").exit_code == 0
+    settings = json.loads((tmp_path / "place" / "placement.json").read_text())["settings"]
+    expected = {"threshold_db": -90.0, "height_m": 2.0, "rx_height_m": 1.0, "seed": 3, "objective": "coverage"}
+    assert {name: settings[name] for name in expected} == expected
+    assert (settings["trace_settings"]["frequency_hz"], settings["trace_settings"]["max_depth"]) == (27e9, 0)
+    assert settings["scene_settings"]["material"]["itu"] == "concrete"
 
 
 @pytest.mark.parametrize(

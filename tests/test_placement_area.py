@@ -1,13 +1,30 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, use_fakes
-from placement_fakes import two_rooms
+from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of
+from numpy.typing import NDArray
+from placement_cases import TWO_ROOMS, home
 
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.settings import TraceSettings
+
+
+class IndoorBy(FakePredictor):
+    """Predicts the probability of being indoors by a function of the features."""
+
+    def __init__(self, predict_indoor: Callable[[LinkFeatures], NDArray[np.float64]]) -> None:
+        self.predict_indoor = predict_indoor  # type: ignore[method-assign]
+
+
+def two_rooms() -> PlacementArea:
+    """Where a transmitter may stand in the home, all of which is known."""
+    return placement_area(home(TWO_ROOMS), 1.5, 1.5, None)
 
 
 class TestRoom:
@@ -42,54 +59,35 @@ class TestRoom:
             placement_area(map_of("###\n#.#\n###", 0.1), 1.5, 1.5, None)
 
 
-class TestReaches:
-    def test_walls_are_in_the_way(self) -> None:
-        area = two_rooms()
-        left, right, door = np.array([[1.0, 2.0, 1.5], [3.5, 2.0, 1.5], [2.75, 1.25, 1.5]])
-        assert not area.reaches(left, right)
-        assert area.reaches(np.array([1.0, 1.25, 1.5]), np.array([4.0, 1.25, 1.5]))
-        assert area.reaches(door, np.array([2.0, 1.25, 1.5]))
-        assert area.reaches(left, left)
-
-    def test_unknown_cells_are_in_the_way(self) -> None:
-        area = placement_area(map_of(".?.\n...", 0.5, (0.0, 0.0)), 1.5, 1.5, None)
-        assert not area.reaches(np.array([0.25, 0.75, 1.5]), np.array([1.25, 0.75, 1.5]))
-        assert area.reaches(np.array([0.25, 0.25, 1.5]), np.array([1.25, 0.25, 1.5]))
-
-    def test_end_outside(self) -> None:
-        assert not two_rooms().reaches(np.array([1.0, 1.0, 1.5]), np.array([-1.0, 1.0, 1.5]))
-
-
-class TestPlaces:
+class TestPositions:
     def test_all_over_the_area(self) -> None:
         area = two_rooms()
-        places = area.places(3)
+        places = area.positions(3)
         assert area.stands(places).all()
         assert (places[:, 2] == 1.5).all()
         assert len(places) == pytest.approx(area.size_m2 / 0.25**2, rel=0.25)
 
     def test_seed(self) -> None:
         area = two_rooms()
-        np.testing.assert_array_equal(area.places(3), area.places(3))
-        assert not np.isin(area.places(4)[:, 0], area.places(3)[:, 0]).any()
+        np.testing.assert_array_equal(area.positions(3), area.positions(3))
+        assert not np.isin(area.positions(4)[:, 0], area.positions(3)[:, 0]).any()
 
     def test_no_more_than_wanted_on_a_large_map(self) -> None:
         area = placement_area(PartialMap(np.zeros((200, 300), dtype=np.uint8), 0.2), 1.5, 1.5, None)
-        assert 400 < len(area.places(0)) < 600
+        assert 400 < len(area.positions(0)) < 600
 
     def test_area_that_the_grid_misses(self) -> None:
         state = np.full((40, 40), CellState.UNKNOWN, dtype=np.uint8)
         state[20, 20:23] = CellState.FREE
         area = placement_area(PartialMap(state, 0.05), 1.5, 1.5, FakePredictor())
         for seed in range(5):
-            assert area.stands(area.places(seed)).all()
+            assert area.stands(area.positions(seed)).all()
 
 
 class TestReceivers:
-    def test_where_predict_map_has_valid_ones(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        use_fakes(monkeypatch)
-        partial = map_of(PICTURE)
-        coverage = predict_map(partial, TX, spacing_m=0.5)
+    def test_where_predict_map_has_valid_ones(self) -> None:
+        partial, settings = map_of(PICTURE), TraceSettings(max_depth=0, diffraction=False)
+        coverage = predict_map(partial, TX, spacing_m=0.5, predictor="paper", trace_settings=settings)
         rows, columns = np.nonzero(coverage["valid"].to_numpy())
         expected = np.column_stack([coverage["x"].to_numpy()[columns], coverage["y"].to_numpy()[rows]])
         found = placement_area(partial, 1.5, 1.2, FakePredictor()).rx_m
@@ -109,16 +107,15 @@ class TestReceivers:
         assert (partial.state_at(area.rx_m) == CellState.FREE).all()
         assert (area.weight == 1.0).all()
 
-    def test_those_hardly_indoors_are_left_out(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(FakePredictor, "predict_indoor", lambda self, phi: np.full(len(phi), 0.01))
+    def test_those_hardly_indoors_are_left_out(self) -> None:
         partial = map_of(PICTURE)
-        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        area = placement_area(partial, 1.5, 1.5, IndoorBy(lambda phi: np.full(len(phi), 0.01)))
         assert (partial.state_at(area.rx_m) == CellState.FREE).all()
 
-    def test_the_nearer_to_what_is_seen_the_more(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """P(indoor) is asked with lengths that grow with the distance from the free cells."""
-        monkeypatch.setattr(FakePredictor, "predict_indoor", lambda self, phi: np.exp(-phi.unobserved_distance_m))
-        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, FakePredictor())
+    def test_the_nearer_to_free_cells_the_more(self) -> None:
+        """P(indoor) is predicted for lengths that grow with the distance from the free cells."""
+        model = IndoorBy(lambda phi: np.exp(-phi.unobserved_distance_m))
+        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, model)
         order = np.argsort(area.rx_m[:, 0])
         assert (np.diff(area.weight[order][3:]) < 0.0).all()
 
@@ -131,7 +128,7 @@ class TestReceivers:
         state = np.full((20, 20), CellState.UNKNOWN, dtype=np.uint8)
         state[1:5, 1:5] = CellState.WALL
         state[2:4, 2:4] = CellState.FREE
-        with pytest.raises(PositionError, match=r"no receiver can stand anywhere: all places of a grid of 0\.5 m"):
+        with pytest.raises(PositionError, match=r"no receiver can stand anywhere: all positions of a grid of 0\.5 m"):
             placement_area(PartialMap(state, 0.15), 1.5, 1.5, None)
 
 
@@ -158,20 +155,20 @@ class TestThinned:
         assert area.thinned(10_000) is area
 
 
-class TestSight:
+class TestVisibility:
     def test_open_unknown_and_walled(self) -> None:
         partial = map_of("#####\n....?\n####?", 1.0, (0.0, 0.0))
         area = PlacementArea(
             partial, 1.5, partial, np.array([[3.5, 1.5, 1.5], [4.5, 1.5, 1.5], [4.5, 0.5, 1.5]]), np.ones(3), 0.5
         )
-        clear, unseen, walled = area.sight(np.array([[0.5, 1.5, 1.5]]))[0]
+        clear, unseen, walled = area.visibility(np.array([[0.5, 1.5, 1.5]]))[0]
         assert clear == 1.0
         assert unseen == pytest.approx(np.exp(-0.5 / 4.0))
         assert 0.0 < walled < unseen
 
-    def test_beyond_reach(self) -> None:
+    def test_beyond_range(self) -> None:
         area = two_rooms()
-        seen = area.sight(np.array([[1.0, 1.0, 1.5]]), reach_m=1.0)[0]
+        seen = area.visibility(np.array([[1.0, 1.0, 1.5]]), range_m=1.0)[0]
         far = np.linalg.norm(area.rx_m - [1.0, 1.0, 1.5], axis=1) > 1.0
         left = area.rx_m[:, 0] < 2.4
         assert (seen[~far] == 1.0).all()

@@ -1,37 +1,28 @@
 import numpy as np
 import pytest
 from matplotlib.collections import PatchCollection
-from matplotlib.figure import Figure
-from placement_fakes import small_placement
+from placement_cases import placed
 
 from sionna_partial.errors import SettingsError
-from sionna_partial.placement import placement as placement_module
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.plots.placement_plot import plot_placement
-from sionna_partial.plots.style import BLUE, RED, figure_png
+from sionna_partial.plots.style import RED, figure_png
 
 
 @pytest.fixture
-def placement(monkeypatch: pytest.MonkeyPatch) -> TransmitterPlacement:
-    for name, limits in (("STARTS", (8, 8)), ("CLIMBS", (3, 3)), ("STEPS", (3, 3))):
-        monkeypatch.setattr(placement_module, name, limits)
-    return small_placement(monkeypatch)
-
-
-def ways(figure: Figure, colour: str) -> list[np.ndarray]:
-    return [np.column_stack(line.get_data()) for line in figure.axes[0].lines if line.get_color() == colour]
+def placement() -> TransmitterPlacement:
+    return placed()
 
 
 class TestPlotPlacement:
-    def test_shows_every_climb_and_the_best(self, placement: TransmitterPlacement) -> None:
-        figure = plot_placement(placement)
-        (red,) = ways(figure, RED)
+    def test_shows_the_refinement_and_the_best(self, placement: TransmitterPlacement) -> None:
+        lines = plot_placement(placement).axes[0].lines
+        (red,) = (np.column_stack(line.get_data()) for line in lines if line.get_color() == RED)
         np.testing.assert_array_equal(red, placement.trajectory_m[:, :2])
-        assert len(ways(figure, BLUE)) == len(placement.climbs) - 1 > 0
-        star = next(line for line in figure.axes[0].lines if line.get_marker() == "*")
+        star = next(line for line in lines if line.get_marker() == "*")
         np.testing.assert_array_equal(np.ravel(star.get_data()), placement.position_m[:2])
 
-    def test_shows_what_was_looked_at(self, placement: TransmitterPlacement) -> None:
+    def test_shows_the_starts(self, placement: TransmitterPlacement) -> None:
         points = [np.asarray(each.get_offsets()) for each in plot_placement(placement).axes[0].collections]
         assert any(
             len(each) == len(placement.starts_m) and (each == placement.starts_m[:, :2]).all() for each in points
@@ -50,8 +41,8 @@ class TestPlotPlacement:
         assert figure.axes[0].get_title() == title
         assert figure.axes[1].get_ylabel() == "probability of more than -100 dB"
 
-    def test_worst_places(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        figure = plot_placement(small_placement(monkeypatch, objective="percentile"))
+    def test_worst_tenth(self) -> None:
+        figure = plot_placement(placed(objective="percentile"))
         assert "worst tenth at" in figure.axes[0].get_title()
         assert figure.axes[1].get_ylabel() == "mean path gain [dB]"
 

@@ -1,4 +1,5 @@
 import dataclasses
+import doctest
 import re
 
 import numpy as np
@@ -10,14 +11,15 @@ from predictor_links import (
     arrays,
     assert_valid,
     context_predictor,
-    corridors,
+    corridor_of,
+    make_context,
     make_links,
     make_seen_links,
     quick_predictor,
 )
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction import features as features_module
 from sionna_partial.prediction import predictor as predictor_module
 from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
@@ -41,6 +43,13 @@ def seeing(request):
 def saved(quick, tmp_path):
     quick.save(tmp_path / "mine.keras")
     return tmp_path / "mine.keras"
+
+
+@pytest.mark.parametrize("module", [features_module, predictor_module])
+def test_examples_in_the_docstrings(module):
+    result = doctest.testmod(module)
+    assert result.attempted > 0
+    assert result.failed == 0
 
 
 def test_valid_on_other_links(quick):
@@ -70,17 +79,6 @@ def test_total_expectation_and_variance():
     assert answer.link_state.tolist() == [LOS]
 
 
-def test_prediction_is_the_mixture_of_its_parts(quick):
-    answer = quick.predict(make_links(100)[0])
-    parts = LinkPrediction.of_parts(
-        np.stack([answer.p_outage, answer.p_los, answer.p_nlos]),
-        np.stack([np.full(100, -150.0), answer.gain_los_mean_db, answer.gain_nlos_mean_db]),
-        np.stack([np.zeros(100), answer.gain_los_std_db, answer.gain_nlos_std_db]),
-    )
-    np.testing.assert_allclose(parts.gain_mean_db, answer.gain_mean_db)
-    np.testing.assert_allclose(parts.gain_std_db, answer.gain_std_db)
-
-
 def test_of_trace():
     phi = make_links(50)[0]
     answer = LinkPrediction.of_trace(phi)
@@ -104,12 +102,6 @@ def test_anywhere_is_indoors_or_in_outage(quick):
     second_moment = p_indoor * (indoors.gain_std_db**2 + indoors.gain_mean_db**2) + 150.0**2 * (1.0 - p_indoor)
     np.testing.assert_allclose(answer.gain_std_db**2 + answer.gain_mean_db**2, second_moment)
     assert answer.p_outage[0] == 1.0
-
-
-def test_certainly_indoors_changes_nothing(quick):
-    indoors = quick.predict(make_links(50)[0])
-    for name, values in arrays(indoors.anywhere(np.ones(50))).items():
-        np.testing.assert_allclose(values, getattr(indoors, name), rtol=1e-12, err_msg=name)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +162,7 @@ def test_shipped_predictor(name):
         assert stage["predictor"]["rmse_db"] < stage["majority"]["rmse_db"]
 
 
-class TestWhatSeesWhereLinksRun:
+class TestNetworksOfMapsAndPaths:
     def test_valid_on_other_links(self, seeing):
         answer = seeing.predict(make_seen_links(500, seed=2)[0])
         assert_valid(answer)
@@ -185,14 +177,10 @@ class TestWhatSeesWhereLinksRun:
             np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
 
     @pytest.mark.parametrize("complete", [range(4), [], [1, 3]], ids=str)
-    def test_the_trace_answers_where_maps_are_complete(self, seeing, complete):
+    def test_the_trace_is_the_prediction_where_maps_are_complete(self, seeing, complete):
         phi = make_seen_links(200, seed=3)[0]
-        whole = PartialMap(np.pad(np.zeros((2, 32), dtype=np.uint8), 1, constant_values=1), 0.5, (-0.75, -0.75))
-        assert whole.is_complete
-        maps = tuple(whole if number in complete else each for number, each in enumerate(corridors()))
-        mixed = dataclasses.replace(phi, context=dataclasses.replace(phi.context, maps=maps))
-        sure = np.isin(phi.context.map_index, [*complete])
-        assert sure.mean() == len(complete) / 4 or len(complete) == 2
+        sure = np.isin(corridor_of(phi), [*complete])
+        mixed = dataclasses.replace(phi, context=dataclasses.replace(phi.context, complete=sure))
         answer, traced, unsure = seeing.predict(mixed), LinkPrediction.of_trace(phi), seeing.predict(phi)
         assert_valid(answer)
         for name, values in arrays(answer).items():
@@ -238,14 +226,6 @@ class TestWhatSeesWhereLinksRun:
         own = {name: set(parts(context_predictor(name).model)) - set(parts(quick.model)) for name in ("paths", "map")}
         assert own == {"paths": {LINK_NETWORK}, "map": {LINK_NETWORK, *MAP_NETWORKS}}
 
-    def test_progress(self):
-        calls = []
-        settings = dataclasses.replace(context_predictor("paths").settings, passes=1)
-        Predictor.fit(*make_seen_links(20), settings=settings, progress=lambda *call: calls.append(call))
-        ((share, message),) = calls
-        assert share == 0.0
-        assert message.startswith("step 0 of 1, loss ")
-
     def test_links_that_cannot_train_it(self, seeing):
         _, state, gain_db = make_seen_links(5)
         message = (
@@ -257,13 +237,15 @@ class TestWhatSeesWhereLinksRun:
         with pytest.raises(PredictorError, match="features has no links: give at least one"):
             Predictor.fit(make_seen_links(0)[0], [], [], settings=seeing.settings)
 
-
-def test_where():
-    one, other = (LinkPrediction.of_trace(make_links(6, seed=seed)[0]) for seed in (1, 2))
-    taken = np.array([True, False, False, True, True, False])
-    for name, values in arrays(one.where(taken, other)).items():
-        np.testing.assert_array_equal(values[taken], getattr(other, name)[taken], err_msg=name)
-        np.testing.assert_array_equal(values[~taken], getattr(one, name)[~taken], err_msg=name)
+    def test_features_without_windows(self):
+        phi, state, gain_db = make_links(5)
+        phi = dataclasses.replace(phi, context=make_context(phi))
+        assert_valid(context_predictor("paths").predict(phi))
+        message = r"features has no windows, which map networks read: call link_features with windows=True\."
+        with pytest.raises(PredictorError, match=message):
+            context_predictor("map").predict(phi)
+        with pytest.raises(PredictorError, match=message):
+            Predictor.fit(phi, state, gain_db, settings=context_predictor("map").settings)
 
 
 def test_bad_training_data(quick):

@@ -1,4 +1,3 @@
-import dataclasses
 import io
 import json
 import re
@@ -17,7 +16,6 @@ from predictor_links import (
     context_predictor,
     fit_context_predictor,
     make_links,
-    make_seen_links,
     quick_predictor,
 )
 
@@ -64,19 +62,6 @@ def test_stock_keras_loads_it(quick, saved):
     np.testing.assert_allclose(probabilities[:, LOS], quick.predict(phi).p_los[phi.link_state == LOS], rtol=1e-5)
 
 
-def test_stock_keras_loads_networks_that_see_where_links_run(tmp_path):
-    context_predictor("map").save(tmp_path / "mine.keras")
-    model = import_keras().saving.load_model(tmp_path / "mine.keras", safe_mode=True)
-    mine = dataclasses.replace(context_predictor("map"), model=model)
-    phi = make_seen_links(20)[0]
-    np.testing.assert_array_equal(mine.predict(phi).p_los, context_predictor("map").predict(phi).p_los)
-
-
-def test_same_bytes_however_many_were_made_before(quick):
-    again = Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
-    assert again.archive == quick.archive
-
-
 class TestSameBytes:
     """Of a training by seed, however many were before it, and in a process of its own."""
 
@@ -93,18 +78,6 @@ class TestSameBytes:
         )
         assert result.returncode == 0, result.stderr
         assert result.stdout.split() == [context_predictor(name).fingerprint for name in ("map", "paths")]
-
-    def test_other_seeds_give_others(self):
-        assert fit_context_predictor("paths", seed=1).archive != context_predictor("paths").archive
-
-
-@pytest.mark.parametrize("networks", ["paths", "map"])
-def test_card_of_networks_that_see_where_links_run(networks, tmp_path):
-    context_predictor(networks).save(tmp_path / "mine.keras")
-    card = json.loads((tmp_path / "mine.json").read_text())
-    assert (card["settings"]["networks"], card["settings"]["passes"]) == (networks, 8)
-    assert card["sha256"] == digest((tmp_path / "mine.keras").read_bytes())
-    assert card["links"]["NLOS given NLOS"] > 0
 
 
 def test_cards_from_before_there_were_others_are_of_the_papers(saved):
@@ -287,12 +260,6 @@ def test_bad_card(saved, change, message):
 def test_card_that_is_no_json(saved, text):
     saved.with_suffix(".json").write_bytes(text.encode("latin-1"))
     with pytest.raises(PredictorError, match=r"mine\.json' is not JSON"):
-        Predictor.load(saved)
-
-
-def test_card_that_is_no_object(saved):
-    saved.with_suffix(".json").write_text("[]")
-    with pytest.raises(PredictorError, match="format = None, but this version reads"):
         Predictor.load(saved)
 
 

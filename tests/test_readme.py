@@ -1,4 +1,4 @@
-"""The README's lines run as they stand, one after the other, on a shipped map."""
+"""The documentation: its Python blocks run as they stand, its commands parse, and its pages lead to each other."""
 
 import re
 import shutil
@@ -8,62 +8,125 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import trimesh
+import typer
 
 import sionna_partial as sp
-from sionna_partial.calibration import material_search
+from sionna_partial.cli.app import app
 from sionna_partial.resources import scenes_folder
 
-README = Path(__file__).resolve().parents[1] / "README.md"
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+PAGES = (README, *sorted((ROOT / "docs").glob("*.md")))
 
 
-def blocks(language: str) -> list[str]:
-    """Code blocks of the README in one language."""
-    return re.findall(
-        rf"^```{language}\n(.*?)^```$", README.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE
-    )
+def blocks(page: Path, language: str) -> list[str]:
+    """Code blocks of a page in one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
 
 
-def write_measurements(folder: Path) -> None:
-    """Write made-up gains of 30 links beside the map."""
-    partial = sp.load_map(folder / "map.yaml")
-    cells = np.argwhere(partial.state == sp.CellState.FREE)
-    rx = cells[np.random.default_rng(0).choice(len(cells), 30, replace=False)][:, ::-1] + 0.5
-    rx = np.column_stack([rx * partial.resolution_m + partial.origin_m, np.full(30, 1.5)])
-    links = sp.trace_links(partial, (7.0, 9.8, 1.5), rx)
-    rows = np.column_stack([np.tile(links.tx, (30, 1)), rx, links.gain_db])
-    header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
-    np.savetxt(folder / "measured.csv", rows, delimiter=",", header=header, comments="")
+def links(page: Path) -> list[tuple[Path, str]]:
+    """File and anchor of each link and picture of a page, other sites aside."""
+    targets = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    parts = [target.partition("#") for target in targets if "://" not in target]
+    return [((page.parent / name).resolve() if name else page, anchor) for name, _, anchor in parts]
 
 
-def test_python_lines_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mpl.use("Agg")
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings of a page, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.fixture
+def inputs(tmp_path: Path) -> Path:
+    """Folder with the map, the measurements and the scan that the blocks read."""
     for name in ("map.yaml", "map.pgm"):
         shutil.copy(scenes_folder() / "apartment" / "step100" / name, tmp_path)
+    (tmp_path / "scenes").symlink_to(scenes_folder())
     trimesh.creation.box((7.0, 5.0, 3.0), transform=trimesh.transformations.translation_matrix((3, 2, 1.5))).export(
         tmp_path / "scan.ply"
     )
-    write_measurements(tmp_path)
-    for name, value in {"MOST_TEETH": 1, "MOST_CELLS": 60, "FEW_TEETH": 1, "TEETH_PARTS": 1, "COARSE_PARTS": 8}.items():
-        monkeypatch.setattr(material_search, name, value)  # a short search
-    monkeypatch.chdir(tmp_path)
+    partial = sp.load_map(tmp_path / "map.yaml")
+    cells = np.argwhere(partial.state == sp.CellState.FREE)
+    rx = cells[np.random.default_rng(0).choice(len(cells), 18, replace=False)][:, ::-1] + 0.5
+    rx = np.column_stack([rx * partial.resolution_m + partial.origin_m, np.full(len(rx), 1.5)])
+    traced = sp.trace_links(partial, (7.0, 9.8, 1.5), rx)
+    rows = np.column_stack([np.tile(traced.tx, (len(rx), 1)), rx, traced.gain_db])
+    header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
+    np.savetxt(tmp_path / "measured.csv", rows, delimiter=",", header=header, comments="")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("page", "files"),
+    [
+        ("README.md", ("coverage.nc", "coverage.png", "scene/scene.xml")),
+        ("docs/usage.md", ("coverage.nc", "scene/scene.xml", "exploration.gif", "calibration.png", "placement.png")),
+    ],
+)
+def test_python_blocks_run(page: str, files: tuple[str, ...], inputs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mpl.use("Agg")
+    monkeypatch.chdir(inputs)
     names: dict[str, object] = {}
-    for block in blocks("python"):
+    for block in blocks(ROOT / page, "python"):
         exec(block, names)
-    assert (tmp_path / "calibration.png").stat().st_size > 10_000
-    assert (tmp_path / "coverage.nc").stat().st_size > 10_000
-    assert (tmp_path / "coverage.png").stat().st_size > 10_000
-    assert (tmp_path / "scene" / "scene.xml").is_file()
-    assert len(names["maps"]) == 4  # type: ignore[arg-type]
+    for file in files:
+        assert (inputs / file).stat().st_size > 500
 
 
-def test_files_that_are_linked_are_there() -> None:
-    text = README.read_text(encoding="utf-8")
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", text) if "://" not in link]
-    assert links
-    assert [link for link in links if not (README.parent / link).is_file()] == []
+def test_other_pages_have_no_python_blocks() -> None:
+    assert [page.name for page in PAGES if blocks(page, "python")] == ["README.md", "usage.md"]
+
+
+def test_commands_and_their_options_exist() -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in PAGES).replace("\\\n", " ")
+    commands = re.findall(r"(?:^ *|`|/bin/)sionna-partial ([a-z-]+)([^`\n]*)", text, flags=re.MULTILINE)
+    known = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    assert len(commands) > 8
+    for name, arguments in commands:
+        options = {
+            option for parameter in known[name].params for option in (*parameter.opts, *parameter.secondary_opts)
+        }
+        assert set(re.findall(r"--[a-z-]+", arguments)) <= {*options, "--help"}, f"{name}{arguments}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_linked_files_and_headings_exist(page: Path) -> None:
+    for target, anchor in links(page):
+        assert target.is_file(), f"{page.name} links to {target}"
+        assert not anchor or anchor in anchors(target), f"{page.name} links to {target.name}#{anchor}"
+
+
+def test_every_page_and_picture_is_linked() -> None:
+    linked = {target for page in PAGES for target, _ in links(page)}
+    from_readme = {target for target, _ in links(README)}
+    assert set(PAGES[1:]) <= from_readme
+    assert set((ROOT / "docs").glob("*.png")) <= linked
+    for page in PAGES[1:]:
+        assert README in {target for target, _ in links(page)}, f"{page.name} does not lead back"
+
+
+def test_files_named_in_code_exist() -> None:
+    for page in PAGES:
+        if page.name == "experiments.md":  # scripts of earlier commits
+            continue
+        for name in re.findall(r"\b(?:benchmarks|examples|scenes|sionna_partial)/[\w/]+\.\w+", page.read_text("utf-8")):
+            assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
+def test_rooms_are_described() -> None:
+    text = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
+    folders = [path.parent.name for path in (ROOT / "sionna_partial").glob("*/__init__.py")]
+    assert [name for name in folders if f"`{name}/`" not in text] == []
+
+
+def test_readme_is_short() -> None:
+    assert len(README.read_text(encoding="utf-8").splitlines()) <= 120
 
 
 def test_make_targets_that_are_named_exist() -> None:
-    makefile = (README.parent / "Makefile").read_text(encoding="utf-8")
-    for target in set(re.findall(r"`make ([a-z-]+)`", README.read_text(encoding="utf-8"))):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in {
+        name for page in PAGES for name in re.findall(r"`make ([a-z-]+)`", page.read_text(encoding="utf-8"))
+    }:
         assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target

@@ -1,5 +1,6 @@
 """ROS map_server YAML and image, read as nav2_map_server reads them."""
 
+import logging
 import math
 import re
 import warnings
@@ -9,13 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
+from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
+from sionna_partial.maps import ros_map
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.ros_map import MapWarning, states_from_percent
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.ros_map import turn_grid
 
 SHEET: dict[str, Any] = {
     "image": "map.pgm",
@@ -48,9 +54,6 @@ def write_map(folder: Path, shades: object, **changes: object) -> Path:
 def load_state(folder: Path, shades: object, *, strict: bool = False, **changes: object) -> list[list[int]]:
     """Read a map made of shades, turned back so that its first row is the image's top row."""
     return load_map(write_map(folder, shades, **changes), strict=strict).state[::-1].tolist()
-
-
-# --- images -----------------------------------------------------------------------------------------------------------
 
 
 def test_orientation_and_place(tmp_path: Path) -> None:
@@ -99,9 +102,6 @@ def test_colours_are_averaged(tmp_path: Path) -> None:
     assert load_state(tmp_path, pixels) == [[WALL, FREE, WALL, UNKNOWN]]
 
 
-# --- modes, thresholds, negate, alpha ---------------------------------------------------------------------------------
-
-
 def test_thresholds_are_strict(tmp_path: Path) -> None:
     """nav2: occupancy > occupied_thresh is wall, < free_thresh is free; negated 51 and 204 have exactly 0.2 and 0.8."""
     thresholds = {"free_thresh": 0.2, "occupied_thresh": 0.8, "negate": 1}
@@ -148,9 +148,6 @@ def test_transparent_is_unknown(tmp_path: Path) -> None:
     assert load_state(tmp_path, pixels, strict=True) == [[WALL, FREE, WALL, WALL]]
 
 
-# --- the 205 trap -----------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("colour", ["grey", "grey, 16 bit", "RGB", "RGBA", "grey, negated", "RGBA, negated"])
 def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
     shades = np.array([[0, 254, 205], [205, 205, 254]])
@@ -190,9 +187,6 @@ def test_warning_points_to_the_caller(tmp_path: Path) -> None:
     with pytest.warns(MapWarning) as caught:
         load_map(path)
     assert caught[0].filename == __file__
-
-
-# --- the YAML ---------------------------------------------------------------------------------------------------------
 
 
 def test_numbers_as_people_write_them(tmp_path: Path) -> None:
@@ -301,19 +295,6 @@ def test_yaml_bomb_stays_short(tmp_path: Path) -> None:
     assert len(str(caught.value)) < 1000
 
 
-def test_unreadable_yaml(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object) -> None:
-        raise PermissionError(13, "Permission denied")
-
-    path = write_map(tmp_path, [[0]])
-    monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(MapError, match=r"cannot be read \(Permission denied\): check the path"):
-        load_map(path)
-
-
-# --- damaged images ---------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "content",
     [
@@ -368,9 +349,6 @@ def test_floating_point_image(tmp_path: Path) -> None:
         load_map(write_sheet(tmp_path))
 
 
-# --- yaw, writing, percent --------------------------------------------------------------------------------------------
-
-
 def test_yaw_turns_about_the_lower_left_corner(tmp_path: Path) -> None:
     path = write_map(tmp_path, [[0, 205, 205], [254, 254, 205]], origin=[-1.0, 2.0, 1.5708])
     partial = load_map(path)
@@ -417,6 +395,113 @@ def test_neither_file_without_the_other(tmp_path: Path, blocked: str) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [blocked]
 
 
-def test_states_from_percent() -> None:
-    percent = np.array([[-128, -1, 0, 25], [26, 64, 65, 100], [101, 127, 255, 50]])
-    assert states_from_percent(percent, 65, 25).tolist() == [[2, 2, 0, 0], [2, 2, 1, 1], [2, 2, 2, 2]]
+GRID = np.array([[0, 1, 2], [0, 0, 1]], dtype=np.uint8)
+grids = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 2))
+
+
+@pytest.mark.parametrize(
+    ("yaw", "state", "origin_m"),
+    [
+        (math.pi / 2, [[0, 0], [0, 1], [1, 2]], (9.0, 20.0)),
+        (2 * math.pi, [[0, 1, 2], [0, 0, 1]], (10.0, 20.0)),
+        (1.57, [[0, 0], [0, 1], [1, 2]], (9.0, 20.0)),
+    ],
+)
+def test_quarter_turns(yaw: float, state: list[list[int]], origin_m: tuple[float, float]) -> None:
+    turned, resolution_m, corner_m = turn_grid(GRID, 0.5, (10.0, 20.0, yaw))
+    assert turned.tolist() == state
+    assert resolution_m == 0.5
+    assert corner_m == origin_m
+
+
+@given(grids, st.integers(-4, 4))
+def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns: int) -> None:
+    """A world point has the state that the grid has at the point turned back about the corner."""
+    yaw = turns * math.pi / 2
+    partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw))[:1], 1.0, turn_grid(state, 1.0, (3.0, -2.0, yaw))[2])
+    v, u = np.mgrid[: state.shape[0], : state.shape[1]] + 0.5
+    x = 3.0 + math.cos(yaw) * u - math.sin(yaw) * v
+    y = -2.0 + math.sin(yaw) * u + math.cos(yaw) * v
+    assert np.array_equal(partial.state_at(np.stack([x, y], axis=-1)), state)
+    assert partial.state.size == state.size
+
+
+@given(grids, st.floats(-6.28, 6.28), st.integers(0, 2**32 - 1))
+def test_any_turn_keeps_the_state_of_places(state: np.ndarray, yaw: float, seed: int) -> None:
+    """New cells have the state of the old grid at their centre; only a free one may have become wall."""
+    new, cell, (x0, y0) = turn_grid(state, 1.0, (3.0, -2.0, yaw))
+    if cell == 1.0:
+        return
+    row, column = np.mgrid[: new.shape[0], : new.shape[1]]
+    x, y = x0 + (column + 0.5) * cell - 3.0, y0 + (row + 0.5) * cell + 2.0
+    back = np.stack([math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x], axis=-1)
+    fraction = np.abs(back - np.rint(back)).min(axis=-1)
+    clear = fraction > 1e-6
+    expected = PartialMap(state, 1.0).state_at(back)
+    differs = clear & (new != expected)
+    assert (expected[differs] == FREE).all()
+    assert (new[differs] == WALL).all()
+    assert cell == 0.5
+
+
+def room(ny: int, nx: int) -> np.ndarray:
+    """Build a closed room with walls of one cell amid unknown cells."""
+    state = np.full((ny + 4, nx + 4), UNKNOWN, dtype=np.uint8)
+    state[1:-1, 1:-1] = WALL
+    state[2:-2, 2:-2] = FREE
+    return state
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.floats(-6.28, 6.28), st.booleans())
+def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -> None:
+    """Also where the walls meet at a corner alone."""
+    state = room(ny, nx)
+    if not corners:
+        for row in (1, -2):
+            state[row, [1, -2]] = UNKNOWN
+    new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))
+    assert PartialMap(new, resolution_m, origin_m).is_complete
+    assert label(new != WALL, np.ones((3, 3)))[1] == 2 or not corners
+
+
+def test_diagonal_walls_stay_closed() -> None:
+    """A diamond of cells that touch at corners alone, free inside."""
+    y, x = np.mgrid[-12:13, -12:13]
+    reach = np.abs(x) + np.abs(y)
+    state = np.where(reach < 10, FREE, np.where(reach == 10, WALL, UNKNOWN)).astype(np.uint8)
+    assert PartialMap(state, 0.1).is_complete
+    for yaw in np.linspace(-3, 3, 41):
+        new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))
+        assert PartialMap(new, resolution_m, origin_m).is_complete
+        if resolution_m < 0.1:
+            assert (new == FREE).sum() == pytest.approx(4 * (state == FREE).sum(), rel=0.06)
+
+
+def test_frontiers_stay_open() -> None:
+    """Turning closes no opening towards unknown cells."""
+    state = room(10, 10)
+    state[1, 4:8] = FREE
+    new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, 0.4))
+    assert not PartialMap(new, resolution_m, origin_m).is_complete
+    assert (new == WALL).sum() == pytest.approx(4 * (state == WALL).sum(), rel=0.05)
+
+
+def test_small_tilt_is_below_the_resolution() -> None:
+    state = room(96, 96)
+    limit = 0.5 / math.hypot(100, 100)
+    assert turn_grid(state, 0.1, (0.0, 0.0, 0.99 * limit))[1] == 0.1
+    assert turn_grid(state, 0.1, (0.0, 0.0, 1.01 * limit))[1] == 0.05
+
+
+def test_turning_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        turn_grid(GRID, 0.1, (0.0, 0.0, 0.3))
+    assert "origin yaw 0.3 rad: the map is turned onto cells of 0.05 m" in caplog.text
+
+
+def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
+    with pytest.raises(
+        MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells, more"
+    ):
+        turn_grid(GRID, 0.1, (0.0, 1.0, 0.5))

@@ -121,16 +121,14 @@ def test_floor_of_the_whole_map_and_no_floor() -> None:
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 15), st.integers(1, 15))
 def test_floor_and_its_triangles_cover_the_observed_area_once(seed: int, ny: int, nx: int) -> None:
-    from sionna_partial.scene.scene import _triangles
-
     state = np.random.default_rng(seed).choice(3, (ny, nx)).astype(np.uint8)
     partial = PartialMap(state, 0.1)
-    rectangles = build_scene(partial).floor_m
-    count = covered(rectangles, partial)
+    geometry = build_scene(partial)
+    count = covered(geometry.floor_m, partial)
     assert count.max(initial=0) <= 1
     assert (count[state == CellState.FREE] == 1).all()
     assert (count[state == CellState.UNKNOWN] == 0).all()
-    corners, triangles = _triangles(rectangles, 0.1)
+    corners, triangles = geometry.floor_mesh
     (ax, ay), (bx, by), (cx, cy) = (corners[triangles[:, k]].T for k in range(3))
     areas = ((bx - ax) * (cy - ay) - (cx - ax) * (by - ay)) / 2
     assert (areas > 0.004).all()
@@ -217,14 +215,6 @@ def test_every_itu_material_loads_with_its_constants(name: str, tmp_path: Path) 
     assert material.thickness.numpy() == pytest.approx(0.07)
 
 
-def test_custom_material(tmp_path: Path) -> None:
-    chosen = SceneSettings(material=Material(relative_permittivity=5.5, conductivity_s_m=0.02, thickness_m=0.2))
-    (material,) = load(export_scene(drawn(ROOM), tmp_path / "scene", chosen)).radio_materials.values()
-    assert material.relative_permittivity.numpy() == pytest.approx(5.5)
-    assert material.conductivity.numpy() == pytest.approx(0.02)
-    assert material.thickness.numpy() == pytest.approx(0.2)
-
-
 def test_frequency_outside_the_material_is_refused_and_nothing_written(tmp_path: Path) -> None:
     chosen = SceneSettings(material=Material(itu="wet_ground"))
     with pytest.raises(SettingsError, match=r"frequency_hz = 28000000000.0 .*wet_ground.* 1-10 GHz"):
@@ -245,11 +235,6 @@ def test_same_bytes_twice(tmp_path: Path) -> None:
     assert len(files) == 6
     for file in files:
         assert (first / file).read_bytes() == (second / file).read_bytes()
-
-
-def test_reading_back_gives_the_same_map(tmp_path: Path) -> None:
-    partial = drawn(ROOM, 0.05, (1.25, -3.5))
-    assert load_map(export_scene(partial, tmp_path / "scene")) == partial
 
 
 @pytest.mark.parametrize("settings", [None, SceneSettings(Material(itu="wood"))])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sionna_partial.errors import SettingsError
-from sionna_partial.tracing.sionna_rt import load_sionna
+from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.slab import VACUUM_F_M, reflection_loss_db
 
 FREQUENCY_HZ = 28e9

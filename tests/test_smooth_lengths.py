@@ -1,7 +1,5 @@
 """Smooth lengths of segments in cells: by hand, beside quadrature and finite differences, and by their properties."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -74,14 +72,6 @@ def one(smooth, start, end):
 
 
 class TestLengths:
-    def test_everything_on_an_unknown_map(self):
-        partial = PartialMap(np.full((4, 6), UNKNOWN), RESOLUTION_M, ORIGIN_M)
-        start_m, end_m = ends_around(partial, 100)
-        distance_m = np.linalg.norm(end_m - start_m, axis=1)
-        np.testing.assert_allclose(SmoothLengths(partial, UNKNOWN)(start_m, end_m), distance_m, rtol=1e-12)
-        assert not SmoothLengths(partial, WALL)(start_m, end_m).any()
-        assert not SmoothLengths(partial, FREE)(start_m, end_m).any()
-
     def test_nothing_unknown_on_a_complete_map(self):
         partial = PartialMap(np.pad([[FREE]], 1, constant_values=WALL), RESOLUTION_M, ORIGIN_M)
         assert partial.is_complete
@@ -140,54 +130,6 @@ class TestLengths:
         assert (found_m >= 0.0).all()
         assert (found_m <= np.linalg.norm(end_m - start_m, axis=1)).all()
 
-    def test_kinds_share_the_distance(self):
-        partial = random_map(2)
-        start_m, end_m = ends_around(partial, 500)
-        found_m = sum(SmoothLengths(partial, kind)(start_m, end_m) for kind in CellState)
-        np.testing.assert_allclose(found_m, np.linalg.norm(end_m - start_m, axis=1), rtol=1e-12)
-
-    def test_same_under_exchange_of_ends(self):
-        partial = random_map(3)
-        start_m, end_m = ends_around(partial, 500)
-        smooth = SmoothLengths(partial, UNKNOWN)
-        np.testing.assert_allclose(smooth(start_m, end_m), smooth(end_m, start_m), atol=1e-12)
-        np.testing.assert_allclose(smooth.slopes(start_m, end_m), smooth.slopes(end_m, start_m)[::-1], atol=1e-11)
-
-    @pytest.mark.parametrize("shift_m", [(0.1, -7.3), (4e5, 5.5e6)], ids=["metres", "UTM"])
-    def test_same_when_everything_is_moved(self, shift_m):
-        partial = random_map(4)
-        moved = PartialMap(partial.state, RESOLUTION_M, tuple(np.add(ORIGIN_M, shift_m)))
-        ends_m = ends_around(partial, 500)
-        moved_m = [np.add(points, (*shift_m, 0.0)) for points in ends_m]
-        here, there = SmoothLengths(partial, UNKNOWN), SmoothLengths(moved, UNKNOWN)
-        np.testing.assert_allclose(here(*ends_m), there(*moved_m), atol=1e-7)
-        np.testing.assert_allclose(here.slopes(*ends_m), there.slopes(*moved_m), atol=1e-5)
-
-    def test_same_when_everything_is_mirrored(self):
-        partial = random_map(5)
-        mirrored = PartialMap(partial.state[:, ::-1], RESOLUTION_M, (-partial.bounds_m[2], ORIGIN_M[1]))
-        ends_m = ends_around(partial, 500)
-        mirrored_m = [points * [-1.0, 1.0, 1.0] for points in ends_m]
-        here, there = SmoothLengths(partial, WALL), SmoothLengths(mirrored, WALL)
-        np.testing.assert_allclose(here(*ends_m), there(*mirrored_m), atol=1e-12)
-        slopes = np.array(there.slopes(*mirrored_m)) * [-1.0, 1.0, 1.0]
-        np.testing.assert_allclose(here.slopes(*ends_m), slopes, atol=1e-11)
-
-    def test_parts_of_a_segment_add_up(self):
-        partial = random_map(6)
-        start_m, end_m = ends_around(partial, 500)
-        smooth, middle_m = SmoothLengths(partial, UNKNOWN), 0.3 * start_m + 0.7 * end_m
-        parts_m = smooth(start_m, middle_m) + smooth(middle_m, end_m)
-        np.testing.assert_allclose(smooth(start_m, end_m), parts_m, atol=1e-12)
-
-    def test_one_start_for_all(self):
-        partial = random_map(7)
-        start_m, end_m = ends_around(partial, 20)
-        smooth, tiled_m = SmoothLengths(partial, UNKNOWN), np.tile(start_m[0], (20, 1))
-        np.testing.assert_array_equal(smooth(start_m[0], end_m), smooth(tiled_m, end_m))
-        np.testing.assert_array_equal(smooth.slopes(start_m[0], end_m), smooth.slopes(tiled_m, end_m))
-        np.testing.assert_array_equal(smooth(end_m, start_m[0]), smooth(end_m, tiled_m))
-
     def test_no_segments(self):
         smooth, none = SmoothLengths(random_map(), UNKNOWN), np.zeros((0, 3))
         assert smooth(none, none).shape == smooth(np.zeros(3), none).shape == (0,)
@@ -218,29 +160,8 @@ class TestBesideTheExactLength:
         assert (error_m <= allowed * slant * 0.25 * np.sqrt(2) * partial.resolution_m).all()
         assert error_m.mean() < 0.1 * partial.resolution_m
 
-    def test_comes_closer_as_cells_become_smaller(self):
-        state = random_map(9).state
-        errors_m = []
-        for parts in (1, 2, 4, 8):
-            fine = PartialMap(np.kron(state, np.ones((parts, parts), dtype=int)), RESOLUTION_M / parts, ORIGIN_M)
-            ends_m = ends_around(fine, 2_000, margin_m=0.0)
-            errors_m.append(np.abs(SmoothLengths(fine, UNKNOWN)(*ends_m) - unobserved_lengths_m(fine, *ends_m)).mean())
-        assert all(fine < 0.6 * coarse for coarse, fine in pairwise(errors_m))
-
 
 class TestSlopes:
-    def test_unit_vectors_on_an_unknown_map(self):
-        partial = PartialMap(np.full((4, 6), UNKNOWN), RESOLUTION_M, ORIGIN_M)
-        start_m, end_m = ends_around(partial, 100)
-        towards = (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=1, keepdims=True)
-        start, end = SmoothLengths(partial, UNKNOWN).slopes(start_m, end_m)
-        np.testing.assert_allclose(end, towards, atol=1e-12)
-        np.testing.assert_allclose(start, -towards, atol=1e-12)
-
-    def test_zero_on_a_complete_map(self):
-        partial = PartialMap(np.pad([[FREE]], 1, constant_values=WALL), RESOLUTION_M, ORIGIN_M)
-        assert not np.any(SmoothLengths(partial, UNKNOWN).slopes(*ends_around(partial, 100)))
-
     def test_half_plane_by_hand(self):
         # In the plane, with its start in the free half, a segment is unknown for (x - 5 m) / (x - x_start) of its way.
         smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
@@ -287,25 +208,6 @@ class TestSlopes:
         start_m, end_m = np.array([start]), np.array([end])
         expected = differences(smooth, start_m, end_m, 1e-3)
         np.testing.assert_allclose(smooth.slopes(start_m, end_m), expected, atol=1e-5)
-
-    def test_moving_both_ends_is_their_sum(self):
-        partial = random_map(11)
-        start_m, end_m = ends_around(partial, 500)
-        smooth = SmoothLengths(partial, UNKNOWN)
-        move_m = 1e-5 * np.array([0.6, -0.8, 0.5])
-        rate = (smooth(start_m + move_m, end_m + move_m) - smooth(start_m - move_m, end_m - move_m)) / 2e-5
-        error = np.abs(sum(smooth.slopes(start_m, end_m)) @ move_m / 1e-5 - rate)
-        assert np.quantile(error, 0.9) < 1e-7
-        assert error.max() < 1e-4
-        assert not np.sum(smooth.slopes(start_m, end_m), axis=0)[:, 2].any()
-
-    def test_stretching_from_the_start_is_the_mask_at_the_end(self):
-        partial = random_map(12)
-        start_m, end_m = ends_around(partial, 500)
-        towards = (end_m - start_m) / np.linalg.norm(end_m - start_m, axis=1, keepdims=True)
-        _, end = SmoothLengths(partial, UNKNOWN).slopes(start_m, end_m)
-        expected = interpolated(partial, UNKNOWN)(end_m[:, :2])
-        np.testing.assert_allclose((end * towards).sum(axis=1), expected, atol=1e-10)
 
     def test_do_not_jump(self):
         partial, angle = random_map(13), np.linspace(0.1, np.pi / 2 - 0.1, 20_000)

@@ -1,23 +1,46 @@
-"""How well materials explain measured gains, with what is assumed of them, and the way down to the next minimum."""
+"""The posterior distribution of materials, given measured gains: errors of gains, prior, descent and search.
 
+Most links are off by the noise of the measurement alone, which is normal [dB]. Some without line of sight are stronger,
+because of paths that the map does not show, and some weaker, because of obstacles: an exponential is added there.
+
+Slabs of little loss interfere with themselves: over the refractive index, the loss of a reflection has fringes, half a
+wavelength over the thickness apart. So the plane of index and conductivity is searched as a whole, on cells finer than
+the fringes, before anything follows a slope. Cells that matter are divided until one can integrate over them.
+"""
+
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
-from sionna_partial.calibration.gain_errors import GainErrors, fit_errors
-from sionna_partial.calibration.material_paths import MaterialPaths, link_gains_db
+from sionna_partial.calibration.measured_building import LinkPaths, link_gains_db
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.tracing.slab import reflection_loss_db
 
-PRIOR_SUSCEPTIBILITY, SUSCEPTIBILITY_SPREAD = 2.5, 0.9
-"""Median of the relative permittivity less 1 before anything is measured, and standard deviation of its logarithm: 95 %
-of materials are between 1.4 and 16. The building materials of ITU-R P.2040-3 at 28 GHz are between 1.5 and 7.1."""
+NOISES_DB = np.geomspace(0.7, 15.0, 24)
+MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0.2)
+"""Values of the parameters of GainErrors among which the likeliest are chosen."""
 
-PRIOR_CONDUCTIVITY_S_M, CONDUCTIVITY_SPREAD = 0.15, 1.8
-"""Median of the conductivity before anything is measured [S/m], and standard deviation of its logarithm: 95 % are
-between 0.004 and 5 S/m. The building materials of ITU-R P.2040-3 at 28 GHz are between 0.04 and 0.63."""
+MISSED_DB, BLOCKED_DB = 8.0, 12.0
+"""Mean of how much stronger links with missed paths are, and how much weaker links with blocked paths [dB]."""
+
+STRAY_FRACTION = 0.01
+"""Fraction of links with a line of sight that are off either way, and smallest fraction of the others."""
+
+EXPECTED_NOISE_DB, NOISE_SPREAD, MEAN_FRACTION = 3.0, 0.7, 0.5
+"""Prior: median of the noise [dB], standard deviation of its logarithm, and mean of the fractions."""
+
+LOSSLESS = np.array([[1.0], [0.0]])
+"""Relative permittivity and conductivity [S/m] of the vacuum; what exceeds them is positive and has a logarithm."""
+
+PRIOR_MEDIAN, PRIOR_SPREAD = np.array([[2.5], [0.15]]), np.array([[0.9], [1.8]])
+"""Prior: median of permittivity less 1 and of conductivity [S/m], and standard deviation of their logarithms. 95 % of
+materials are between 1.4 and 16, and 0.004 and 5 S/m. The building materials of ITU-R P.2040-3 at 28 GHz are between
+1.5 and 7.1, and 0.04 and 0.63 S/m."""
 
 IMPEDANCE_OHM = 376.73
 """Impedance of the vacuum."""
@@ -28,7 +51,99 @@ LOWEST_GAIN_DB = -300.0
 TYPICAL_DEG, TYPICAL_LOSS_DB = np.arange(0.0, 80.0, 2.5), 30.0
 """Angles of incidence at which reflections are compared [degrees], and the largest loss that counts [dB]."""
 
+INDEX_RANGE, FINE_INDEX = (1.01, 6.0), 3.4
+"""Refractive indices that are searched, and the one up to which fringes are resolved."""
+
+FRINGE_CELLS, FINEST_FRINGE_CELLS, COARSE_CELLS = 14, 60, 29
+"""Number of cells to a fringe when the search begins, and where it ends; number of cells where there are no fringes."""
+
+SPLIT_FRACTION, MOST_CELLS = 0.004, 600
+"""Fraction of the posterior above which a cell is divided, and number of cells that division may add."""
+
+MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
+"""Number of fringes whose minima are searched, of steps to each, and of fringes that are followed to the end."""
+
+CELLS_A_REPORT = 64
+"""Number of cells after which progress is reported."""
+
 Report = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class GainErrors:
+    """Density of measured less predicted gains; the fractions are of links without line of sight.
+
+    Parameters
+    ----------
+    noise_db : standard deviation of the noise
+    missed_fraction, blocked_fraction : links that are stronger, and weaker, than predicted
+    """
+
+    noise_db: float
+    missed_fraction: float
+    blocked_fraction: float
+
+    def penalty(self) -> float:
+        """Negative logarithm of the prior, but for a constant."""
+        spread = math.log(self.noise_db / EXPECTED_NOISE_DB) / NOISE_SPREAD
+        return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
+
+    def curve(
+        self, error_db: NDArray[np.float64], is_direct: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Negative logarithm of the density of errors (N,) [dB], and its first and second derivatives."""
+        parts = _log_densities(error_db, self.noise_db)
+        fraction = _fractions(is_direct, self.missed_fraction, self.blocked_fraction)
+        top = np.max(parts, axis=0)
+        normal, missed, blocked = fraction * np.exp(parts - top)
+        bell = np.exp(parts[0] - top)
+        density = normal + missed + blocked
+        variance = self.noise_db**2
+        missed_slope = (fraction[1] * bell - missed) / MISSED_DB
+        blocked_slope = (fraction[2] * bell - blocked) / BLOCKED_DB
+        slope = -error_db / variance * normal + missed_slope - blocked_slope
+        bell_slope = -error_db / variance * bell
+        bend = normal * (error_db**2 / variance - 1.0) / variance
+        bend += (fraction[1] * bell_slope - missed_slope) / MISSED_DB
+        bend -= (fraction[2] * bell_slope + blocked_slope) / BLOCKED_DB
+        first = -slope / density
+        return -np.log(density) - top, first, first**2 - bend / density
+
+
+_ALL_ERRORS = [
+    GainErrors(float(noise_db), missed, blocked)
+    for missed, blocked, noise_db in itertools.product(MISSED_FRACTIONS, BLOCKED_FRACTIONS, NOISES_DB)
+]
+_PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
+
+
+def fit_errors(error_db: NDArray[np.float64], is_direct: NDArray[np.bool_]) -> tuple[GainErrors, float]:
+    """Return the likeliest density of errors (N,) [dB], and its negative log likelihood with the prior's."""
+    kinds = np.exp(np.maximum(_log_densities(error_db, NOISES_DB[:, None]), -700.0))
+    losses = [
+        -np.log(np.maximum(np.einsum("ksn,kn->sn", kinds, _fractions(is_direct, *fractions)), 1e-300)).sum(axis=1)
+        for fractions in itertools.product(MISSED_FRACTIONS, BLOCKED_FRACTIONS)
+    ]
+    total = np.concatenate(losses) + _PENALTIES
+    best = int(np.argmin(total))
+    return _ALL_ERRORS[best], float(total[best])
+
+
+def _fractions(is_direct: NDArray[np.bool_], missed: float, blocked: float) -> NDArray[np.float64]:
+    """Fractions (3, N) of noise alone, of missed and of blocked paths; none is 0."""
+    stray = STRAY_FRACTION / 2.0
+    off = np.where(is_direct, stray, np.maximum([[missed], [blocked]], stray))
+    return np.stack([1.0 - off.sum(axis=0), *off])
+
+
+def _log_densities(error_db: NDArray[np.float64], noise_db: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Logarithms (3, ..., N) of the densities of noise alone, and with an exponential added either way."""
+    parts = [-0.5 * (error_db / noise_db) ** 2 - np.log(noise_db * math.sqrt(2.0 * math.pi))]
+    for error, mean_db in ((error_db, MISSED_DB), (-error_db, BLOCKED_DB)):
+        ratio = noise_db / mean_db
+        tail = log_ndtr(error / noise_db - ratio)
+        parts.append(0.5 * ratio**2 - error / mean_db - math.log(mean_db) + tail)
+    return np.stack(parts)
 
 
 @dataclass(frozen=True)
@@ -37,136 +152,84 @@ class Point:
 
     Parameters
     ----------
-    permittivity, conductivity_s_m : (M,) float64 arrays
-    loss : float
-        Negative logarithm of the posterior density of the logarithms, but for a constant.
-    errors : GainErrors
+    values : (2, M), permittivity and conductivity [S/m]
+    loss : negative logarithm of the posterior density of their logarithms, but for a constant
     """
 
-    permittivity: NDArray[np.float64]
-    conductivity_s_m: NDArray[np.float64]
+    values: NDArray[np.float64]
     loss: float
     errors: GainErrors
 
     @property
     def logs(self) -> NDArray[np.float64]:
-        """Logarithms (2 M,) of permittivity less 1, and of conductivity [S/m]."""
-        return np.log(np.concatenate([self.permittivity - 1.0, self.conductivity_s_m]))
+        """Logarithms (2, M) of permittivity less 1, and of conductivity [S/m]."""
+        return np.log(self.values - LOSSLESS)
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """What measurements leave open about one material: K values with weights that sum to 1.
-
-    Parameters
-    ----------
-    permittivity, conductivity_s_m, weight : (K,) float64 arrays
-    """
+    """What measurements leave open about one material: K values with weights that sum to 1, all (K,)."""
 
     permittivity: NDArray[np.float64]
     conductivity_s_m: NDArray[np.float64]
     weight: NDArray[np.float64]
 
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Permittivity and conductivity (2, K)."""
+        return np.stack([self.permittivity, self.conductivity_s_m])
+
     def deviation(self, values: NDArray[np.float64], best: float) -> float:
         """Root mean square of how far values (K,) are from the best one."""
         return float(np.sqrt(self.weight @ (values - best) ** 2))
 
-    def typical(self, thickness_m: float, frequency_hz: float) -> int:
-        """Return the value whose reflection losses are nearest to their mean: the likeliest one may be an odd one."""
+    def typical(self, thickness_m: float, frequency_hz: float) -> NDArray[np.float64]:
+        """Return the values (2,) whose reflection losses are nearest to their mean: the likeliest may be odd ones."""
         loss_db = reflection_loss_db(
             self.permittivity[:, None], self.conductivity_s_m[:, None], thickness_m, frequency_hz, TYPICAL_DEG
         )
         shown = np.minimum(loss_db, TYPICAL_LOSS_DB)
-        return int(np.argmin(((shown - self.weight @ shown) ** 2).sum(axis=1)))
+        return self.values[:, int(np.argmin(((shown - self.weight @ shown) ** 2).sum(axis=1)))]
 
     def interval(self, values: NDArray[np.float64]) -> tuple[float, float]:
         """Central 95 % of values (K,)."""
         order = np.argsort(values, kind="stable")
-        place = np.cumsum(self.weight[order]) - 0.5 * self.weight[order]
-        low, high = np.interp((0.025, 0.975), place, values[order])
+        rank = np.cumsum(self.weight[order]) - 0.5 * self.weight[order]
+        low, high = np.interp((0.025, 0.975), rank, values[order])
         return float(low), float(high)
 
 
 class MaterialTarget:
-    """How well materials explain measured gains.
+    """How well materials explain measured gains (N,) [dB] of links that all have a path."""
 
-    Parameters
-    ----------
-    paths : MaterialPaths
-        Of N links, each with a path.
-    gain_db : (N,) float64 array
-        Measured gains [dB].
-
-    Attributes
-    ----------
-    known : dict of str to list of float
-        What has been found, by place; what is there is not evaluated again.
-    on_progress : callable
-        Called when something has been found.
-    """
-
-    def __init__(self, paths: MaterialPaths, gain_db: NDArray[np.float64]) -> None:
+    def __init__(self, paths: LinkPaths, gain_db: NDArray[np.float64]) -> None:
         self.paths, self.gain_db = paths, gain_db
-        self.known: dict[str, list[float]] = {}
         self.is_direct = np.zeros(len(gain_db), dtype=bool)
         self.is_direct[paths.link[paths.is_direct]] = True
-        self.on_progress: Callable[[], None] = lambda: None
 
-    def gains_db(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Predicted gains (N,) for (M,) materials [dB]."""
-        return self._gains_db(self.paths.power(permittivity, conductivity_s_m))
+    def at(self, values: NDArray[np.float64]) -> Point:
+        """Evaluate materials (2, M)."""
+        errors, loss = fit_errors(self.gain_db - self.gains_db(self.paths.power(*values)), self.is_direct)
+        return Point(values, loss + prior_loss(values), errors)
 
-    def at(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> Point:
-        """Judge materials (M,)."""
-        key = _key(permittivity, conductivity_s_m)
-        if key not in self.known:
-            self._learn(key, self.gains_db(permittivity, conductivity_s_m))
-            self.on_progress()
-        loss, *errors_found = self.known[key]
-        loss += _prior_loss(permittivity, conductivity_s_m)
-        return Point(permittivity, conductivity_s_m, loss, GainErrors(*errors_found))
-
-    def prepare(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> None:
-        """Judge many materials (K, M) together, which is quicker than one by one with `at`."""
-        keys = [_key(*pair) for pair in zip(permittivity, conductivity_s_m, strict=True)]
-        new = np.flatnonzero([key not in self.known for key in keys])
-        for start in range(0, len(new), self.paths.at_once):
-            rows = new[start : start + self.paths.at_once]
-            powers = self.paths.powers(permittivity[rows], conductivity_s_m[rows])
-            for row, power in zip(rows, powers, strict=True):
-                self._learn(keys[row], self._gains_db(power))
-            self.on_progress()
-
-    def _gains_db(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gains_db(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gains (N,) [dB] from the power of the paths (P,)."""
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)
-
-    def _learn(self, key: str, gains_db: NDArray[np.float64]) -> None:
-        errors, loss = fit_errors(self.gain_db - gains_db, self.is_direct)
-        self.known[key] = [loss, errors.noise_db, errors.missed_share, errors.blocked_share]
 
     def slopes(self, point: Point) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms, by Sionna RT and Dr.Jit."""
-        key = f"slopes {_key(point.permittivity, point.conductivity_s_m)}"
-        size = 2 * len(point.permittivity)
-        if key not in self.known:
-            gradient, curvature = self._slopes(point)
-            self.known[key] = [*gradient.tolist(), *curvature.ravel().tolist()]
-            self.on_progress()
-        numbers = np.array(self.known[key])
-        return numbers[:size], numbers[size:].reshape(size, size)
-
-    def _slopes(self, point: Point) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         link, count = self.paths.link, len(self.gain_db)
-        power, slopes = self.paths.slopes(point.permittivity, point.conductivity_s_m)
+        power, slopes = self.paths.slopes(*point.values)
         total = np.maximum(np.bincount(link, weights=power, minlength=count), 1e-30)
-        scale = np.concatenate([point.permittivity - 1.0, point.conductivity_s_m])
-        sums = [np.bincount(link, weights=column, minlength=count) for column in slopes.T]
-        jacobian: NDArray[np.float64] = np.stack(sums, axis=1) * (10.0 / math.log(10.0) * scale / total[:, None])
+        sums = np.stack([np.bincount(link, weights=column, minlength=count) for column in slopes.T], axis=1)
+        scale = (point.values - LOSSLESS).ravel()
+        jacobian: NDArray[np.float64] = sums * (10.0 / math.log(10.0) * scale / total[:, None])
         error_db = self.gain_db - np.maximum(10.0 * np.log10(total), LOWEST_GAIN_DB)
         _, first, second = point.errors.curve(error_db, self.is_direct)
-        off, information = _prior_slopes(point)
-        curvature: NDArray[np.float64] = (jacobian.T * np.maximum(second, 0.0)) @ jacobian + np.diag(information)
-        return -jacobian.T @ first + off, curvature
+        information = np.broadcast_to(PRIOR_SPREAD**-2.0, point.values.shape)
+        prior_slope = (information * (point.logs - np.log(PRIOR_MEDIAN))).ravel()
+        curvature: NDArray[np.float64] = (jacobian.T * np.maximum(second, 0.0)) @ jacobian
+        return prior_slope - jacobian.T @ first, curvature + np.diag(information.ravel())
 
 
 def descend(
@@ -174,30 +237,14 @@ def descend(
 ) -> tuple[list[Point], NDArray[np.float64]]:
     """Follow the slopes to a minimum of the loss, by Newton's method with damping (Levenberg and Marquardt).
 
-    Parameters
-    ----------
-    target : MaterialTarget
-    start : Point
-    report : callable
-        Called as ``report(share_done, message)``.
-    most_steps : int
-        Largest number of steps.
-
-    Returns
-    -------
-    list of Point
-        The start, and each step that made the loss smaller.
-    (2 M, 2 M) float64 array
-        Curvature at the last.
+    Returns the start with each step that made the loss smaller, and the curvature (2 M, 2 M) at the last.
     """
     steps, damping = [start], 1e-3
     gradient, curvature = target.slopes(start)
     for number in range(most_steps):
         move = np.linalg.solve(curvature + damping * np.diag(np.diag(curvature)), -gradient)
         move /= max(1.0, float(np.abs(move).max()))
-        size = len(move) // 2
-        values = np.exp(steps[-1].logs + move)
-        trial = target.at(1.0 + values[:size], values[size:])
+        trial = target.at(LOSSLESS + np.exp(steps[-1].logs + move.reshape(2, -1)))
         report((number + 1) / most_steps, "following the slopes")
         if trial.loss < steps[-1].loss:
             gained = steps[-1].loss - trial.loss
@@ -213,37 +260,123 @@ def descend(
     return steps, curvature
 
 
+def prior_loss(values: NDArray[np.float64]) -> float:
+    """Negative logarithm of the prior density of the logarithms of materials (2, M), but for a constant."""
+    return 0.5 * float(((np.log((values - LOSSLESS) / PRIOR_MEDIAN) / PRIOR_SPREAD) ** 2).sum())
+
+
 def prior_posterior() -> Posterior:
-    """Return what is assumed about a material before anything is measured."""
+    """Return the prior of a material, as a posterior without measurements."""
     spread = np.linspace(-3.0, 3.0, 31)
-    weight = np.exp(-0.5 * spread**2)
-    first, second = (axis.ravel() for axis in np.meshgrid(spread, spread))
-    weights = np.outer(weight, weight).ravel()
-    return Posterior(
-        1.0 + PRIOR_SUSCEPTIBILITY * np.exp(SUSCEPTIBILITY_SPREAD * first),
-        PRIOR_CONDUCTIVITY_S_M * np.exp(CONDUCTIVITY_SPREAD * second),
-        weights / weights.sum(),
-    )
+    values = LOSSLESS + PRIOR_MEDIAN * np.exp(PRIOR_SPREAD * np.reshape(np.meshgrid(spread, spread), (2, -1)))
+    weight = np.outer(np.exp(-0.5 * spread**2), np.exp(-0.5 * spread**2)).ravel()
+    return Posterior(values[0], values[1], weight / weight.sum())
 
 
 def lossless_scale_s_m(index: float, thickness_m: float) -> float:
-    """Conductivity that takes 8.7 dB on the way through a slab and back [S/m]."""
+    """Conductivity that attenuates by 8.7 dB through a slab and back [S/m]."""
     return index / (IMPEDANCE_OHM * thickness_m)
 
 
-def _key(permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> str:
-    return " ".join(float(value).hex() for value in (*permittivity, *conductivity_s_m))
+class _Plane:
+    """The plane of one material, the others staying as they are; what was evaluated is kept.
+
+    Cells of it are (4, K) arrays: refractive index and logarithm of the conductivity at the centre, and the widths in
+    both.
+    """
+
+    def __init__(self, target: MaterialTarget, start: Point, which: int, report: Report) -> None:
+        self._target, self._start, self._which, self._report = target, start, which, report
+        self._points: dict[tuple[float, float], Point] = {}
+
+    def evaluate(self, cells: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
+        """Return the cells, and report progress from `begin` to `end`."""
+        values = np.repeat(self._start.values[None], cells.shape[1], axis=0)
+        values[:, 0, self._which], values[:, 1, self._which] = cells[0] ** 2, np.exp(cells[1])
+        for first in range(0, len(values), CELLS_A_REPORT):
+            rows = slice(first, first + CELLS_A_REPORT)
+            self._points |= zip(map(tuple, cells[:2, rows].T), map(self._target.at, values[rows]), strict=True)
+            part = min(1.0, (first + CELLS_A_REPORT) / len(values))
+            self._report(begin + (end - begin) * part, "searching for the material")
+        return cells
+
+    def points(self, cells: NDArray[np.float64]) -> list[Point]:
+        """Points at the centres of evaluated cells."""
+        return [self._points[centre] for centre in map(tuple, cells[:2].T)]
+
+    def losses(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Losses (K,) of evaluated cells."""
+        return np.array([each.loss for each in self.points(cells)])
+
+    def fractions(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Fraction (K,) of the posterior in each cell; the measure is that of the logarithm of permittivity less 1."""
+        loss = self.losses(cells)
+        area = cells[2] * cells[3] * 2.0 * cells[0] / (cells[0] ** 2 - 1.0)
+        mass: NDArray[np.float64] = np.exp(loss.min() - loss) * area
+        return mass / mass.sum()
+
+    def best(self, cells: NDArray[np.float64], fringe: float, most: int) -> list[Point]:
+        """Return the best points, each in a fringe of its own, at most so many."""
+        found: list[int] = []
+        for number in np.argsort(self.losses(cells), kind="stable"):
+            if all(abs(cells[0, number] - cells[0, other]) > 0.5 * fringe for other in found):
+                found.append(int(number))
+            if len(found) == most:
+                break
+        return self.points(cells[:, found])
 
 
-def _prior_loss(permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> float:
-    first = np.log((permittivity - 1.0) / PRIOR_SUSCEPTIBILITY) / SUSCEPTIBILITY_SPREAD
-    second = np.log(conductivity_s_m / PRIOR_CONDUCTIVITY_S_M) / CONDUCTIVITY_SPREAD
-    return 0.5 * float((first**2).sum() + (second**2).sum())
+def search(
+    target: MaterialTarget, start: Point, which: int, thickness_m: float, frequency_hz: float, report: Report
+) -> tuple[list[Point], Posterior]:
+    """Search the plane of one material: its best points, each in a fringe of its own, and its posterior."""
+    fringe = SPEED_OF_LIGHT_M_S / (2.0 * frequency_hz * thickness_m)
+    plane = _Plane(target, start, which, report)
+    cells = plane.evaluate(_first_cells(thickness_m, fringe), 0.0, 0.7)
+    held = np.zeros(cells.shape[1], dtype=bool)
+    for point in plane.best(cells, fringe, MOST_FRINGES):
+        permittivity, conductivity_s_m = descend(target, point, report, FEW_STEPS)[0][-1].values[:, which]
+        beside = np.abs(cells[0] - math.sqrt(permittivity)) <= 0.5 * cells[2]
+        held |= beside & (np.abs(cells[1] - math.log(conductivity_s_m)) <= 0.5 * cells[3])
+    cells = np.hstack([cells[:, ~held], plane.evaluate(_divided(cells[:, held], 9, 2), 0.7, 0.8)])
+    added = 0
+    while added < MOST_CELLS:
+        wide, high = cells[2] > max(fringe / FINEST_FRINGE_CELLS, 0.002), cells[3] > 0.2
+        split = (plane.fractions(cells) > SPLIT_FRACTION) & (wide | high)
+        if not split.any():
+            break
+        kinds = ((wide & high, (2, 2)), (wide & ~high, (3, 1)), (~wide & high, (1, 2)))
+        parts = [_divided(cells[:, split & kind], *counts) for kind, counts in kinds]
+        parts = [plane.evaluate(part, 0.8, 1.0) for part in parts if part.size]
+        cells = np.hstack([cells[:, ~split], *parts])
+        added += sum(part.shape[1] for part in parts)
+    fraction = plane.fractions(cells)
+    order = np.argsort(-fraction, kind="stable")
+    kept = order[: int(np.searchsorted(np.cumsum(fraction[order]), 0.999)) + 1]
+    posterior = Posterior(cells[0, kept] ** 2, np.exp(cells[1, kept]), fraction[kept] / fraction[kept].sum())
+    return plane.best(cells, fringe, FEW_FRINGES), posterior
 
 
-def _prior_slopes(point: Point) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gradient (2 M,) and information (2 M,) of what is assumed."""
-    count = len(point.permittivity)
-    centre = np.log(np.repeat([PRIOR_SUSCEPTIBILITY, PRIOR_CONDUCTIVITY_S_M], count))
-    information = np.repeat([SUSCEPTIBILITY_SPREAD**-2.0, CONDUCTIVITY_SPREAD**-2.0], count)
-    return information * (point.logs - centre), information
+def _divided(cells: NDArray[np.float64], index_parts: int, log_parts: int) -> NDArray[np.float64]:
+    """Cut each cell into parts."""
+    along, across = (np.arange(parts) - 0.5 * (parts - 1) for parts in (index_parts, log_parts))
+    index, log, width, height = cells[:, :, None, None] / np.array([1, 1, index_parts, log_parts])[:, None, None, None]
+    parts = np.broadcast_arrays(index + width * along[:, None], log + height * across, width, height)
+    return np.reshape(parts, (4, -1))
+
+
+def _first_cells(thickness_m: float, fringe: float) -> NDArray[np.float64]:
+    """Cover the plane: fine in the index where slabs interfere with themselves, coarse where they absorb the wave."""
+    scale = lossless_scale_s_m(2.0, thickness_m)
+    levels = np.log(scale * np.array([0.03, 0.5, 1.4, 3.0, 6.0, 15.0, 50.0, 300.0, 1e4, 1e7]))
+    edges = np.concatenate([levels[:1] - 2.0, 0.5 * (levels[1:] + levels[:-1]), levels[-1:] + 2.0])
+    coarse = np.geomspace(*INDEX_RANGE, COARSE_CELLS + 1)
+    rows = []
+    for level, low, high in zip(levels, edges[:-1], edges[1:], strict=True):
+        absorption = math.exp(level) / scale
+        width = min(fringe / FRINGE_CELLS * (1.0 if absorption < 1.0 else 2.0), 0.1)
+        fine = np.linspace(INDEX_RANGE[0], FINE_INDEX, math.ceil((FINE_INDEX - INDEX_RANGE[0]) / width) + 1)
+        borders = np.concatenate([fine, coarse[coarse > FINE_INDEX * 1.03]]) if absorption < 2.0 else coarse
+        centre = 0.5 * (borders[1:] + borders[:-1])
+        rows.append(np.stack(np.broadcast_arrays(centre, 0.5 * (low + high), np.diff(borders), high - low)))
+    return np.hstack(rows)

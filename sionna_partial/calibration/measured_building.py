@@ -1,4 +1,4 @@
-"""A building whose materials are sought: the paths of measured links in it, and which links say something."""
+"""A building whose materials are sought: the paths of measured links in it, and which links are usable."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -6,27 +6,88 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.calibration.material_paths import MaterialPaths, find_material_paths
 from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.prediction.link_context import SEEN_M
-from sionna_partial.scene.scene_xml import itu_constants
+from sionna_partial.prediction.link_context import SEEN_M, path_unobserved_m
+from sionna_partial.scene.scene import itu_constants
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.fixed_paths import PathScene
+from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathScene, PathSet
+from sionna_partial.tracing.slab import VACUUM_F_M
 from sionna_partial.tracing.trace import Progress, nearest_m
 
 FEWEST_LINKS = 10
-"""Smallest number of measured links that say something."""
+"""Smallest number of usable measured links."""
 
-SURE_SHARE = 0.5
-"""Smallest share of a link's power on paths that run wholly through observed space, for a link that is used."""
+OBSERVED_FRACTION = 0.5
+"""Smallest fraction of a link's power on paths that run wholly through observed space, for a link that is used."""
+
+KEPT_FRACTION = 0.96
+"""Fraction of the power of each link that the kept paths have, for each of `EXTREMES`."""
+
+EXTREMES = tuple((permittivity, loss) for permittivity in (1.2, 3.0, 8.0, 30.0) for loss in (0.0, 0.03, 3.0))
+"""Materials between which any other lies: relative permittivity, and its imaginary part."""
 
 OUTAGE = "measured outage"
 """Reason why a link is left out before anything is traced."""
 
 _REFLECTING = Material(10.0, 1.0)
-"""While paths are looked for, everything reflects well: none may be missing for a better material."""
+"""Material with which paths are found: everything reflects well, so that none is missing for a better material."""
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPaths:
+    """P paths of N measured links, as functions of the materials that are sought.
+
+    Parameters
+    ----------
+    paths : PathSet
+    columns : (M,) int array
+        Which of the scene's materials are sought.
+    link : (P,) int64 array
+        Link of each path.
+    """
+
+    paths: PathSet
+    columns: NDArray[np.intp]
+    link: NDArray[np.int64]
+
+    @property
+    def is_direct(self) -> NDArray[np.bool_]:
+        """Whether each path (P,) is the line of sight."""
+        return self.paths.is_direct
+
+    def of_links(self, chosen: NDArray[np.bool_]) -> "LinkPaths":
+        """Return the paths of the links of a mask (N,), which are counted anew."""
+        kept = chosen[self.link]
+        return LinkPaths(self.paths.kept(kept), self.columns, (np.cumsum(chosen) - 1)[self.link[kept]])
+
+    def power(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Evaluate |a|^2 of each path (P,) for M relative permittivities and conductivities [S/m]."""
+        return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
+
+    def slopes(
+        self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Evaluate |a|^2 of each path (P,), and differentiate it (P, 2 M): by permittivities, then conductivities."""
+        parameters = self._parameters(permittivity, conductivity_s_m)
+        slopes = self.paths.slopes(parameters, ("relative_permittivity", "conductivity_s_m")).values()
+        return self.paths.at(parameters)[0], np.concatenate([each[:, self.columns] for each in slopes], axis=1)
+
+    def strong(self) -> NDArray[np.bool_]:
+        """Find the paths (P,) that have `KEPT_FRACTION` of the power of their link for some of `EXTREMES`."""
+        strong, ones = np.zeros(len(self.link), dtype=bool), np.ones(len(self.columns))
+        scale_s_m = 2.0 * np.pi * float(self.paths.base.frequency_hz) * VACUUM_F_M
+        for permittivity, loss in EXTREMES:
+            strong |= _strongest(self.link, self.power(permittivity * ones, loss * scale_s_m * ones), KEPT_FRACTION)
+        return strong
+
+    def _parameters(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> PathParameters:
+        values = {"relative_permittivity": permittivity, "conductivity_s_m": conductivity_s_m}
+        all_values = {name: getattr(self.paths.base, name).copy() for name in values}
+        for name, own in values.items():
+            all_values[name][self.columns] = own
+        return replace(self.paths.base, **all_values)
 
 
 @dataclass(frozen=True)
@@ -47,14 +108,35 @@ class MeasuredBuilding:
 
     def paths(
         self, measured: Measurements, settings: TraceSettings, scene_settings: SceneSettings, report: Progress
-    ) -> MaterialPaths:
-        """Find the paths of the measured links."""
+    ) -> "LinkPaths":
+        """Find the paths of the measured links, and keep those that may have some power.
+
+        Paths are reciprocal: they are traced from those ends of which there are fewer.
+        """
         reflecting = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in self.start.values()]
         settings = replace(settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
         scene = PathScene(self.with_materials(reflecting), settings=settings, scene_settings=scene_settings)
-        return find_material_paths(
-            scene, tuple(self.start), measured.tx, measured.rx, lambda share, what: report(0.02 + 0.28 * share, what)
-        )
+        tx, rx = measured.tx, measured.rx
+        if len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0)):
+            tx, rx = rx, tx
+        tx_m, index = np.unique(tx, axis=0, return_inverse=True)
+        links = [np.flatnonzero(index.ravel() == number) for number in range(len(tx_m))]
+        nothing = PathSet(scene, tx_m, rx, [])
+        kept, new = nothing, [nothing]
+
+        def link_paths(paths: PathSet) -> LinkPaths:
+            columns = [paths.materials.index(name) for name in self.start]
+            return LinkPaths(paths, np.array(columns, dtype=int), paths.path_rx.astype(np.int64))
+
+        def strong() -> PathSet:
+            paths = PathSet.joined(new)
+            return PathSet.joined([kept, paths.kept(link_paths(paths).strong())])
+
+        for block in scene.blocks(tx_m, rx, lambda fraction, what: report(0.02 + 0.28 * fraction, what), links):
+            new.append(block)
+            if sum(map(len, new)) > PATHS_PER_BLOCK:
+                kept, new = strong(), [nothing]
+        return link_paths(strong())
 
 
 def require_places(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
@@ -94,11 +176,15 @@ def custom_material(material: Material, frequency_hz: float) -> Material:
     return Material(float(permittivity), float(conductivity_s_m), material.thickness_m)
 
 
-def usable_links(paths: MaterialPaths, measured: Measurements) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Find the links (N,) that say something about the materials, and count the others."""
-    count, ones = len(measured), np.ones(len(paths.materials))
+def usable_links(
+    partial: PartialMap, paths: LinkPaths, measured: Measurements
+) -> tuple[NDArray[np.bool_], dict[str, int]]:
+    """Find the links (N,) from which materials can be determined, and count the others by reason."""
+    count, ones = len(measured), np.ones(len(paths.columns))
     power = paths.power(4.0 * ones, 0.1 * ones)
-    seen = paths.unobserved_m < SEEN_M
+    found = paths.paths
+    start_m, end_m = found.base.tx_m[found.path_tx], found.rx_m[found.path_rx]
+    seen = path_unobserved_m(partial, start_m, found.interactions, found.vertices_m, end_m) < SEEN_M
     total = np.bincount(paths.link, weights=power, minlength=count)
     sure = np.bincount(paths.link, weights=power * seen, minlength=count)
     doubtful = np.zeros(count, dtype=bool)
@@ -106,7 +192,7 @@ def usable_links(paths: MaterialPaths, measured: Measurements) -> tuple[NDArray[
     reasons = {
         OUTAGE: measured.is_outage,
         "no path on the map": total == 0.0,
-        "runs through unobserved space": doubtful | (sure < SURE_SHARE * total),
+        "runs through unobserved space": doubtful | (sure < OBSERVED_FRACTION * total),
     }
     used, left_out = np.ones(count, dtype=bool), {}
     for reason, matters in reasons.items():
@@ -123,3 +209,20 @@ def _require_enough(used: NDArray[np.bool_], left_out: Mapping[str, int]) -> Non
             f"measurements has {int(used.sum())} usable links of {len(used)}, fewer than {FEWEST_LINKS}; left out: "
             f"{counts}. Measure more links, behind corners and in line of sight, in the part that has been observed."
         )
+
+
+def link_gains_db(power: NDArray[np.float64], link: NDArray[np.int64], links: int) -> NDArray[np.float64]:
+    """Gain of N links [dB] from the power of their paths (P,); -inf where there is none."""
+    with np.errstate(divide="ignore"):
+        return 10.0 * np.log10(np.bincount(link, weights=power, minlength=links))
+
+
+def _strongest(link: NDArray[np.int64], power: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
+    """Find the strongest paths (P,) of each link that have a fraction of its power together."""
+    order = np.lexsort((-power, link))
+    sums = np.cumsum(power[order])
+    total = np.bincount(link, weights=power)
+    before = sums - power[order] - (np.cumsum(total) - total)[link[order]]
+    strong = np.zeros(len(link), dtype=bool)
+    strong[order] = (before < fraction * total[link[order]]) & (power[order] > 0.0)
+    return strong

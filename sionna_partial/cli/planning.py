@@ -108,8 +108,8 @@ def place(
             result.save(folder / "placement.json")
             sp.plot_placement(result).savefig(folder / "placement.png")
     x, y, z = result.position_m
-    if result.objective.name == "coverage":
-        score = f"{result.score:.1%} of the receivers are predicted above {result.objective.threshold_db:g} dB"
+    if result.settings.objective == "coverage":
+        score = f"{result.score:.1%} of the receivers are predicted above {result.settings.threshold_db:g} dB"
     else:
         score = f"the worst tenth of the receivers is predicted at {result.score:.1f} dB"
     typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {score}")

@@ -65,7 +65,9 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
         LinkTable(
             home=np.full(len(phi), name),
             stage=np.full(len(phi), stage, dtype=np.float64),
-            phi=phi,
+            features=phi,
+            maps=(partial,),
+            map_index=np.zeros(len(phi), dtype=np.int64),
             link_state=link_state,
             gain_db=gain_db,
             inside=inside,
@@ -196,5 +198,5 @@ def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSe
             continue
         tx_m, rx_m = positions.tx_m, positions.rx_m
         links = trace_each(partial, tx_m, rx_m, settings=settings.trace, scene_settings=settings.scene)
-        features.append(LinkFeatures.concatenate([link_features(partial, each) for each in links]))
+        features.append(LinkFeatures.concatenate([link_features(partial, each, windows=False) for each in links]))
     return features

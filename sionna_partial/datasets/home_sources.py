@@ -5,11 +5,12 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from sionna_partial.checks import is_whole, require
 from sionna_partial.errors import MapError
 from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import HOME_KINDS, HomeKind, is_whole, require
+from sionna_partial.settings import HOME_KINDS, HomeKind
 from sionna_partial.simulation.homes import make_home
 
 Home = int | tuple[int, HomeKind | None] | str | os.PathLike[str]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,12 @@ class LinkTable:
         Name of the home, such as "make_home(10003)".
     stage : (N,) float64 array
         Steps that the robot has explored; below 1, the fraction of the home's free area that it was to observe.
-    phi : LinkFeatures
+    features : LinkFeatures
         Features of the trace on the partial map, with their context.
+    maps : tuple of M PartialMap
+        The partial maps.
+    map_index : (N,) int64 array
+        Index of each link's map.
     link_state, gain_db : (N,) arrays
         LinkState and omnidirectional path gain [dB] on the complete map; a receiver that is not inside is in outage
         (paper, "Indoor-Outdoor Estimation").
@@ -38,7 +43,9 @@ class LinkTable:
 
     home: NDArray[np.str_]
     stage: NDArray[np.float64]
-    phi: LinkFeatures
+    features: LinkFeatures
+    maps: tuple[PartialMap, ...]
+    map_index: NDArray[np.int64]
     link_state: NDArray[np.uint8]
     gain_db: NDArray[np.float64]
     inside: NDArray[np.bool_]
@@ -47,8 +54,8 @@ class LinkTable:
     complete_maps: Mapping[str, PartialMap]
 
     def __post_init__(self) -> None:
-        if self.phi.context is None:
-            raise PredictorError("phi has no context: give the LinkFeatures of link_features.")
+        if self.features.context is None:
+            raise PredictorError("features has no context: give the LinkFeatures of link_features.")
         link_states("link_state", self.link_state, len(self))
         link_numbers("gain_db", self.gain_db, len(self))
 
@@ -58,15 +65,20 @@ class LinkTable:
 
     @property
     def context(self) -> LinkContext:
-        """Positions of the links, and their maps."""
-        assert self.phi.context is not None
-        return self.phi.context
+        """What the maps show of the links."""
+        assert self.features.context is not None
+        return self.features.context
+
+    @cached_property
+    def phi(self) -> LinkFeatures:
+        """The features with the windows that map networks read, which are drawn at the first access."""
+        return self.features.with_windows(self.maps, self.map_index)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
         """Return the links that an index array, a mask (N,) or a slice selects."""
-        phi = self.phi.take(index)
-        columns = {name: getattr(self, name)[index] for name in COLUMNS}
-        return LinkTable(phi=phi, complete_maps=self.complete_maps, **columns)
+        features = self.__dict__.get("phi", self.features).take(index)  # with the windows, if they were drawn
+        columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
+        return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, **columns)
 
     @classmethod
     def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
@@ -74,10 +86,16 @@ class LinkTable:
         tables = list(parts)
         if not tables:
             raise PredictorError("parts is empty: give at least one LinkTable.")
-        phi = LinkFeatures.concatenate([table.phi for table in tables])
+        features = LinkFeatures.concatenate([table.features for table in tables])
         columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in COLUMNS}
         complete_maps = {name: home for table in tables for name, home in table.complete_maps.items()}
-        return cls(phi=phi, complete_maps=complete_maps, **columns)
+        maps = {id(each): each for table in tables for each in table.maps}
+        number = {key: index for index, key in enumerate(maps)}
+        numbers = [np.array([number[id(each)] for each in table.maps], dtype=np.int64) for table in tables]
+        index = np.concatenate([each[table.map_index] for each, table in zip(numbers, tables, strict=True)])
+        return cls(
+            features=features, maps=tuple(maps.values()), map_index=index, complete_maps=complete_maps, **columns
+        )
 
 
 def stage_name(stage: float) -> str:

@@ -19,7 +19,7 @@ from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
@@ -36,7 +36,7 @@ _FEATURES = {
     "unobserved_distance_m": "unobserved_distance_m",
     "distance_m": "distance_m",
 }
-_REACHES = [f"indirect_gain_reach_{reach:g}_m_db" for reach in REACHES_M]
+_REACHES = [f"indirect_gain_reach_{reach:g}_m_db" for reach in ATTENUATION_LENGTHS_M]
 
 _TYPES = {
     "home": pa.string(),
@@ -61,9 +61,10 @@ def _columns(table: LinkTable) -> dict[str, Any]:
         **{name: getattr(table, name) for name in COLUMNS},
         **{f"tx_{axis}_m": context.tx_m[:, index] for index, axis in enumerate("xyz")},
         **{f"rx_{axis}_m": context.rx_m[:, index] for index, axis in enumerate("xyz")},
-        **{name: getattr(table.phi, field) for name, field in _FEATURES.items()},
+        **{name: getattr(table.features, field) for name, field in _FEATURES.items()},
         **{name: context.indirect_gain_db[:, index] for index, name in enumerate(_REACHES)},
-        **{name: getattr(context, name) for name in ("strongest_unobserved_m", "map_index")},
+        "strongest_unobserved_m": context.strongest_unobserved_m,
+        "map_index": table.map_index,
     }
 
 
@@ -76,7 +77,7 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
     index of the map on which a link was traced.
     """
     maps = {
-        "partial": [_packed(each) for each in table.context.maps],
+        "partial": [_packed(each) for each in table.maps],
         "complete": {name: _packed(home) for name, home in table.complete_maps.items()},
     }
     notes = {"format": FORMAT, "maps": maps, **metadata}
@@ -177,20 +178,25 @@ def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
     return Path(folder) / SHARDS_FOLDER / f"{name}.parquet"
 
 
-def _links_of(columns: dict[str, Any], maps: Any) -> LinkTable:
+def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
     positions = {
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
-    context = LinkContext(
-        maps=tuple(_unpacked(each) for each in maps["partial"]),
-        map_index=columns.pop("map_index"),
+    maps, map_index = tuple(_unpacked(each) for each in notes["partial"]), columns.pop("map_index")
+    features = {field: columns.pop(name) for name, field in _FEATURES.items()}
+    context = LinkContext.on_maps(
+        maps,
+        map_index,
+        link_state=features["link_state"],
+        unobserved_distance_m=features["unobserved_distance_m"],
         indirect_gain_db=np.column_stack([columns.pop(name) for name in _REACHES]),
         strongest_unobserved_m=columns.pop("strongest_unobserved_m"),
         **positions,
     )
-    phi = LinkFeatures(**{field: columns.pop(name) for name, field in _FEATURES.items()}, context=context)
-    complete_maps = {name: _unpacked(each) for name, each in maps["complete"].items()}
-    return LinkTable(home=columns.pop("home").astype(np.str_), phi=phi, complete_maps=complete_maps, **columns)
+    home = columns.pop("home").astype(np.str_)
+    complete_maps = {name: _unpacked(each) for name, each in notes["complete"].items()}
+    known = {"features": LinkFeatures(**features, context=context), "maps": maps, "map_index": map_index}
+    return LinkTable(home=home, complete_maps=complete_maps, **known, **columns)
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""What NumPy and Dr.Jit compute, as functions of TensorFlow with derivatives (`dr.wrap` knows no TensorFlow)."""
+"""Power of paths and lengths of segments as functions of TensorFlow (`dr.wrap` does not support TensorFlow)."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -9,31 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
-from sionna_partial.tracing.fixed_paths import FixedPaths
+from sionna_partial.tracing.path_set import PathSet
 
 STEEPEST = 4.0
-"""How much faster than its smooth surrogate a length grows at most, as where it hardly touches a cell."""
+"""Largest ratio of the growth of a length to that of its smooth surrogate, as where it hardly touches a cell."""
 
 
-def moved_paths(paths: FixedPaths, given: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Evaluate fixed paths for other parameters.
+def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Evaluate power (P,) and vertices (P, D, 3) of paths, 0 where there are none, for float64 tensors.
 
-    Parameters
-    ----------
-    paths : FixedPaths
-    given : mapping of str to float64 tensors
-        Fields of `PathParameters`; the others are as the paths were traced.
-
-    Returns
-    -------
-    power : (P,) float64 tensor
-    vertices_m : (P, D, 3) float64 tensor
-        0 where there is no interaction [m].
-
-    Raises
-    ------
-    LookupError
-        By TensorFlow, where second derivatives are asked for.
+    They are `given` for fields of `PathParameters`; the others are as the paths were traced. There are first
+    derivatives only.
     """
     import tensorflow as tf
 
@@ -67,7 +53,7 @@ def moved_paths(paths: FixedPaths, given: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _pulled(slopes: NDArray[np.float64], upstream: Any) -> Any:
-    """Sum (K,) of slopes (P, K) times upstream derivatives (P,), in the same order whatever the number of threads."""
+    """Sum (K,) of slopes (P, K) times upstream derivatives (P,), in an order that does not depend on threads."""
     import tensorflow as tf
 
     rows = tf.convert_to_tensor(upstream)[:, None] * slopes
@@ -75,7 +61,7 @@ def _pulled(slopes: NDArray[np.float64], upstream: Any) -> Any:
 
 
 def _once_only(slopes: Any) -> Any:
-    """Let derivatives be, but refuse theirs, which would lack a part."""
+    """Return derivatives that TensorFlow cannot differentiate again: a part would be missing."""
     import tensorflow as tf
 
     return tf.raw_ops.PreventGradient(input=slopes, message="links have first derivatives only.")
@@ -87,22 +73,10 @@ def moved_lengths_m(
     base: tuple[NDArray[np.float64], NDArray[np.float64]],
     ends: tuple[Any, Any],
 ) -> Any:
-    """Let exact lengths change as smooth ones do while the ends of their segments move.
+    """Return lengths (N,) that change from exact ones as smooth ones do while the ends of their segments move.
 
-    Parameters
-    ----------
-    lengths : SmoothLengths
-    exact_m : (N,) float64 array
-        Length in cells of one kind at first [m]. Those that are 0 stay so.
-    base : tuple of two (N, 3) float64 arrays
-        Ends of the segments at first [m].
-    ends : tuple of two (N, 3) float64 tensors
-        Where they are now [m].
-
-    Returns
-    -------
-    (N,) float64 tensor
-        [m]
+    Exact lengths [m] are those in cells of one kind at the ends `base` (N, 3), and `ends` are the present ones [m].
+    Lengths that were 0 stay so.
     """
     import tensorflow as tf
 

@@ -1,27 +1,25 @@
 """The predicted distribution as one differentiable function of transmitter, materials, frequency and network weights.
 
-Sionna RT and Dr.Jit give the paths and their derivatives (`tracing.fixed_paths`), a `tf.custom_gradient` hands both to
-TensorFlow, and everything from there on, features and networks, is TensorFlow. At the place where links were traced the
-distribution is that of `Predictor.predict`.
+Paths and their derivatives come from `tracing`, a `tf.custom_gradient` hands both to TensorFlow, and everything from
+there on, features and networks, is TensorFlow. At the position where links were traced the distribution is that of
+`Predictor.predict`.
 
-What gradients see, and what they do not:
+What gradients include, and what they do not:
 
-- Paths are those of the trace. One that would appear elsewhere is not there; one that is no longer valid loses its
-  power in a step, and no derivative sees that step. Link states of the partial trace, which states the map leaves
-  possible, and whether the ends were seen, are those of the trace too.
+- Paths are those of the trace. One that would appear elsewhere is missing; one that is no longer valid loses its
+  power in a step, which no derivative includes. Link states of the partial trace, the link states that the map leaves
+  possible, and whether the ends are in observed cells, are those of the trace too.
 - The unobserved length of a line, d_unobs, has a derivative that jumps from cell to cell. Where the transmitter moves,
   the length is that of the trace times s(tx) / s(tx at the trace), and s is `SmoothLengths`: so are the lengths of all
   paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
-- What the map network knows around the transmitter is read there and 15 cm to each side, and is linear between. Where a
-  receiver passes the middle of one of its cells the slope has a bend, and wherever one of the paper's rectifiers
-  switches.
-- On a complete map the distribution is the trace itself: its probabilities are constant, and its gain is that of the
-  paths.
+- The outputs of the map networks are evaluated around the transmitter and 15 cm to each side, and are linear between.
+  Their derivative jumps where a receiver passes the centre of one of their cells.
+- Where the map is complete the distribution is the trace itself: its probabilities are constant, and its gain is that
+  of the paths.
 - There are first derivatives alone: TensorFlow refuses those of derivatives.
 """
 
 import math
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,22 +27,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.link_distribution import LinkDistribution
 from sionna_partial.differentiable.path_power import moved_lengths_m, moved_paths
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.certainty import possible_states
 from sionna_partial.prediction.features import link_features
-from sionna_partial.prediction.link_context import REACHES_M, kept_shares
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, attenuation
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
-    LinkNumbers,
+    binary_features,
+    context_of,
     distribution,
     input_columns,
-    link_marks,
+    numeric_features,
     read_links,
     read_maps,
     reads_maps,
@@ -59,10 +58,10 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.prediction.unobserved import Bools, unobserved_lengths_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
-from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, require
-from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene
+from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
+from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
 from sionna_partial.tracing.trace import Progress
 
 WINDOW_STEP_M = CELLS_M[0] / 2
@@ -81,7 +80,7 @@ _LIMITS = {
 
 
 class DifferentiableScene:
-    """A map and a predictor, for the differentiable links of any transmitters: built once, traced for each.
+    """A map and a predictor for the differentiable links of any transmitters: built once, traced for each.
 
     Parameters
     ----------
@@ -119,10 +118,10 @@ class DifferentiableScene:
 
     @property
     def weights(self) -> list[Any]:
-        """Variables of the networks that answer."""
-        seeing = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
-        answering = seeing or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
-        return [weight.value for name in answering for weight in self.networks[name].trainable_variables]
+        """Variables of the networks that predict."""
+        names = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
+        names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
+        return [weight.value for name in names for weight in self.networks[name].trainable_variables]
 
     def links(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | None = None) -> "DifferentiableLinks":
         """Trace the links from a transmitter to N receivers.
@@ -134,14 +133,14 @@ class DifferentiableScene:
         rx : (N, 3) array-like
             Receiver positions [m].
         progress : callable, optional
-            Called as ``progress(share_done, message)``.
+            Called as ``progress(fraction_done, message)``.
 
         Raises
         ------
         PositionError
             As `trace_links`, or for several transmitters.
         """
-        return DifferentiableLinks(self, self.paths.paths(tx, rx, progress=progress))
+        return DifferentiableLinks(self, self.paths.paths(one_transmitter(tx), rx, progress=progress))
 
     @cached_property
     def smooth_unknown(self) -> SmoothLengths:
@@ -156,11 +155,6 @@ class DifferentiableScene:
 
 class DifferentiableLinks:
     """Links from one transmitter to N receivers, traced once: their distribution as a function (see the module).
-
-    Parameters
-    ----------
-    scene : DifferentiableScene
-    paths : FixedPaths
 
     Attributes
     ----------
@@ -177,16 +171,16 @@ class DifferentiableLinks:
     >>> room = sp.PartialMap(np.pad(np.zeros((18, 58), dtype=np.uint8), 1, constant_values=1), resolution_m=0.1)
     >>> scene = sp.DifferentiableScene(room, trace_settings=sp.TraceSettings(max_depth=0))
     >>> links = scene.links((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
-    >>> place = tf.Variable(links.base.tx_m)
+    >>> tx_m = tf.Variable(links.base.tx_m)
     >>> with tf.GradientTape() as tape:
-    ...     gain_db = links(tx_m=place).gain_mean_db[0]
-    >>> (tape.gradient(gain_db, place).numpy() + 0.0).round(3).tolist()
+    ...     gain_db = links(tx_m=tx_m).gain_mean_db[0]
+    >>> (tape.gradient(gain_db, tx_m).numpy() + 0.0).round(3).tolist()
     [4.343, 0.0, 0.0]
     """
 
-    def __init__(self, scene: DifferentiableScene, paths: FixedPaths) -> None:
+    def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
-        self._phi = link_features(scene.partial, paths.links())
+        self._phi = link_features(scene.partial, paths.links(), windows=False)
 
     def __call__(
         self,
@@ -225,16 +219,22 @@ class DifferentiableLinks:
         pairs = zip(PARAMETERS, values, strict=True)
         given = {name: self._tensor(name, value) for name, value in pairs if value is not None}
         power, vertices_m = moved_paths(self._paths, given)
-        gain_db = _gain_db(self._sum(power, self._paths.rx_of_path))
-        if self._scene.partial.is_complete:
-            states = tf.cast([self._phi.link_state == state for state in LinkState], tf.float64)
-            return LinkDistribution.of_parts(states, tf.stack([gain_db] * len(LinkState)), tf.zeros_like(states))
-        place = given.get("tx_m")
-        numbers = self._moved_numbers(place, gain_db)
+        gain_db = _gain_db(self._sum(power, self._paths.path_rx))
+        states = tf.cast([self._phi.link_state == state for state in LinkState], tf.float64)
+        trace = states, tf.stack([gain_db] * len(LinkState)), tf.zeros_like(states)
+        complete = context_of(self._phi).complete
+        if complete.all():
+            return LinkDistribution.of_parts(*trace)
+        moved_m = given.get("tx_m")
+        numeric = self._moved_features(moved_m, gain_db)
         if LINK_NETWORK in self._scene.networks:
-            return self._seen(place, self._with_context(numbers, place, power, vertices_m))
-        inputs = {name: tf.cast(getattr(numbers, name), tf.float32)[:, None] for name in FEATURES}
-        return LinkDistribution.of_parts(*distribution_by_paper(self._scene.networks, inputs, self._phi.link_state))
+            numeric |= self._indirect_features(numeric["distance_m"], moved_m, power, vertices_m)
+            predicted = self._by_context(moved_m, numeric)
+        else:
+            inputs = {name: tf.cast(numeric[name], tf.float32)[:, None] for name in FEATURES}
+            predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state)
+        pairs = zip(trace, predicted, strict=True)
+        return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs))
 
     def _tensor(self, name: str, value: Any) -> Any:
         """Check one argument, and return it as a float64 tensor."""
@@ -252,10 +252,6 @@ class DifferentiableLinks:
         return tensor
 
     @cached_property
-    def _numbers(self) -> LinkNumbers:
-        return LinkNumbers.of(self._phi)
-
-    @cached_property
     def _legs(self) -> "_Legs":
         return _Legs(self._scene.partial, self._paths)
 
@@ -265,137 +261,115 @@ class DifferentiableLinks:
 
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
-    def _moved_numbers(self, place: Any, gain_db: Any) -> LinkNumbers:
-        """Return what derives from the transmitter's place alone, None being where it was, and the gain (N,)."""
+    def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
+        """Return the gain, and what derives from the transmitter position alone, None being where it was."""
         import tensorflow as tf
 
-        numbers, rx_m = replace(self._numbers, gain_db=gain_db), tf.constant(self._paths.rx_m)
-        if place is None:
-            return numbers
-        first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(place, rx_m.shape), rx_m)
+        numeric, rx_m = numeric_features(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
+        if tx_m is None:
+            return numeric
+        first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
         scene, base = self._scene, (first, self._paths.rx_m)
-        distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - place) ** 2, axis=1), _NEAREST_M**2))
-        unobserved_m = moved_lengths_m(scene.smooth_unknown, numbers.unobserved_distance_m, base, ends)
-        return replace(
-            numbers,
-            distance_m=distance_m,
-            unobserved_distance_m=tf.minimum(unobserved_m, distance_m),
-            walled_m=moved_lengths_m(scene.smooth_walls, numbers.walled_m, base, ends),
-        )
+        distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
+        unobserved_m = moved_lengths_m(scene.smooth_unknown, numeric["unobserved_distance_m"], base, ends)
+        return numeric | {
+            "distance_m": distance_m,
+            "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
+            "walled_m": moved_lengths_m(scene.smooth_walls, numeric["walled_m"], base, ends),
+        }
 
-    def _with_context(self, numbers: LinkNumbers, place: Any, power: Any, vertices_m: Any) -> LinkNumbers:
-        """Add what the indirect paths say, whose power (P,) and vertices (P, D, 3) are those now."""
+    def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
+        """Return what derives from the indirect paths, whose power (P,) and vertices (P, D, 3) are those now."""
         import tensorflow as tf
 
         legs = self._legs
-        crossed_m = tf.constant(legs.crossed_m)
-        if place is not None:
-            crossed_m = legs.moved_m(self._scene.smooth_unknown, place, vertices_m)
-        indirect = tf.gather(power, legs.paths)
-        gains_db = [_gain_db(self._sum(indirect * self._kept(crossed_m, reach), legs.rx)) for reach in REACHES_M]
-        strongest = tf.gather(crossed_m, np.maximum(legs.strongest, 0)) if len(legs.paths) else numbers.distance_m
-        return replace(
-            numbers,
-            indirect_gain_db=tf.stack(gains_db, axis=1),
-            strongest_unobserved_m=tf.where(legs.strongest >= 0, strongest, numbers.distance_m),
-        )
+        unobserved_m = tf.constant(legs.unobserved_m)
+        if tx_m is not None:
+            unobserved_m = legs.moved_m(self._scene.smooth_unknown, tx_m, vertices_m)
+        indirect, gains_db = tf.gather(power, legs.paths), []
+        for length_m in ATTENUATION_LENGTHS_M:
+            kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else attenuation(legs.unobserved_m, 0.0)
+            gains_db.append(_gain_db(self._sum(indirect * kept, legs.rx)))
+        strongest_m = tf.gather(unobserved_m, np.maximum(legs.strongest, 0)) if len(legs.paths) else distance_m
+        strongest_m = tf.where(legs.strongest >= 0, strongest_m, distance_m)
+        return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
 
-    def _kept(self, crossed_m: Any, reach_m: float) -> Any:
-        """Share of power that gets through the unobserved; paths wholly in observed space stay so."""
+    def _by_context(self, tx_m: Any, numeric: dict[str, Any]) -> tuple[Any, Any, Any]:
+        """Evaluate the networks that read maps and paths: see `distribution`."""
         import tensorflow as tf
 
-        return tf.exp(-crossed_m / reach_m) if reach_m > 0.0 else kept_shares(self._legs.crossed_m, 0.0)
+        ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
+        columns = input_columns(tf.constant(binary_features(self._phi)), numeric, frequency_hz, ops)
+        offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
+        columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
+        outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)
+        free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops)
+        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi).possible)
 
-    def _seen(self, place: Any, numbers: LinkNumbers) -> LinkDistribution:
-        """Let the networks answer that see where links run."""
+    def _maps(self, tx_m: Any) -> list[Any]:
+        """Return the outputs (1, ...) of the map networks around the transmitter: linear around where it was."""
         import tensorflow as tf
 
-        keras, frequency_hz = import_keras(), self._scene.predictor.settings.frequency_hz
-        marks = tf.constant(link_marks(self._phi))
-        columns = input_columns(marks, numbers, frequency_hz, keras.ops)
-        away_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if place is None else place)
-        known = self._known(place) if reads_maps(self._scene.networks) else []
-        outputs = read_links(
-            self._scene.networks, known, tf.cast(columns, tf.float32)[None], tf.cast(away_m, tf.float32)[None, :, :2]
-        )
-        free_db = free_space_gain_db(numbers.distance_m, frequency_hz, keras.ops)
-        possible = possible_states(self._phi)
-        return LinkDistribution.of_parts(*distribution(tf.cast(outputs[0], tf.float64), free_db, possible))
-
-    def _known(self, place: Any) -> list[Any]:
-        """Return what the map networks read (1, ...) around the transmitter: linear around where it was."""
-        import tensorflow as tf
-
-        known = read_maps(self._scene.networks, self._windows[:1] if place is None else self._windows)
-        if place is None:
-            return known
-        away = tf.cast(place - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)
-        return [maps[:1] + away[0] * (maps[1:2] - maps[2:3]) + away[1] * (maps[3:4] - maps[4:5]) for maps in known]
+        networks = self._scene.networks
+        if not reads_maps(networks):
+            return []
+        maps = read_maps(networks, self._windows[:1] if tx_m is None else self._windows)
+        if tx_m is None:
+            return maps
+        steps = tf.cast(tx_m - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)
+        return [each[:1] + steps[0] * (each[1:2] - each[2:3]) + steps[1] * (each[3:4] - each[4:5]) for each in maps]
 
     @cached_property
     def _windows(self) -> NDArray[np.float32]:
-        """Windows around the transmitter, and around places to the right, left, top and bottom of it."""
+        """Windows around the transmitter, and around positions to the right, left, top and bottom of it."""
         steps_m = WINDOW_STEP_M * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         return map_windows(self._scene.partial, self.base.tx_m[:2] + steps_m).astype(np.float32)
 
 
 class _Legs:
-    """The straight legs of the indirect paths: what moves with the transmitter, and how much of it is unobserved.
+    """The straight legs of the Q indirect paths: what moves with the transmitter, and how much of it is unobserved.
 
-    Parameters
-    ----------
-    partial : PartialMap
-    paths : FixedPaths
-
-    Attributes
-    ----------
-    paths : (Q,) int array
-        Which of the paths are indirect.
-    rx : (Q,) int32 array
-        Their receivers.
-    crossed_m : (Q,) float64 array
-        Their length in unknown cells as they were traced [m].
-    strongest : (N,) int array
-        The strongest of them to each receiver; -1 where there is none.
+    `paths` are their numbers (Q,), `rx` their receivers (Q,), `unobserved_m` their lengths in unknown cells as traced
+    (Q,) [m], and `strongest` is the strongest of them to each receiver (N,), -1 where there is none.
     """
 
-    def __init__(self, partial: PartialMap, paths: FixedPaths) -> None:
+    def __init__(self, partial: PartialMap, paths: PathSet) -> None:
         self.paths = np.flatnonzero(~paths.is_direct)
-        self.rx = paths.rx_of_path[self.paths]
+        self.rx = paths.path_rx[self.paths]
         self._rx_m = paths.rx_m
         vertices_m = paths.vertices_m[self.paths]
         self._of_path, self._start, self._end = _leg_nodes(paths.interactions[self.paths] > 0, self.rx, len(paths.rx_m))
         nodes_m = np.concatenate([paths.base.tx_m[None], paths.rx_m, vertices_m.reshape(-1, 3)])
         self._base = nodes_m[self._start], nodes_m[self._end]
         self._exact_m = unobserved_lengths_m(partial, *self._base)
-        self.crossed_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
+        self.unobserved_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
         self.strongest = np.full(len(paths.rx_m), -1)
         weakest_first = np.argsort(paths.power[self.paths], kind="stable")
         self.strongest[self.rx[weakest_first]] = weakest_first
 
-    def moved_m(self, lengths: SmoothLengths, place: Any, vertices_m: Any) -> Any:
-        """Return the length (Q,) in unknown cells with the transmitter at a place, and vertices (P, D, 3) now [m]."""
+    def moved_m(self, lengths: SmoothLengths, tx_m: Any, vertices_m: Any) -> Any:
+        """Return the length (Q,) in unknown cells with the transmitter at `tx_m`, and vertices (P, D, 3) now [m]."""
         import tensorflow as tf
 
-        bends = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
-        nodes_m = tf.concat([place[None], self._rx_m, bends], axis=0)
+        vertices_m = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
+        nodes_m = tf.concat([tx_m[None], self._rx_m, vertices_m], axis=0)
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
-        crossed_m = moved_lengths_m(lengths, self._exact_m, self._base, ends)
-        return tf.math.unsorted_segment_sum(crossed_m, self._of_path, len(self.rx))
+        moved_m = moved_lengths_m(lengths, self._exact_m, self._base, ends)
+        return tf.math.unsorted_segment_sum(moved_m, self._of_path, len(self.rx))
 
 
 def _leg_nodes(
-    bends: NDArray[np.bool_], rx: NDArray[np.int32], receivers: int
+    interacts: Bools, rx: NDArray[np.int32], receivers: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Path, start and end of each leg of Q paths that bend at some of D vertices (Q, D), to receivers (Q,).
+    """Path, start and end of each leg of Q paths that interact at some of D vertices (Q, D), to receivers (Q,).
 
-    Nodes are counted through: the transmitter, the receivers, and all vertices, path by path.
+    Nodes are numbered in this order: the transmitter, the receivers, and all vertices, path by path.
     """
-    paths, depth = bends.shape
+    paths, depth = interacts.shape
     vertices = 1 + receivers + np.arange(paths * depth).reshape(paths, depth)
-    chain = np.column_stack([np.zeros(paths, dtype=np.intp), vertices, 1 + rx])
-    there = np.column_stack([np.ones(paths, dtype=bool), bends, np.ones(paths, dtype=bool)])
-    of_path, nodes = np.nonzero(there)[0], chain[there]
+    all_nodes = np.column_stack([np.zeros(paths, dtype=np.intp), vertices, 1 + rx])
+    there = np.column_stack([np.ones(paths, dtype=bool), interacts, np.ones(paths, dtype=bool)])
+    of_path, nodes = np.nonzero(there)[0], all_nodes[there]
     on = of_path[:-1] == of_path[1:]
     return of_path[:-1][on], nodes[:-1][on], nodes[1:][on]
 

@@ -1,4 +1,4 @@
-"""How much of straight lines is in cells of one kind, smooth in their ends: what derivatives need of d_unobs."""
+"""Lengths of segments in cells of one kind, smooth in their ends: what derivatives of d_unobs need."""
 
 import numpy as np
 from numba import njit
@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.unobserved import first_line, shares_inside
+from sionna_partial.prediction.unobserved import Bools, Floats, Segment, enter_grid, leave_cells, segment_between
 
 _BORDER_CELLS = 1e-6
 """Distance within which a segment runs along the border of patches [cells]."""
@@ -17,23 +17,16 @@ class SmoothLengths:
     """Length of segments in cells of one kind, smooth in their ends.
 
     The length that `unobserved_lengths_m` measures is continuous, but its derivatives jump wherever a segment passes
-    the corner of a cell, and they are those of a staircase: they say little of the wall or frontier that the cells
-    stand for. Here the mask of the cells, 1 in cells of the kind and 0 in others, is interpolated bilinearly between
-    the middles of cells before it is integrated along the segment. Edges become ramps that are one cell wide.
+    the corner of a cell. Here the mask of the cells, 1 in cells of the kind and 0 in others, is interpolated bilinearly
+    between the centres of cells before it is integrated along the segment. Edges become ramps that are one cell wide.
 
     Where a segment crosses a straight edge along the axes from side to side, the length is the same. It differs by a
-    fraction of a cell where a segment passes a corner or ends within a cell of an edge, and by up to half of the way on
-    which it runs along an edge. The first derivatives are continuous, and exact to rounding, except for segments that
-    run along a line through the middles of cells, or are upright above one: there they are the mean of both sides.
+    fraction of a cell where a segment passes a corner or ends within a cell of an edge, and by up to half of the length
+    on which it runs along an edge. The first derivatives are continuous, and exact to rounding, except for segments
+    that run along a line through the centres of cells, or are upright above one: there they are the mean of both sides.
 
     Everything outside the grid is unknown. On a complete map nothing unknown can be reached, and lengths in unknown
     cells are 0 by definition.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    kind : CellState
-        The cells whose share of a segment counts.
     """
 
     def __init__(self, partial: PartialMap, kind: CellState) -> None:
@@ -42,41 +35,16 @@ class SmoothLengths:
             mask[:] = False
         self._mask = mask.astype(np.int8)
         self._even = _even_patches(mask)
-        self._first_middle_m = np.array(partial.origin_m) - 0.5 * partial.resolution_m
+        self._first_centre_m = np.array(partial.origin_m) - 0.5 * partial.resolution_m
         self._resolution_m = partial.resolution_m
 
-    def __call__(self, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Measure segments.
-
-        Parameters
-        ----------
-        start_m, end_m : (N, 3) float64 arrays
-            Ends of the segments [m]; one may be (3,).
-
-        Returns
-        -------
-        (N,) float64 array
-            Between 0 and the lengths of the segments [m]; NaN where an end is.
-        """
+    def __call__(self, start_m: Floats, end_m: Floats) -> Floats:
+        """Return the lengths (N,) [m] of segments between (N, 3) or (3,) ends [m]; NaN where an end is."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         return self._integrals(start_m, end_m)[:, 0] * np.linalg.norm(end_m - start_m, axis=1)
 
-    def slopes(
-        self, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Differentiate the lengths.
-
-        Parameters
-        ----------
-        start_m, end_m : (N, 3) float64 arrays
-            Ends of the segments [m]; one may be (3,).
-
-        Returns
-        -------
-        start, end : (N, 3) float64 arrays
-            Derivatives of the lengths with respect to `start_m` and `end_m` [1]; 0 where the ends coincide, NaN where
-            one is NaN.
-        """
+    def slopes(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
+        """Return the derivatives (N, 3) of the lengths with respect to start and end; 0 where the ends coincide."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         integrals, step_m = self._integrals(start_m, end_m), end_m - start_m
         distance_m = np.linalg.norm(step_m, axis=1, keepdims=True)
@@ -86,18 +54,18 @@ class SmoothLengths:
         end[:, :2] += distance_m / self._resolution_m * integrals[:, 3:5]
         return start, end
 
-    def _integrals(self, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _integrals(self, start_m: Floats, end_m: Floats) -> Floats:
         """Return what `_fill_integrals` fills in, for segments (N, 3) [m]."""
-        starts, ends = ((points[:, :2] - self._first_middle_m) / self._resolution_m for points in (start_m, end_m))
+        starts, ends = ((points[:, :2] - self._first_centre_m) / self._resolution_m for points in (start_m, end_m))
         integrals = np.zeros((len(starts), 5))
         _fill_integrals(self._mask, self._even, starts, ends, integrals)
         return integrals
 
 
-def _even_patches(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
+def _even_patches(mask: Bools) -> NDArray[np.int32]:
     """Return how far the next uneven patch is in every direction, corners included; 0 in uneven patches.
 
-    A patch is what four cell middles enclose, and even if their cells are alike: the interpolation is constant there.
+    A patch is what four cell centres enclose, and even if their cells are alike: the interpolation is constant there.
     """
     around = mask[:-1, :-1].astype(np.int8) + mask[:-1, 1:] + mask[1:, :-1] + mask[1:, 1:]
     even = around % 4 == 0
@@ -108,15 +76,11 @@ def _even_patches(mask: NDArray[np.bool_]) -> NDArray[np.int32]:
 
 @njit(cache=True)
 def _fill_integrals(
-    mask: NDArray[np.int8],
-    even: NDArray[np.int32],
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    integrals: NDArray[np.float64],
+    mask: NDArray[np.int8], even: NDArray[np.int32], starts: Floats, ends: Floats, integrals: Floats
 ) -> None:
     """Integrate the interpolated mask u over the parameter t of segments, from 0 at the start to 1 at the end.
 
-    Places (N, 2) are counted in cells from the middle of the first cell of the mask. Zeros in `integrals` (N, 5) become
+    Points (N, 2) are counted in cells from the centre of the first cell of the mask. Zeros in `integrals` (N, 5) become
     the integrals of u, (1 - t) du/dx, (1 - t) du/dy, t du/dx and t du/dy.
     """
     for i in range(len(ends)):
@@ -126,11 +90,12 @@ def _fill_integrals(
             continue
         aside_x, aside_y = _aside(start_x, end_x), _aside(start_y, end_y)
         if aside_x == 0.0 and aside_y == 0.0:
-            _integrate(mask, even, start_x, start_y, end_x, end_y, integrals[i])
+            _integrate(mask, even, segment_between(start_x, start_y, end_x, end_y), integrals[i])
         else:
             for x in (-aside_x, aside_x):
                 for y in (-aside_y, aside_y):
-                    _integrate(mask, even, start_x + x, start_y + y, end_x + x, end_y + y, integrals[i])
+                    segment = segment_between(start_x + x, start_y + y, end_x + x, end_y + y)
+                    _integrate(mask, even, segment, integrals[i])
             integrals[i] *= 0.25
         integrals[i, 0] = min(max(integrals[i, 0], 0.0), 1.0)
         integrals[i, 1:3] -= integrals[i, 3:5]
@@ -144,73 +109,39 @@ def _aside(start: float, end: float) -> float:
 
 
 @njit(cache=True)
-def _integrate(
-    mask: NDArray[np.int8],
-    even: NDArray[np.int32],
-    start_x: float,
-    start_y: float,
-    end_x: float,
-    end_y: float,
-    sums: NDArray[np.float64],
-) -> None:
-    """Add the integrals of u, du/dx, du/dy, t du/dx and t du/dy along a segment to `sums` (5,).
-
-    Patches are walked from line to line (Amanatides and Woo 1987), and even ones at once. Lines of the other axis that
-    were passed meanwhile are caught up with afterwards, which takes no share of the segment. The distance to each line
-    is computed afresh, so that rounding does not add up.
-    """
+def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment, sums: Floats) -> None:
+    """Add the integrals of u, du/dx, du/dy, t du/dx and t du/dy along a segment to `sums` (5,)."""
     ny, nx = even.shape
-    step_x, step_y = end_x - start_x, end_y - start_y
-    enter_x, leave_x = shares_inside(start_x, step_x, nx)
-    enter_y, leave_y = shares_inside(start_y, step_y, ny)
-    here, leave = max(enter_x, enter_y), min(leave_x, leave_y)
+    here, leave, line_x, line_y = enter_grid(segment, ny, nx)
     sums[0] += mask[0, 0] * (1.0 - max(0.0, leave - here))
-    turn_x, turn_y = (1 if step_x > 0.0 else -1), (1 if step_y > 0.0 else -1)
-    line_x = int(first_line(start_x + here * step_x, step_x))
-    line_y = int(first_line(start_y + here * step_y, step_y))
     while here < leave:
-        column = line_x - 1 if turn_x > 0 else line_x
-        row = line_y - 1 if turn_y > 0 else line_y
+        column = line_x - 1 if segment.step_x > 0.0 else line_x
+        row = line_y - 1 if segment.step_y > 0.0 else line_y
         within = 0 <= row < ny and 0 <= column < nx
-        over = max(0, even[row, column] - 1) if within else 0
-        reach_x = (line_x + turn_x * over - start_x) / step_x if step_x != 0.0 else np.inf
-        reach_y = (line_y + turn_y * over - start_y) / step_y if step_y != 0.0 else np.inf
-        there = min(max(here, min(reach_x, reach_y)), leave)
+        skip = max(0, even[row, column] - 1) if within else 0
+        there, line_x, line_y = leave_cells(segment, line_x, line_y, skip, here, leave)
         if not within:
             sums[0] += mask[0, 0] * (there - here)
         elif even[row, column]:
             sums[0] += mask[row, column] * (there - here)
         else:
-            _add_patch(mask, row, column, start_x, start_y, step_x, step_y, here, there, sums)
-        if reach_x <= there:
-            line_x += turn_x * (over + 1)
-        if reach_y <= there:
-            line_y += turn_y * (over + 1)
+            _add_patch(mask[row : row + 2, column : column + 2], row, column, segment, here, there, sums)
         here = there
 
 
 @njit(cache=True)
 def _add_patch(
-    mask: NDArray[np.int8],
-    row: int,
-    column: int,
-    start_x: float,
-    start_y: float,
-    step_x: float,
-    step_y: float,
-    here: float,
-    there: float,
-    sums: NDArray[np.float64],
+    corners: NDArray[np.int8], row: int, column: int, segment: Segment, here: float, there: float, sums: Floats
 ) -> None:
-    """Add what `_integrate` adds for the part of a segment, from `here` to `there`, that is in one patch.
+    """Add what `_integrate` adds between two fractions of a segment that is in one patch there, by Simpson's rule.
 
-    What is integrated is quadratic in t, and Simpson's rule exact.
+    What is integrated is quadratic in t, and the rule exact.
     """
-    corner, right, up = mask[row, column], mask[row, column + 1], mask[row + 1, column]
-    twist = mask[row + 1, column + 1] - right - up + corner
+    corner, right, up = corners[0, 0], corners[0, 1], corners[1, 0]
+    twist = corners[1, 1] - right - up + corner
     width = there - here
     for t, weight in ((here, width / 6.0), (0.5 * (here + there), width / 1.5), (there, width / 6.0)):
-        x, y = start_x + t * step_x - column, start_y + t * step_y - row
+        x, y = segment.x + t * segment.step_x - column, segment.y + t * segment.step_y - row
         slope_x, slope_y = right - corner + twist * y, up - corner + twist * x
         sums[0] += weight * (corner + slope_x * x + (up - corner) * y)
         sums[1] += weight * slope_x

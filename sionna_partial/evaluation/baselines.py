@@ -63,7 +63,7 @@ class Baselines:
     @classmethod
     def fit(cls, links: LinkTable, settings: PredictorSettings) -> "Baselines":
         """Fit to links whose receivers were drawn indoors."""
-        blind = nothing_seen(links.phi, settings.frequency_hz)
+        blind = nothing_seen(links.features, settings.frequency_hz)
         homes = list(dict.fromkeys(map(str, links.home)))
         distance = Predictor.fit(
             blind, links.link_state, links.gain_db, homes=homes, settings=replace(settings, networks="paper")

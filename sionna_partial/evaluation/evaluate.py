@@ -158,14 +158,14 @@ def evaluate(
         if progress:
             progress(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
         part = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
-        prediction = model.predict(part.phi)  # once: receivers indoors and anywhere share transmitters and windows
+        prediction = model.predict(part.phi if model.reads_maps else part.features)
         for receivers in ("indoor", "anywhere"):
             drawn = part.anywhere == (receivers == "anywhere")
             if not drawn.any():
                 continue
             some, own = part.take(drawn), prediction.take(drawn)
             if receivers == "indoor":
-                others = baseline_predictions(fitted, paper, some.phi, model.settings.frequency_hz)
+                others = baseline_predictions(fitted, paper, some.features, model.settings.frequency_hz)
                 predictions = {"predictor": own, **others}
             else:
                 predictions = _anywhere(model, some, own)
@@ -194,7 +194,7 @@ def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
 
 def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> dict[str, LinkPrediction]:
     """Predictions where receivers may be outside, from those for receivers indoors."""
-    p_indoor = np.where(links.context.rx_seen, 1.0, model.predict_indoor(links.phi))
+    p_indoor = np.where(links.context.rx_seen, 1.0, model.predict_indoor(links.features))
     outage = indoors.anywhere(np.zeros(len(links)))
     return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 

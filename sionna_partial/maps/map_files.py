@@ -9,18 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import SCENE_FILES, atomic_write, output_path
-from sionna_partial.maps.mesh.cells import MeshReading, mesh_map, raised
-from sionna_partial.maps.mesh.files import MESH_SUFFIXES, read_mesh
-from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, mesh_arrays, mesh_of_arrays
-from sionna_partial.maps.mesh.mitsuba_xml import read_exported_mesh, read_mitsuba_scene
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, require_map
+from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.files import MESH_SUFFIXES, read_mesh, read_mitsuba_scene
+from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map
 from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
 from sionna_partial.settings import Material
 
@@ -93,29 +91,31 @@ def load_map(
     if not isinstance(path, (str, os.PathLike)):
         raise MapError(f"path = {path!r} is not a path: give {ACCEPTED}.")
     source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
+    suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
-    if os.path.isdir(source) or source.suffix.lower() == ".xml":
-        return _read_scene_map(source, wall_height_m, reading)
-    if source.suffix.lower() in MESH_SUFFIXES:
-        return mesh_map(read_mesh(source, up), reading, wall_height_m)
-    reading.require_unused(source, "no mesh")
-    return _read_grid_file(source, strict=strict, wall_height_m=wall_height_m)
-
-
-def _read_grid_file(source: Path, *, strict: bool, wall_height_m: float | None) -> PartialMap:
-    suffix = source.suffix.lower()
-    if suffix in (".yaml", ".yml"):
-        partial = read_ros_map(source, strict=strict, wall_height_m=wall_height_m)
-        return _with_exported_mesh(partial, source, wall_height_m)
-    if suffix == ".npz":
-        return _read_npz(source, wall_height_m)
-    if suffix in (".pgm", ".png", ".bmp"):
-        raise MapError(
-            f"path = '{source}' is a bare image without resolution and origin: "
-            f"give its YAML, such as '{source.with_suffix('.yaml')}'."
-        )
-    raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+    if os.path.isdir(source) or suffix == ".xml":
+        partial = _read_scene(source, reading)
+    elif suffix in MESH_SUFFIXES:
+        partial = mesh_map(read_mesh(source, up), reading)
+    else:
+        reading.require_unused(source, "no mesh")
+        if suffix in (".yaml", ".yml"):
+            partial = read_ros_map(source, strict=strict)
+        elif suffix == ".npz":
+            partial = _read_npz(source)
+        elif suffix in (".pgm", ".png", ".bmp"):
+            remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
+            raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
+        else:
+            raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+    if wall_height_m is None:
+        return partial
+    partial = replace(partial, wall_height_m=wall_height_m)
+    if partial.mesh is None:
+        return partial
+    low, _ = partial.height_range_m
+    return replace(partial, mesh=replace(partial.mesh, height_range_m=(low, low + partial.wall_height_m)))
 
 
 def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mapping[str, object] | None = None) -> None:
@@ -136,6 +136,15 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
         If `partial` is no PartialMap.
     OutputError
         For another suffix, for a map with a mesh as YAML, or if writing fails; nothing half written is left behind.
+
+    Examples
+    --------
+    >>> import tempfile, sionna_partial as sp
+    >>> partial = sp.map_from_array([[1, 1, 1], [1, 0, 2]], resolution_m=0.1)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     sp.save_map(partial, f"{folder}/home.npz")
+    ...     sp.load_map(f"{folder}/home.npz") == partial
+    True
     """
     require_map("partial", partial)
     target = output_path(path)
@@ -156,7 +165,10 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
         if partial.material is not None:
             content["material"] = json.dumps(asdict(partial.material))
         if partial.mesh is not None:
-            content |= mesh_arrays(partial.mesh)
+            mesh = partial.mesh
+            content["mesh_vertices_m"], content["mesh_triangles"] = mesh.vertices_m, mesh.triangles
+            content["mesh_material"], content["mesh_materials"] = mesh.material, json.dumps(material_records(mesh))
+            content["mesh_height_range_m"] = mesh.height_range_m
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content)
     else:
@@ -191,8 +203,14 @@ def map_from_array(
     ------
     MapError
         For anything else than a two-dimensional array of these integers, or a number out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.map_from_array([[1, 1, 1], [1, 0, 2]], resolution_m=0.1).is_complete
+    False
     """
-    return PartialMap(_numbers("array", array, "iub"), resolution_m, origin_m, wall_height_m)
+    return PartialMap(grid_array("array", array, "iub"), resolution_m, origin_m, wall_height_m)
 
 
 def map_from_occupancy(
@@ -229,15 +247,13 @@ def map_from_occupancy(
     MapError
         For other values, or a number out of range.
     """
-    values = _numbers("data", data, "iu")
+    values = grid_array("data", data, "iu")
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
         raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
     if not 0 <= free_percent < occupied_percent <= 100:
-        raise MapError(
-            f"free_percent = {free_percent!r} and occupied_percent = {occupied_percent!r} are not allowed: "
-            "give 0 <= free_percent < occupied_percent <= 100."
-        )
+        given = f"free_percent = {free_percent!r} and occupied_percent = {occupied_percent!r}"
+        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100.")
     state = states_from_percent(values, occupied_percent, free_percent)
     return PartialMap(state, resolution_m, origin_m, wall_height_m)
 
@@ -281,7 +297,7 @@ def map_from_habitat(
     MapError
         For arrays of other or unequal shapes, or a number out of range.
     """
-    value, seen = _numbers("top_down", top_down, "iu"), _numbers("fog_of_war", fog_of_war, "iub") != 0
+    value, seen = grid_array("top_down", top_down, "iu"), grid_array("fog_of_war", fog_of_war, "iub") != 0
     _require_equal_shapes("fog_of_war", seen, "top_down", value)
     if value.min() < 0 or value.max() > 255:
         raise MapError(f"top_down holds values {value.min()} to {value.max()}: give Habitat's map, 0 to 255.")
@@ -328,7 +344,10 @@ def map_from_slam(
     MapError
         For arrays of other or unequal shapes or with other values, or a number out of range.
     """
-    channels = {"obstacle": _numbers("obstacle", obstacle, "iubf"), "explored": _numbers("explored", explored, "iubf")}
+    channels = {
+        "obstacle": grid_array("obstacle", obstacle, "iubf", "numbers"),
+        "explored": grid_array("explored", explored, "iubf", "numbers"),
+    }
     _require_equal_shapes("explored", channels["explored"], "obstacle", channels["obstacle"])
     for name, channel in channels.items():
         if not ((channel >= 0) & (channel <= 1)).all():
@@ -340,52 +359,25 @@ def map_from_slam(
     return PartialMap(state.astype(np.uint8), resolution_m, origin_m, wall_height_m)
 
 
-def _numbers(name: str, array: ArrayLike, kinds: str) -> NDArray[Any]:
-    """Return a two-dimensional array of one of the dtype kinds, or raise a MapError."""
-    try:
-        values = np.asarray(array)
-    except ValueError as error:
-        raise MapError(f"{name} is not a rectangular array: give a two-dimensional array (ny, nx).") from error
-    if values.ndim != 2 or values.size == 0:
-        raise MapError(
-            f"{name} has shape {values.shape}: give a two-dimensional array (ny, nx) with at least one cell."
-        )
-    if values.dtype.kind not in kinds:
-        wanted = "numbers" if "f" in kinds else "integers"
-        raise MapError(f"{name} has dtype {values.dtype}: give {wanted}.")
-    return values
-
-
 def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDArray[Any]) -> None:
     if array.shape != like.shape:
         raise MapError(f"{name} has shape {array.shape} and {other} {like.shape}: give arrays of one shape.")
 
 
-def _read_scene_map(source: Path, wall_height_m: float | None, reading: MeshReading) -> PartialMap:
+def _read_scene(source: Path, reading: MeshReading) -> PartialMap:
     """Read an exported scene, or else the Mitsuba scene that a path leads to."""
     folder = source if source.is_dir() else source.parent
     scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
-    if folder / "scene.xml" not in scenes or not all((folder / name).is_file() for name in SCENE_FILES):
-        if len(scenes) != 1:
-            raise MapError(
-                f"path = '{source}' is no scene: it has {len(scenes)} .xml files; give the path of one, or {ACCEPTED}."
-            )
-        return mesh_map(read_mitsuba_scene(scenes[0]), reading, wall_height_m)
-    reading.require_unused(source, "an exported map (remove its map.yaml to read the meshes of its scene alone)")
-    partial = read_ros_map(folder / "map.yaml", wall_height_m=wall_height_m, confined=True)
-    return _with_exported_mesh(partial, folder / "map.yaml", wall_height_m)
+    if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):
+        reading.require_unused(source, "an exported map (remove its map.yaml to read the meshes of its scene alone)")
+        return read_ros_map(folder / "map.yaml", confined=True)
+    if len(scenes) != 1:
+        remedy = f"give the path of one, or {ACCEPTED}."
+        raise MapError(f"path = '{source}' is no scene: it has {len(scenes)} .xml files; {remedy}")
+    return mesh_map(read_mitsuba_scene(scenes[0]), reading)
 
 
-def _with_exported_mesh(partial: PartialMap, path: Path, wall_height_m: float | None) -> PartialMap:
-    """Add the meshes of the scene beside a map YAML, if it says that they are the building."""
-    sheet = yaml.safe_load(path.read_bytes())
-    if "mesh" not in sheet:
-        return partial
-    partial = replace(partial, mesh=read_exported_mesh(path.parent, sheet))
-    return partial if wall_height_m is None else raised(partial)
-
-
-def _read_npz(source: Path, wall_height_m: float | None) -> PartialMap:
+def _read_npz(source: Path) -> PartialMap:
     try:
         with zipfile.ZipFile(source) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
@@ -395,16 +387,19 @@ def _read_npz(source: Path, wall_height_m: float | None) -> PartialMap:
             raise MapError(f"path = '{source}' holds more than {MAX_TRIANGLES:,} triangles: cut or simplify the mesh.")
         with np.load(source, allow_pickle=False) as content:
             state, resolution_m = content["state"], content["resolution_m"].item()
-            origin_m, height = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
+            origin_m, height_m = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
-            mesh = mesh_of_arrays(content)
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
+            mesh = None
+            if "mesh_triangles" in content:
+                vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
+                records = json.loads(str(content["mesh_materials"]))
+                materials = tuple(None if record is None else Material(**record) for record in records)
+                low, high = content["mesh_height_range_m"].tolist()
+                mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
     except MapError:
         raise
     except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files
-        raise MapError(
-            f"path = '{source}' is damaged or was not written by save_map ({error}): save it again."
-        ) from error
-    if wall_height_m is None:
-        return PartialMap(state, resolution_m, origin_m, height, interior, mesh, material)
-    return raised(PartialMap(state, resolution_m, origin_m, wall_height_m, interior, mesh, material))
+        what = f"is damaged or was not written by save_map ({error})"
+        raise MapError(f"path = '{source}' {what}: save it again.") from error
+    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material)

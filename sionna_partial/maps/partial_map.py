@@ -1,17 +1,18 @@
-"""PartialMap: what a robot knows of a floor plan, cell by cell."""
+"""PartialMap: what has been observed of a floor plan, cell by cell."""
 
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Integral
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -19,6 +20,11 @@ MAX_CELLS = 100_000_000
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
+
+
+class MapWarning(UserWarning):
+    """A map file that was not read to the letter, because unknown cells would have read as free or wall."""
+
 
 _FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np.uint8)
 _RANK = np.argsort(_FREEST)
@@ -41,9 +47,9 @@ class PartialMap:
     wall_height_m : float
         Height of walls and ceiling of a plan [m]. A mesh has its own (`height_range_m`).
     interior_cells : int or None
-        Number of free cells of the complete home, where a simulation knows it.
+        Number of free cells of the complete home, where a simulation gives it.
     mesh : SceneMesh or None
-        What is known of the building, in place of walls extruded from the cells. Its z is the world's.
+        What has been observed of the building, in place of walls extruded from the cells. Its z is the world's.
     material : Material or None
         Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
         SceneSettings.
@@ -52,6 +58,13 @@ class PartialMap:
     ------
     MapError
         For an array of another shape or with other values, or a number out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> partial = sp.PartialMap([[0, 0, 1], [0, 2, 2]], resolution_m=0.5)
+    >>> partial.shape, partial.bounds_m, partial.is_complete
+    ((2, 3), (0.0, 0.0, 1.5, 1.0), False)
     """
 
     state: NDArray[np.uint8]
@@ -63,9 +76,7 @@ class PartialMap:
     material: Material | None = None
 
     def __post_init__(self) -> None:
-        state = _checked_state(self.state)
-        state.setflags(write=False)
-        object.__setattr__(self, "state", state)
+        object.__setattr__(self, "state", _checked_state(self.state))
         object.__setattr__(self, "resolution_m", _number("resolution_m", self.resolution_m, 1e-3, 10.0))
         if np.shape(self.origin_m) != (2,):
             raise MapError(f"origin_m = {self.origin_m!r}: give the (x, y) of the lower-left corner in metres.")
@@ -74,27 +85,17 @@ class PartialMap:
         object.__setattr__(self, "wall_height_m", _number("wall_height_m", self.wall_height_m, 0.1, 100.0))
         cells = self.interior_cells
         if cells is not None and not (isinstance(cells, Integral) and cells >= 0):
-            raise MapError(
-                f"interior_cells = {cells!r} is not allowed: give the number of free cells of the home, or None."
-            )
-        if not (self.mesh is None or isinstance(self.mesh, SceneMesh)):
+            raise MapError(f"interior_cells = {cells!r} is not allowed: give the number of free cells, or None.")
+        if not isinstance(self.mesh, SceneMesh | None):
             raise MapError(f"mesh is of type {type(self.mesh).__name__}: give a SceneMesh, or None for a plan.")
-        if not (self.material is None or isinstance(self.material, Material)):
+        if not isinstance(self.material, Material | None):
             kind = type(self.material).__name__
             raise MapError(f"material is of type {kind}: give a Material, or None for that of SceneSettings.")
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PartialMap):
             return NotImplemented
-        return (
-            np.array_equal(self.state, other.state)
-            and self.resolution_m == other.resolution_m
-            and self.origin_m == other.origin_m
-            and self.wall_height_m == other.wall_height_m
-            and self.interior_cells == other.interior_cells
-            and self.mesh == other.mesh
-            and self.material == other.material
-        )
+        return equal_fields(self, other)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -122,10 +123,7 @@ class PartialMap:
         What lies beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
         out of a larger one. A map without free cells is not complete.
         """
-        free = self.state == CellState.FREE
-        reached = np.pad(self.state == CellState.UNKNOWN, 1, constant_values=True)
-        touches = reached[2:, 1:-1] | reached[:-2, 1:-1] | reached[1:-1, 2:] | reached[1:-1, :-2]
-        return bool(free.any() and not (free & touches).any())
+        return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
 
     @cached_property
     def alike_cells(self) -> NDArray[np.int32]:
@@ -134,9 +132,9 @@ class PartialMap:
 
     @property
     def observed_fraction(self) -> float:
-        """Share of the interior that has been seen, in [0, 1].
+        """Fraction of the interior that has been seen, in [0, 1].
 
-        Free cells over `interior_cells` where that is known; else 1 for a complete map, and the share of known
+        Free cells over `interior_cells` where that is known; else 1 for a complete map, and the fraction of known
         cells in the grid for any other.
         """
         if self.interior_cells is not None:
@@ -146,18 +144,7 @@ class PartialMap:
         return float((self.state != CellState.UNKNOWN).mean())
 
     def cell_index(self, points_m: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Row and column of the cells that hold world points.
-
-        Parameters
-        ----------
-        points_m : (..., 2 or 3) array
-            World positions [m]; z is ignored.
-
-        Returns
-        -------
-        row, column : (...) int arrays
-            May lie outside the grid.
-        """
+        """Row and column (...) of the cells that hold world points (..., 2 or 3) [m]; they may be outside the grid."""
         points = np.asarray(points_m, dtype=float)
         column = np.floor((points[..., 0] - self.origin_m[0]) / self.resolution_m + 1e-9).astype(np.intp)
         row = np.floor((points[..., 1] - self.origin_m[1]) / self.resolution_m + 1e-9).astype(np.intp)
@@ -167,7 +154,7 @@ class PartialMap:
         """CellState at world points (..., 2 or 3) [m]; UNKNOWN outside the grid.
 
         A point on the border of several cells is in the freest of them: FREE before UNKNOWN before WALL. Sensors and
-        planners place radios on the corners of cells, beside a wall, and these are not inside it.
+        planners put radios on the corners of cells, beside a wall, and these are not inside it.
         """
         cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m
         padded = np.pad(self.state, 1, constant_values=CellState.UNKNOWN)
@@ -180,18 +167,7 @@ class PartialMap:
         return _FREEST[freest]
 
     def require_positions(self, name: str, points_m: object) -> NDArray[np.float64]:
-        """Check radio positions and return them as an array.
-
-        Parameters
-        ----------
-        name : str
-            What the points are, for the message ("tx", "rx").
-        points_m : (3,) or (N, 3) array-like
-            World positions [m].
-
-        Returns
-        -------
-        (3,) or (N, 3) float64 array
+        """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
 
         Raises
         ------
@@ -208,22 +184,16 @@ class PartialMap:
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         flat = points.reshape(-1, 3)
-        finite = ~np.any(~np.isfinite(flat), axis=1)
-        placed = np.where(finite[:, None], flat, 0.0)
-        x, y, z = placed.T
-        state = self.state_at(np.clip(placed[:, :2], (x0, y0), (x1, y1)))
-        faults: tuple[tuple[NDArray[np.bool_], str, str], ...] = (
+        finite = np.asarray(np.isfinite(flat).all(axis=1))
+        x, y, z = np.where(finite[:, None], flat, 0.0).T
+        state = self.state_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1)]))
+        outside = (x < x0) | (x > x1) | (y < y0) | (y > y1)
+        beyond = f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m"
+        too_high = f"is not between floor and ceiling ({low:g} to {high:g} m)"
+        faults = (
             (~finite, "is not finite", "give finite numbers in metres."),
-            (
-                (x < x0) | (x > x1) | (y < y0) | (y > y1),
-                f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m",
-                "move it inside, or extend the map with unknown cells.",
-            ),
-            (
-                (z <= low) | (z >= high),
-                f"is not between floor and ceiling ({low:g} to {high:g} m)",
-                "change its height z or the map's wall_height_m.",
-            ),
+            (outside, beyond, "move it inside, or extend the map with unknown cells."),
+            ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
             (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
         )
         for fault, what, remedy in faults:
@@ -231,13 +201,26 @@ class PartialMap:
                 index = int(np.argmax(fault))
                 which = name if points.ndim == 1 else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
-                place = tuple(float(v) for v in flat[index])
-                raise PositionError(f"{which} = {place}{more} {what}: {remedy}")
+                raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
 
 
+def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
+    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(step == 1)
+    return row, start, np.nonzero(step == -1)[1]
+
+
+def frontier_cells(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
+    unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
+    touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
+    return np.asarray(touches & (state == CellState.FREE))
+
+
 def alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Return how many cells in every direction, corners included, are in the state of the cell."""
+    """How many cells in every direction, corners included, are in the state of each cell."""
     alike = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
         cells = state == kind
@@ -252,26 +235,31 @@ def require_map(name: str, value: object) -> None:
         raise MapError(f"{name} is of type {type(value).__name__}: give a PartialMap, such as load_map returns.")
 
 
-def _checked_state(values: object) -> NDArray[np.uint8]:
-    """Return cell states as a new array, or raise a MapError."""
+def grid_array(name: str, values: ArrayLike, kinds: str, wanted: str = "integers") -> NDArray[Any]:
+    """Return a two-dimensional array of one of the dtype kinds, or raise a MapError."""
     try:
-        state = np.asarray(values)
+        array = np.asarray(values)
     except ValueError as error:
-        raise MapError("state is not a rectangular array: give a two-dimensional array (ny, nx).") from error
-    if state.ndim != 2 or state.size == 0:
-        raise MapError(f"state has shape {state.shape}: give a two-dimensional array (ny, nx) with at least one cell.")
-    if state.dtype.kind not in "iub":
-        raise MapError(f"state has dtype {state.dtype}: use CellState integers FREE 0, WALL 1, UNKNOWN 2.")
+        raise MapError(f"{name} is not a rectangular array: give a two-dimensional array (ny, nx).") from error
+    if array.ndim != 2 or array.size == 0:
+        raise MapError(f"{name} has shape {array.shape}: give a two-dimensional array (ny, nx) with at least one cell.")
+    if array.dtype.kind not in kinds:
+        raise MapError(f"{name} has dtype {array.dtype}: give {wanted}.")
+    return array
+
+
+def _checked_state(values: ArrayLike) -> NDArray[np.uint8]:
+    """Return cell states as a new read-only array, or raise a MapError."""
+    wanted = "CellState integers FREE 0, WALL 1, UNKNOWN 2"
+    state = grid_array("state", values, "iub", wanted)
     if state.size > MAX_CELLS:
-        ny, nx = state.shape
-        raise MapError(
-            f"state has {ny} x {nx} cells, more than {MAX_CELLS:,}: cut the map to the building or coarsen it."
-        )
+        cells = f"{state.shape[0]} x {state.shape[1]} cells, more than {MAX_CELLS:,}"
+        raise MapError(f"state has {cells}: cut the map to the building or coarsen it.")
     if state.min() < 0 or state.max() > max(CellState):
-        raise MapError(
-            f"state has values {state.min()} to {state.max()}: use CellState integers FREE 0, WALL 1, UNKNOWN 2."
-        )
-    return np.array(state, dtype=np.uint8)
+        raise MapError(f"state has values {state.min()} to {state.max()}: use {wanted}.")
+    state = np.array(state, dtype=np.uint8)
+    state.setflags(write=False)
+    return state
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:

@@ -1,27 +1,35 @@
 """ROS map_server maps: a YAML file and an image, read as nav2_map_server reads them, and written."""
 
+import logging
 import math
+import os
 import reprlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
+from scipy.ndimage import affine_transform, binary_dilation
 
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.map_turn import turn_grid
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.mesh.files import read_bytes, read_exported_mesh
+from sionna_partial.maps.mesh.mesh import material_records
+from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, frontier_cells
 from sionna_partial.settings import Material
 
+logger = logging.getLogger(__name__)
+
+States = NDArray[np.uint8]
+
 MODES = ("trinary", "scale", "raw")
-"""Ways in which map_server reads an image."""
+"""How map_server may read an image."""
 
 UNKNOWN_SHADE = 205
 """Shade that map savers give to unknown cells [of 255]."""
@@ -39,32 +47,21 @@ _short = reprlib.Repr()
 _short.maxstring, _short.maxother, _short.maxlevel = 200, 200, 2
 
 
-class MapWarning(UserWarning):
-    """A map file that was not read to the letter, because unknown cells would have read as free or wall."""
-
-
-@dataclass(frozen=True)
-class _Sheet:
-    """The checked content of a map YAML."""
+class _Sheet(NamedTuple):
+    """How the image of a map YAML is to be read."""
 
     source: Path
     image: Path
     mode: str
-    resolution_m: float
-    origin: tuple[float, float, float]
     negate: bool
     occupied_thresh: float
     free_thresh: float
-    wall_height_m: float
-    interior_cells: int | None
-    material: Material | None
 
 
-@dataclass(frozen=True)
-class _Pixels:
+class _Pixels(NamedTuple):
     """A decoded image, row 0 at the top.
 
-    An opaque pixel of grey shade s (0 to 255) has the level s * `per_shade` + `opaque`, at most `full`.
+    An opaque pixel of grey shade s (0 to 255) has the level s * `per_shade` + `opaque`.
     """
 
     level: NDArray[np.uint16]
@@ -72,65 +69,37 @@ class _Pixels:
     opaque: int = 0
     alpha: NDArray[np.uint8] | None = None
 
-    @property
-    def full(self) -> int:
-        return 255 * self.per_shade + self.opaque
 
+def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) -> PartialMap:
+    """Read a ROS map_server YAML and its image, and the mesh of the exported scene that the YAML is part of.
 
-def read_ros_map(
-    path: Path, *, strict: bool = False, wall_height_m: float | None = None, confined: bool = False
-) -> PartialMap:
-    """Read a ROS map_server YAML and its image.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The YAML file.
-    strict : bool
-        Read every pixel as map_server does, even where unknown cells become free or wall that way.
-    wall_height_m : float or None
-        Wall height [m] in place of the YAML's `wall_height`.
-    confined : bool
-        Refuse an image outside the YAML's folder.
-
-    Returns
-    -------
-    PartialMap
-
-    Raises
-    ------
-    MapError
-        For a YAML or an image that is missing, damaged, or out of range.
+    `strict` reads every pixel as map_server does, even where unknown cells become free or wall that way; `confined`
+    refuses an image outside the YAML's folder.
     """
-    sheet = _read_sheet(path, confined=confined)
+    raw = _read_yaml(path)
+    sheet = _read_sheet(path, raw, confined=confined)
+    resolution_m = _number(path, raw, "resolution", 1e-3, 10.0, "metres per cell (not cells per metre)")
+    origin = _origin(path, _required(path, raw, "origin"))
+    height_m = _number(path, {"wall_height": DEFAULT_WALL_HEIGHT_M, **raw}, "wall_height", 0.1, 100.0, "metres")
+    interior = raw.get("interior_cells")
+    if interior is not None and (not isinstance(interior, int) or isinstance(interior, bool) or interior < 0):
+        raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
+    material = _material(path, raw.get("material"))
     pixels = _read_pixels(sheet)
     state = _classify(pixels, sheet)
     if sheet.mode == "trinary" and not strict:
         _keep_unknown(state, pixels, sheet)
-    placed, resolution_m, origin_m = turn_grid(np.flipud(state), sheet.resolution_m, sheet.origin)
-    height = sheet.wall_height_m if wall_height_m is None else wall_height_m
-    interior = sheet.interior_cells
+    state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
-        interior *= round(sheet.resolution_m / resolution_m) ** 2
-    return PartialMap(placed, resolution_m, origin_m, height, interior, material=sheet.material)
+        interior *= round(resolution_m / cell_m) ** 2
+    mesh = read_exported_mesh(path.parent, raw["mesh"], raw.get("scene_offset")) if "mesh" in raw else None
+    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material)
 
 
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
-    """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map.
+    """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map, or neither.
 
-    Parameters
-    ----------
-    partial : PartialMap
-        The map.
-    path : pathlib.Path
-        The YAML file.
-    extra : mapping or None
-        Further keys for the YAML.
-
-    Raises
-    ------
-    OutputError
-        If writing fails; both files are then as they were before.
+    Of a mesh, the YAML has what the exported scene beside it does not.
     """
     image = path.with_suffix(".pgm")
     sheet: dict[str, object] = {
@@ -147,31 +116,61 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         sheet["interior_cells"] = int(partial.interior_cells)
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
+    sheet |= extra or {}
+    if partial.mesh is not None:
+        sheet["mesh"] = {"height_range": [*partial.height_range_m], "materials": material_records(partial.mesh)}
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     ny, nx = partial.shape
     with atomic_write(path, "w") as text, atomic_write(image) as picture:
-        yaml.safe_dump({**sheet, **(extra or {})}, text, sort_keys=False, default_flow_style=None)
+        yaml.safe_dump(sheet, text, sort_keys=False, default_flow_style=None)
         text.flush()
         picture.write(b"P5\n%d %d\n255\n" % (nx, ny))
         picture.write(np.flipud(shades[partial.state]).tobytes())
 
 
-def states_from_percent(
-    percent: NDArray[np.integer], occupied_percent: float, free_percent: float
-) -> NDArray[np.uint8]:
-    """CellState of ROS occupancy values, as nav2's map_saver draws them.
+def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
+    """Turn a grid (ny, nx) by the yaw of its origin (x, y, yaw), onto the world axes; UNKNOWN outside it.
 
-    Parameters
-    ----------
-    percent : integer array
-        0 to 100; any other value is unknown.
-    occupied_percent, free_percent : float
-        From this value a cell is wall; up to this value it is free.
+    Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is below the map's
+    resolution and left out. Any other yaw puts the grid onto cells of half the size, each with the state found at its
+    centre: a wall of one cell stays at least two new cells thick, more than a diagonal step needs (sqrt 2), so that no
+    wall gets holes. Where walls met at a corner alone, the gap is closed; a complete map stays complete.
 
-    Returns
-    -------
-    uint8 array of CellState, of the same shape
+    Returns the state, the edge of its cells [m], and the world x and y of its lower-left corner [m].
+    """
+    x, y, yaw = origin
+    ny, nx = state.shape
+    turns = round(yaw / (math.pi / 2))
+    if abs(yaw - turns * math.pi / 2) * math.hypot(ny, nx) <= 0.5:
+        left, down = ((0, 0), (ny, 0), (nx, ny), (0, nx))[turns % 4]
+        return np.rot90(state, -turns), resolution_m, (x - left * resolution_m, y - down * resolution_m)
+    cell_m = resolution_m / 2
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])  # acts on (y, x)
+    corners = np.array([(0, 0), (ny, 0), (0, nx), (ny, nx)]) @ turn.T * resolution_m
+    low = corners.min(axis=0)
+    rows, columns = (int(n) for n in np.ceil((corners.max(axis=0) - low) / cell_m - 1e-9))
+    if rows * columns > MAX_CELLS:
+        what = f"has a yaw for which the map needs {rows} x {columns} cells, more than {MAX_CELLS:,}"
+        raise MapError(f"origin = {list(origin)} {what}: set the yaw to 0, or cut or coarsen the map.")
+    logger.warning("origin yaw %g rad: the map is turned onto cells of %g m.", yaw, cell_m)
+    first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
+
+    def turned(grid: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Sample a grid of the map's shape at the centres of the new cells."""
+        shape, unknown = (rows, columns), CellState.UNKNOWN
+        return affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
+
+    result = turned(state)
+    frontier = binary_dilation(frontier_cells(state), np.ones((3, 3)))
+    result[frontier_cells(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
+    return result, cell_m, (x + float(low[1]), y + float(low[0]))
+
+
+def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, free_percent: float) -> States:
+    """CellState of ROS occupancy values, as nav2's map_saver draws them: 0 to 100 percent, any other is unknown.
+
+    From `occupied_percent` a cell is wall; up to `free_percent` it is free.
     """
     state = np.full(percent.shape, CellState.UNKNOWN, dtype=np.uint8)
     state[(percent >= 0) & (percent <= free_percent)] = CellState.FREE
@@ -183,8 +182,7 @@ def _refuse(sheet: Path, field: str, value: object, remedy: str) -> MapError:
     return MapError(f"{sheet}: {field} = {_short.repr(value)} is not allowed: {remedy}")
 
 
-def _read_sheet(path: Path, *, confined: bool) -> _Sheet:
-    raw = _read_yaml(path)
+def _read_sheet(path: Path, raw: Mapping[Any, Any], *, confined: bool) -> _Sheet:
     occupied = _number(path, raw, "occupied_thresh", 0.0, 1.0)
     free = _number(path, raw, "free_thresh", 0.0, 1.0)
     if free >= occupied:
@@ -195,23 +193,8 @@ def _read_sheet(path: Path, *, confined: bool) -> _Sheet:
     negate = _required(path, raw, "negate")
     if not isinstance(negate, int) or negate not in (0, 1):
         raise _refuse(path, "negate", negate, "give 0 (dark is wall) or 1 (bright is wall).")
-    interior = raw.get("interior_cells")
-    if interior is not None and (not isinstance(interior, int) or isinstance(interior, bool) or interior < 0):
-        raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
-    height = {"wall_height": DEFAULT_WALL_HEIGHT_M, **raw}
-    return _Sheet(
-        source=path,
-        image=_image_path(path, _required(path, raw, "image"), confined=confined),
-        mode=mode.lower(),
-        resolution_m=_number(path, raw, "resolution", 1e-3, 10.0, "metres per cell (not cells per metre)"),
-        origin=_origin(path, _required(path, raw, "origin")),
-        negate=bool(negate),
-        occupied_thresh=occupied,
-        free_thresh=free,
-        wall_height_m=_number(path, height, "wall_height", 0.1, 100.0, "metres"),
-        interior_cells=interior,
-        material=_material(path, raw.get("material")),
-    )
+    image = _image_path(path, _required(path, raw, "image"), confined=confined)
+    return _Sheet(path, image, mode.lower(), bool(negate), occupied, free)
 
 
 def _material(path: Path, value: object) -> Material | None:
@@ -224,22 +207,13 @@ def _material(path: Path, value: object) -> Material | None:
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
     try:
-        with path.open("rb") as stream:
-            text = stream.read(MAX_YAML_BYTES + 1)
-    except OSError as error:
-        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
-    if len(text) > MAX_YAML_BYTES:
-        raise MapError(f"path = '{path}' has more than {MAX_YAML_BYTES:,} bytes: give the YAML of a ROS map.")
-    try:
-        raw = yaml.safe_load(text)
+        raw = yaml.safe_load(read_bytes(path, MAX_YAML_BYTES, "give the YAML of a ROS map."))
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise MapError(f"path = '{path}' is not valid YAML ({reason}): correct it or save the map again.") from error
     if not isinstance(raw, dict):
-        raise MapError(
-            f"path = '{path}' holds {_short.repr(raw)} in place of keys such as image, resolution and origin: "
-            "give the YAML that a ROS map_saver wrote."
-        )
+        what = f"holds {_short.repr(raw)} in place of keys such as image, resolution and origin"
+        raise MapError(f"path = '{path}' {what}: give the YAML that a ROS map_saver wrote.")
     return raw
 
 
@@ -253,8 +227,7 @@ def _number(path: Path, raw: Mapping[Any, Any], key: str, low: float, high: floa
     value = _required(path, raw, key)
     number = _float(value)
     if not low <= number <= high:
-        what = f" of {unit}" if unit else ""
-        raise _refuse(path, key, value, f"give a number{what} in [{low:g}, {high:g}].")
+        raise _refuse(path, key, value, f"give a number{unit and f' of {unit}'} in [{low:g}, {high:g}].")
     return number
 
 
@@ -282,11 +255,7 @@ def _image_path(path: Path, value: object, *, confined: bool) -> Path:
     if confined and (Path(value).is_absolute() or ".." in Path(value).parts):
         raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
     image = path.parent / value
-    try:
-        found = image.is_file()
-    except OSError:
-        found = False
-    if not found:
+    if not os.path.isfile(image):
         raise _refuse(path, "image", value, f"there is no file '{image}'; put the image there or correct the name.")
     return image
 
@@ -329,7 +298,8 @@ def _decode(sheet: _Sheet) -> Image.Image:
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> NDArray[np.uint8]:
     """Read every pixel to the letter of nav2's loadMapFromFile; what lies between the thresholds is unknown."""
-    shade = np.arange(pixels.full + 1) / pixels.full
+    full = 255 * pixels.per_shade + pixels.opaque
+    shade = np.arange(full + 1) / full
     if sheet.mode == "raw":
         occupied, free = np.rint(100 * sheet.occupied_thresh), np.rint(100 * sheet.free_thresh)
         table = states_from_percent(np.rint(255 * shade).astype(int), occupied, free)
@@ -350,18 +320,17 @@ def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> N
     With a free_thresh above 0.196 (older nav2 wrote 0.25), or with an alpha channel, 205 reads as free. It is
     kept unknown where more cells would be lost that way than would be unknown.
     """
-    shade = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE
+    shade, warned = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, []
     lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)
     if lost.sum() > (state == CellState.UNKNOWN).sum():
         state[lost] = CellState.UNKNOWN
-        _warn(sheet, f"{int(lost.sum())} cells of shade {shade} would read as free (free_thresh {sheet.free_thresh:g})")
+        count = f"{int(lost.sum())} cells of shade {shade}"
+        warned.append(f"{count} would read as free (free_thresh {sheet.free_thresh:g})")
     if pixels.alpha is not None:
         clear = (pixels.alpha == 0) & (state != CellState.UNKNOWN)
         if clear.any():
             state[clear] = CellState.UNKNOWN
-            _warn(sheet, f"{int(clear.sum())} transparent cells would read as free or wall")
-
-
-def _warn(sheet: _Sheet, what: str) -> None:
-    message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
-    warnings.warn(message, MapWarning, stacklevel=6)
+            warned.append(f"{int(clear.sum())} transparent cells would read as free or wall")
+    for what in warned:
+        message = f"{sheet.source}: {what}; they are kept unknown. Pass strict=True to read the file to the letter."
+        warnings.warn(message, MapWarning, stacklevel=4)

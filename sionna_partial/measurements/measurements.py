@@ -1,4 +1,4 @@
-"""Measured path gains at known places: mappings, data frames and CSV files -> Measurements."""
+"""Measured path gains at known positions: mappings, data frames and CSV files -> Measurements."""
 
 import csv
 import os
@@ -18,8 +18,11 @@ LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
 OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 """Up to this gain, noise included, a link counts as an outage [dB]."""
 
-_ACCEPTED = "a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV"
-_CSV_COLUMNS = "tx_x, tx_y, tx_z, rx_x, rx_y, rx_z, gain_db"
+_CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db")
+_GIVE = (
+    "give a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV with the columns "
+    f"{', '.join(_CSV_COLUMNS)}."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +68,6 @@ class Measurements:
         """Whether each link (N,) is an outage."""
         return self.gain_db <= OUTAGE_DB
 
-    def take(self, index: NDArray[Any]) -> "Measurements":
-        """Return the links that an index array or a mask (N,) selects."""
-        return Measurements(self.tx[index], self.rx[index], self.gain_db[index])
-
 
 def measurements_of(source: Any) -> Measurements:
     """Read measurements.
@@ -96,12 +95,8 @@ def measurements_of(source: Any) -> Measurements:
         given, source = f"measurements '{source}'", _read_csv(Path(source))
     gain_db = _field(source, "gain_db")
     if gain_db is None:
-        raise MeasurementError(f"gain_db is missing from {given}: {_give()}")
-    return Measurements(_place(source, "tx"), _place(source, "rx"), gain_db)
-
-
-def _give() -> str:
-    return f"give {_ACCEPTED} with the columns {_CSV_COLUMNS}."
+        raise MeasurementError(f"gain_db is missing from {given}: {_GIVE}")
+    return Measurements(_ends(source, "tx"), _ends(source, "rx"), gain_db)
 
 
 def _field(source: Any, name: str) -> Any:
@@ -112,14 +107,14 @@ def _field(source: Any, name: str) -> Any:
         return None
 
 
-def _place(source: Any, name: str) -> Any:
+def _ends(source: Any, name: str) -> Any:
     """Return positions (N, 3), from one field or from one for each axis."""
-    places = _field(source, name)
-    if places is not None:
-        return places
+    positions = _field(source, name)
+    if positions is not None:
+        return positions
     x, y, z = (_field(source, f"{name}_{axis}") for axis in "xyz")
     if x is None or y is None:
-        raise MeasurementError(f"{name} is missing from the measurements: {_give()}")
+        raise MeasurementError(f"{name} is missing from the measurements: {_GIVE}")
     columns = [_numbers(f"{name}_{axis}", values) for axis, values in zip("xy", (x, y), strict=True)]
     columns.append(np.full_like(columns[0], DEFAULT_HEIGHT_M) if z is None else _numbers(f"{name}_z", z))
     if len({column.shape for column in columns}) > 1:
@@ -128,31 +123,26 @@ def _place(source: Any, name: str) -> Any:
     return np.stack(columns, axis=-1)
 
 
-def _read_csv(path: Path) -> dict[str, NDArray[np.float64]]:
+def _read_csv(path: Path) -> dict[str, list[float]]:
     """Read those columns of a CSV that measurements have."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as stream:
             header, *rows = list(csv.reader(stream, skipinitialspace=True)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeasurementError(f"measurements = '{path}' cannot be read ({error}): {_give()}") from error
-    lines = [(line, row) for line, row in enumerate(rows, 2) if row]
-    places = {name.strip(): place for place, name in enumerate(header) if name.strip() in _CSV_COLUMNS.split(", ")}
-    return {
-        name: np.array([_cell(path, name, line, row[place : place + 1]) for line, row in lines], dtype=np.float64)
-        for name, place in places.items()
-    }
-
-
-def _cell(path: Path, name: str, line: int, cell: list[str]) -> float:
-    """Return the number in a cell, which a short line lacks."""
-    try:
-        return float(cell[0])
-    except (IndexError, ValueError) as error:
-        text = cell[0] if cell else ""
-        raise MeasurementError(
-            f"measurements = '{path}', line {line}: {name} = {text!r} is not a number: correct the line, or leave it "
-            "out."
-        ) from error
+        raise MeasurementError(f"measurements = '{path}' cannot be read ({error}): {_GIVE}") from error
+    columns = {column: name.strip() for column, name in enumerate(header) if name.strip() in _CSV_COLUMNS}
+    found: dict[str, list[float]] = {name: [] for name in columns.values()}
+    for line, row in enumerate(rows, 2):
+        for column, name in columns.items() if row else ():
+            text = row[column] if column < len(row) else ""
+            try:
+                found[name].append(float(text))
+            except ValueError as error:
+                raise MeasurementError(
+                    f"measurements = '{path}', line {line}: {name} = {text!r} is not a number: correct the line, or "
+                    "leave it out."
+                ) from error
+    return found
 
 
 def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
@@ -167,21 +157,21 @@ def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
 
 
 def _positions(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
-    places = _numbers(name, values)
-    if places.shape == (3,):
-        places = np.tile(places, (count, 1))
-    if places.shape != (count, 3):
+    positions = _numbers(name, values)
+    if positions.shape == (3,):
+        positions = np.tile(positions, (count, 1))
+    if positions.shape != (count, 3):
         raise MeasurementError(
-            f"{name} has shape {places.shape} for {count} gains: give x, y, z of each link in metres, ({count}, 3)."
+            f"{name} has shape {positions.shape} for {count} gains: give x, y, z of each link in metres, ({count}, 3)."
         )
-    return places
+    return positions
 
 
 def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], remedy: str) -> None:
     """Raise a MeasurementError that names the first value that is not good."""
     if not good.all():
-        place = tuple(int(index) for index in np.argwhere(~good)[0])
+        first = tuple(int(index) for index in np.argwhere(~good)[0])
         more = f" (and {int((~good).sum()) - 1} more)" if (~good).sum() > 1 else ""
         raise MeasurementError(
-            f"{name}[{', '.join(map(str, place))}] = {values[place]:g}{more} is not allowed: {remedy}"
+            f"{name}[{', '.join(map(str, first))}] = {values[first]:g}{more} is not allowed: {remedy}"
         )

@@ -1,111 +1,95 @@
-"""Where to put a transmitter: gradient ascent with restarts over the free cells of a partial map."""
+"""Where to put a transmitter: positions compared by visibility, then traced and predicted, the best ones refined."""
 
+import json
 import math
 import os
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
-from sionna_partial.checkpoint import Checkpoint, run_fingerprint, write_json
-from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S
-from sionna_partial.differentiable.scene import DifferentiableScene
+from sionna_partial.checks import require, require_number, settings_or_default
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import PlacementArea, placement_area
-from sionna_partial.placement.climb import Climb, climb_on, smoothed_slope
-from sionna_partial.placement.objective import PlacementObjective
-from sionna_partial.placement.state import PlacementState
-from sionna_partial.placement.views import PlacementViews
-from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.settings import Objective, SceneSettings, TraceSettings, is_whole, require, require_number
-from sionna_partial.tracing.trace import Progress
+from sionna_partial.prediction.features import LinkFeatures, features_of_paths
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.tracing.trace import Progress, Tracer, checked_settings, nearest_m
 
 RECEIVERS = 120
-"""Largest number of receivers that the search looks at; the places that it ends at are judged by all of them."""
+"""Largest number of receivers during the search; the final positions are compared at all receivers."""
 
-SOFTNESS_DB = 6.0
-"""Spread of the gain that the search adds where the map is complete and the gain certain [dB]."""
+STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
+"""Number of positions that are traced first, and of those that are refined: fewest, most, and area for each [m^2].
+Fewer than 6 starts would miss the best room of a small home."""
 
-APART_M = 1.1
-"""Least distance between places that are looked at, or climbed from [m]."""
+STEPS_M = (0.6, 0.25)
+"""Distances at which the refinement tries neighbours, in turn [m]."""
 
-ALIKE = 0.6
-"""What a place loses that sees the same as one that is looked at already: much, so that those looked at differ."""
+_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
-STARTS, CLIMBS, STEPS = (6, 16), (1, 4), (1, 4)
-"""Between how many places a search looks at before it climbs, climbs, and steps of a climb.
+SIMILARITY_PENALTY = 0.6
+"""How much a start loses that sees the same receivers as one that is chosen already."""
 
-Fewer than 6 places would miss the best room of a small home, though 6 take more than a tenth of its exhaustive search.
-"""
-
-_CELL_M2 = 0.25
-"""Area of a place of an exhaustive search [m^2]."""
-
-_SHARE, _LOOKS_OF_STEP = 0.085, 6.0
-"""Share of an exhaustive search that a search may take, and how many looks a step takes."""
-
-_LOOK_OF_ALL, _RECEIVERS_OF_LOOK = 0.7, 400.0
-"""A look at n receivers takes 0.7 + n / 400 times as long as one at `RECEIVERS`."""
+FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
+"""Of the receivers, sorted by gain, the worst 5 % count in full, and linearly less up to 15 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class TransmitterPlacement:
-    """Where a transmitter should be, and how that was found.
+    """A position for a transmitter, and the search that found it.
 
     Parameters
     ----------
     position_m : (3,) float64 array
-        The best place that was found [m].
+        The best position that was found [m].
     score : float
         The objective there, at all receivers: the mean predicted coverage in [0, 1], or the gain of the worst tenth
         [dB].
     trajectory_m : (K, 3) float64 array
-        The way of the climb that led there [m].
+        Positions of the refinement that led there, from its start [m].
     scores : (K,) float64 array
-        The objective along it, as the search saw it: at some of the receivers, softened where the map is complete.
-    climbs : tuple of Climb
-        All climbs, in the order of their starts, from the best to the worst.
-    climb_scores : (C,) float64 array
-        The objective where each ended, at all receivers.
+        The objective along it, at some of the receivers. It rises.
     starts_m : (S, 3) float64 array
-        Places that were looked at to choose where climbs start [m].
+        Positions that were traced first [m].
     start_scores : (S,) float64 array
-        The objective there, as the search saw it.
-    objective : PlacementObjective
+        The objective there, at some of the receivers.
     rx_m : (N, 3) float64 array
         All receivers [m].
     weight : (N,) float64 array
-        How much each counts: 1 in free cells, the probability of being indoors in unknown ones.
+        Their weights: 1 in free cells, the probability of being indoors in unknown ones.
     values : (N,) float64 array
         P(gain > threshold) of each with the transmitter at `position_m`, or its mean gain [dB].
     spacing_m : float
         Distance between receivers [m].
     partial : PartialMap
-    settings : mapping
-        What the search was asked for, as plain data.
+    settings : PlacementSettings
+    provenance : dict
+        Predictor and settings of scene and trace, as plain data.
     """
 
     position_m: NDArray[np.float64]
     score: float
     trajectory_m: NDArray[np.float64]
     scores: NDArray[np.float64]
-    climbs: tuple[Climb, ...]
-    climb_scores: NDArray[np.float64]
     starts_m: NDArray[np.float64]
     start_scores: NDArray[np.float64]
-    objective: PlacementObjective
     rx_m: NDArray[np.float64]
     weight: NDArray[np.float64]
     values: NDArray[np.float64]
     spacing_m: float
     partial: PartialMap
-    settings: dict[str, Any]
+    settings: PlacementSettings
+    provenance: dict[str, Any]
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write position, score, ways and settings as JSON; equal placements give equal files.
+        """Write position, score, search and settings as JSON; equal placements give equal files.
 
         Parameters
         ----------
@@ -116,79 +100,47 @@ class TransmitterPlacement:
         OutputError
             If writing fails.
         """
-        record = {
-            "position_m": self.position_m.tolist(),
+        arrays = ("position_m", "trajectory_m", "scores", "starts_m", "start_scores")
+        record = {name: getattr(self, name).tolist() for name in arrays} | {
             "score": self.score,
-            "objective": self.objective.name,
-            "threshold_db": self.objective.threshold_db,
-            "trajectory_m": self.trajectory_m.tolist(),
-            "scores": self.scores.tolist(),
-            "climbs": [climb.record for climb in self.climbs],
-            "climb_scores": self.climb_scores.tolist(),
-            "starts_m": self.starts_m.tolist(),
-            "start_scores": self.start_scores.tolist(),
-            "settings": self.settings,
+            "settings": asdict(self.settings) | self.provenance,
         }
-        write_json(path, record)
+        with atomic_write(path, "w") as stream:
+            stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
 def place_transmitter(
     scene: PartialMap | str | Path,
     *,
-    objective: Objective = "coverage",
-    threshold_db: float = -100.0,
-    height_m: float = DEFAULT_HEIGHT_M,
-    seed: int = 0,
-    rx_height_m: float = DEFAULT_HEIGHT_M,
-    edge_smoothing_m: float = 0.25,
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
+    **options: Any,
 ) -> TransmitterPlacement:
-    """Find where a transmitter covers a partly known building best, as far as can be told from what is known.
+    """Find the transmitter position that covers a partly known building best, as predicted from what is known.
 
-    Places all over the free cells are compared by sight, without tracing. The best of them that see different things
-    are traced, and from the best of those climbs go along the slope of the objective; where one ends, another begins.
-    Each new place is traced again. What they find is judged at all receivers. Larger maps get more of all that.
+    Positions all over the free cells are compared by visibility, without tracing. The best of them that see different
+    receivers are traced and predicted, as `predict_map` does. Around the best of these, neighbours at 0.6 and 0.25 m
+    are tried; what they find is compared at all receivers. Larger maps get more of all that.
 
-    A transmitter stands in a free cell, at least 10 cm from known walls, and the way of a climb crosses neither walls
-    nor unknown cells. Receivers are 0.5 m apart wherever `predict_map` has some; one in a free cell counts 1, one in an
-    unknown cell the probability that it is indoors, which does not depend on the transmitter's place.
-
-    The gradient of the differentiable pipeline (`DifferentiableScene`) does not see paths appear and vanish, such as
-    the line of sight through a door. The slope of an objective that is averaged over `edge_smoothing_m` to each side
-    does: it comes from traces at both ends. The places that are tried along a slope, up to 1.5 m away, are traced, too.
+    A transmitter stands in a free cell, at least 10 cm from known walls. Receivers are 0.5 m apart wherever
+    `predict_map` has some; one in a free cell has weight 1, one in an unknown cell its probability of being indoors,
+    which does not depend on the transmitter.
 
     Parameters
     ----------
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
-    objective : {"coverage", "percentile"}
-        What is maximised, see `PlacementObjective`: the mean probability that the path gain exceeds `threshold_db`, or
-        the mean predicted gain of the worst tenth of the receivers [dB].
-    threshold_db : float
-        Path gain above which a receiver is covered [dB], in (-150, 0].
-    height_m : float
-        Height of the transmitter [m].
-    seed : int
-        Of the places that are compared. The same seed gives the same bytes.
-    rx_height_m : float
-        Height of the receivers [m].
-    edge_smoothing_m : float
-        How far to each side the objective is averaged for its slope, so that edges of visibility have one [m]. With 0
-        the slope is the gradient of the differentiable pipeline, which does not see them.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
-        Refraction and diffuse reflection must be off: such paths have no gradients.
-    checkpoint : path-like, optional
-        JSON file that is written after every step. A run that was stopped goes on from there when it is called again
-        with the same arguments, and ends with the same bytes; with others the file is refused.
     progress : callable, optional
-        Called as ``progress(share_done, message)``.
+        Called as ``progress(fraction_done, message)``.
+    **options
+        Fields of `sionna_partial.settings.PlacementSettings`: `objective` ("coverage", the default, or "percentile"),
+        `threshold_db` (-100 dB), `height_m` and `rx_height_m` (1.5 m), and `seed` (0).
 
     Returns
     -------
@@ -201,181 +153,172 @@ def place_transmitter(
     PositionError
         If a transmitter or a receiver can stand nowhere.
     SettingsError
-        For another objective, a threshold, height, seed or frequency out of range, or paths that only rays find.
+        For another objective, or a threshold, height, seed or frequency out of range.
     PredictorError
         If the predictor cannot be read.
     BackendError
         If LLVM or Sionna RT cannot be used.
-    OutputError
-        If the checkpoint cannot be written, or is of another search.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> home = sp.make_home(7)
+    >>> found = sp.place_transmitter(home, objective="coverage", threshold_db=-100.0)
+    >>> bool(home.state_at(found.position_m) == sp.CellState.FREE)
+    True
     """
-    wanted = PlacementObjective(objective, threshold_db)
+    settings = PlacementSettings(**options)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
-    require_number("edge_smoothing_m", edge_smoothing_m, 0.0, 10.0)
-    for name, value in (("height_m", height_m), ("rx_height_m", rx_height_m)):
-        _require_height(name, value, partial)
-    report = progress or (lambda share, message: None)
-    report(0.0, "building the scene")
-    differentiable = DifferentiableScene(
-        partial, predictor=predictor, trace_settings=trace_settings, scene_settings=scene_settings
-    )
-    report(0.05, "looking over the map")
-    model = None if partial.is_complete else differentiable.predictor
-    area = placement_area(partial, float(height_m), float(rx_height_m), model)
-    settings = {
-        "objective": wanted.name,
-        "threshold_db": float(wanted.threshold_db),
-        "height_m": float(height_m),
-        "seed": int(seed),
-        "rx_height_m": float(rx_height_m),
-        "edge_smoothing_m": float(edge_smoothing_m),
-        "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
-        "predictor_sha256": "" if model is None else model.fingerprint,
-        "scene_settings": asdict(differentiable.paths.scene_settings),
-        "trace_settings": asdict(differentiable.paths.settings),
-    }
-    state = PlacementState(Checkpoint(checkpoint, run_fingerprint(partial, settings)))
-    return _Search(differentiable, area, wanted).run(int(seed), settings, state, report)
-
-
-def _require_height(name: str, height_m: float, partial: PartialMap) -> None:
+    trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
+    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
+    trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     low_m, high_m = partial.height_range_m
-    require_number(name, height_m, low_m, high_m, open_low=True)
-    require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
+    for name in ("height_m", "rx_height_m"):
+        height_m = getattr(settings, name)
+        require_number(name, height_m, low_m, high_m, open_low=True)
+        require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
+    report = progress or (lambda fraction, message: None)
+    report(0.0, "building the scene")
+    model = None
+    if not partial.is_complete:
+        model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+    area = placement_area(partial, float(settings.height_m), float(settings.rx_height_m), model)
+    thinned = area.thinned(RECEIVERS)
+    with temporary_folder() as folder:
+        objective = _Objective(Tracer(partial, folder, trace_settings, scene_settings), model, settings)
+        report(0.1, "comparing positions")
+        starts_m = _starts(thinned, settings, trace_settings.frequency_hz)
+        start_scores = objective.scores(starts_m, thinned)
+        routes = _refined(objective, thinned, starts_m, start_scores, report)
+        report(0.9, "evaluating the best positions")
+        values = [objective.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
+    scores = [placement_score(each, area.weight, settings) for each in values]
+    best = int(np.argmax(scores))
+    report(1.0, "done")
+    return TransmitterPlacement(
+        position_m=routes[best][0][-1],
+        score=scores[best],
+        trajectory_m=routes[best][0],
+        scores=routes[best][1],
+        starts_m=starts_m,
+        start_scores=start_scores,
+        rx_m=area.rx_m,
+        weight=area.weight,
+        values=values[best],
+        spacing_m=area.spacing_m,
+        partial=partial,
+        settings=settings,
+        provenance={
+            "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
+            "predictor_sha256": "" if model is None else model.fingerprint,
+            "scene_settings": asdict(scene_settings),
+            "trace_settings": asdict(trace_settings),
+        },
+    )
 
 
-@dataclass(frozen=True)
-class Effort:
-    """How much is tried.
-
-    An exhaustive search on a grid of 0.5 m looks at a place for every quarter of a square metre, and from each at all
-    receivers. All looks of a search together shall take a tenth of that or less; a step takes about six. Areas that
-    are too small for six starts and a step get them all the same.
-
-    Parameters
-    ----------
-    starts : int
-        Places that are looked at.
-    climbs : int
-        Climbs at a time, from the best of them. Where one ends, another begins at the next best.
-    steps : int
-        Number of steps of all together.
-    """
-
-    starts: int
-    climbs: int
-    steps: int
-
-    @classmethod
-    def of_area(cls, area_m2: float, receivers: int) -> "Effort":
-        """Choose it for an area where a transmitter may stand [m^2], and a number of receivers."""
-        judging = _LOOK_OF_ALL + receivers / _RECEIVERS_OF_LOOK
-        looks = _SHARE * area_m2 / _CELL_M2 * judging - judging - 1.0
-        climbs = _between(looks / 30.0, CLIMBS)
-        return cls(_between(0.4 * looks, STARTS), climbs, _between(0.6 * looks / _LOOKS_OF_STEP / climbs, STEPS))
+def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDArray[np.float64]:
+    """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
+    if settings.objective == "percentile":
+        return prediction.gain_mean_db
+    covered = np.zeros(len(prediction.p_los))
+    for probability, mean_db, std_db in (
+        (prediction.p_los, prediction.gain_los_mean_db, prediction.gain_los_std_db),
+        (prediction.p_nlos, prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db),
+    ):
+        above_db = mean_db - settings.threshold_db
+        spread = ndtr(above_db / np.where(std_db > 0.0, std_db, 1.0))
+        covered += probability * np.where(std_db > 0.0, spread, above_db > 0.0)
+    return covered
 
 
-def _between(value: float, limits: tuple[int, int]) -> int:
-    return min(max(round(value), limits[0]), limits[1])
+def placement_score(values: NDArray[np.float64], weight: NDArray[np.float64], settings: PlacementSettings) -> float:
+    """Return the objective of receivers' values (N,) and weights (N,), rounded: threads change the last bits."""
+    fraction = weight / weight.sum()
+    if settings.objective == "coverage":
+        return round(float(values @ fraction), 5)
+    order = np.argsort(values, kind="stable")
+    ends = np.concatenate([[0.0], np.cumsum(fraction[order])])
+    return round(float(values[order] @ np.diff(_counted(ends)) / _counted(np.ones(1))[0]), 3)
+
+
+def _counted(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Integral of what the worst receivers count, from 0 to a fraction of them."""
+    falling = np.clip(fraction, FULL_FRACTION, LAST_FRACTION) - FULL_FRACTION
+    width = LAST_FRACTION - FULL_FRACTION
+    return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)
 
 
 @dataclass(frozen=True, eq=False)
-class _Search:
-    """One search: what it looks at, and what it looks for."""
+class _Objective:
+    """The objective at transmitter positions: links are traced and predicted."""
 
-    scene: DifferentiableScene
-    area: PlacementArea
-    objective: PlacementObjective
+    tracer: Tracer
+    model: Predictor | None
+    settings: PlacementSettings
 
-    def run(self, seed: int, settings: dict[str, Any], state: PlacementState, report: Progress) -> TransmitterPlacement:
-        """Look, climb and judge."""
-        thinned, effort = self.area.thinned(RECEIVERS), Effort.of_area(self.area.size_m2, len(self.area.rx_m))
-        softness_db = SOFTNESS_DB if self.scene.partial.is_complete else 0.0
-        views = PlacementViews(self.scene, thinned, replace(self.objective, softness_db=softness_db))
-        reach_m = settings["edge_smoothing_m"]
-        slope = smoothed_slope(self.area, views.scores, reach_m) if reach_m > 0.0 else views.slope
-        report(0.1, "comparing places")
-        if not len(state.starts_m):
-            starts_m = self._starts(seed, thinned, effort.starts)
-            state.keep(starts_m, views.scores(starts_m), [], 0)
-        while state.steps < effort.steps:
-            report(0.3 + 0.6 * state.steps / effort.steps, f"climbing, step {state.steps + 1} of {effort.steps}")
-            climbs = climb_on(self.area, _restarted(state, effort.climbs), views.scores, slope)
-            state.keep(state.starts_m, state.start_scores, climbs, state.steps + 1)
-        report(0.9, "judging what was found")
-        everyone = PlacementViews(self.scene, self.area, self.objective)
-        found = self._judge(state, settings, views if views.sees_as(everyone) else everyone)
-        report(1.0, "done")
-        return found
+    def values(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+        """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
+        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.tracer.settings.frequency_hz)
+        values = np.full(far.shape, 1.0 if self.settings.objective == "coverage" else 0.0)
+        if not far.any():
+            return values
+        features = []
+        for tx_m, kept in zip(positions_m, far, strict=True):
+            paths = self.tracer.paths(tx_m, area.rx_m[kept], lambda fraction, message: None)
+            phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
+            features.append(phi)
+        phi = LinkFeatures.concatenate(features)
+        prediction = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+        values[far] = link_values(prediction, self.settings)
+        return values
 
-    def _starts(self, seed: int, thinned: PlacementArea, count: int) -> NDArray[np.float64]:
-        """Choose the best places (S, 3) by sight that are some way apart [m]."""
-        places_m = self.area.places(seed)
-        reach_m = math.inf
-        if self.objective.name == "coverage":  # by Friis' formula
-            loss = 10.0 ** (-self.objective.threshold_db / 20.0)
-            reach_m = SPEED_OF_LIGHT_M_S / self.scene.paths.settings.frequency_hz / (4.0 * math.pi) * loss
-        seen = thinned.sight(places_m, reach_m)
-        scores = np.array([self.objective.score(values, thinned.weight) for values in seen])
-        return places_m[_best_that_differ(scores, seen, thinned.weight / thinned.weight.sum(), count)]
-
-    def _judge(self, state: PlacementState, settings: dict[str, Any], views: PlacementViews) -> TransmitterPlacement:
-        """Compare where the climbs ended, at all receivers."""
-        ends_m = np.stack([climb.trajectory_m[-1] for climb in state.climbs])
-        scores = views.scores(ends_m)
-        best = int(np.argmax(scores))
-        return TransmitterPlacement(
-            position_m=ends_m[best],
-            score=float(scores[best]),
-            trajectory_m=state.climbs[best].trajectory_m,
-            scores=state.climbs[best].scores,
-            climbs=tuple(state.climbs),
-            climb_scores=scores,
-            starts_m=state.starts_m,
-            start_scores=state.start_scores,
-            objective=self.objective,
-            rx_m=self.area.rx_m,
-            weight=self.area.weight,
-            values=views.values(ends_m[[best]])[0],
-            spacing_m=self.area.spacing_m,
-            partial=self.area.partial,
-            settings=settings,
-        )
+    def scores(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+        """Scores (P,) of positions (P, 3) [m]."""
+        return np.array([placement_score(each, area.weight, self.settings) for each in self.values(positions_m, area)])
 
 
-def _restarted(state: PlacementState, wanted: int) -> list[Climb]:
-    """Return the climbs, with new ones from the next best starts in place of those that have ended."""
-    starts = _best_apart(state.starts_m, state.start_scores, len(state.starts_m))
-    missing = wanted - sum(not climb.ended for climb in state.climbs)
-    new = starts[len(state.climbs) : len(state.climbs) + missing]
-    return [*state.climbs, *(Climb(state.starts_m[[index]], state.start_scores[[index]]) for index in new)]
-
-
-def _best_that_differ(
-    scores: NDArray[np.float64], seen: NDArray[np.float64], share: NDArray[np.float64], count: int
-) -> list[int]:
-    """Return the indices of good places of which each sees something else, at most `count`, the best first.
-
-    From the score of a place is taken off how much its view `seen` (C, N) is like one that was chosen already, in
-    units of the scores' spread.
-    """
-    chosen = [int(np.argmax(scores))]
-    alike = np.zeros(len(scores))
-    while len(chosen) < min(count, len(scores)):
-        alike = np.maximum(alike, 1.0 - np.abs(seen - seen[chosen[-1]]) @ share)
-        left = scores - ALIKE * alike
+def _starts(area: PlacementArea, settings: PlacementSettings, frequency_hz: float) -> NDArray[np.float64]:
+    """Choose positions (S, 3) [m] by visibility: a score is lowered by what the position sees of what others see."""
+    positions_m, range_m = area.positions(int(settings.seed)), math.inf
+    if settings.objective == "coverage":  # by Friis' formula
+        loss = 10.0 ** (-settings.threshold_db / 20.0)
+        range_m = SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi) * loss
+    seen = area.visibility(positions_m, range_m)
+    scores = np.array([placement_score(values, area.weight, settings) for values in seen])
+    fraction = area.weight / area.weight.sum()
+    chosen, similarity = [int(np.argmax(scores))], np.zeros(len(scores))
+    while len(chosen) < min(_per_area(area, *STARTS), len(scores)):
+        similarity = np.maximum(similarity, 1.0 - np.abs(seen - seen[chosen[-1]]) @ fraction)
+        left = scores - SIMILARITY_PENALTY * similarity
         left[chosen] = -math.inf
         chosen.append(int(np.argmax(left)))
-    return chosen
+    return positions_m[chosen]
 
 
-def _best_apart(places_m: NDArray[np.float64], scores: NDArray[np.float64], count: int) -> list[int]:
-    """Return the indices of the best places `APART_M` from each other, at most `count`, the best first."""
-    chosen: list[int] = []
-    for index in np.argsort(-scores, kind="stable"):
-        if all(np.linalg.norm(places_m[index] - places_m[other]) >= APART_M for other in chosen):
-            chosen.append(int(index))
-        if len(chosen) == count:
-            break
-    return chosen
+def _refined(
+    objective: _Objective,
+    area: PlacementArea,
+    starts_m: NDArray[np.float64],
+    start_scores: NDArray[np.float64],
+    report: Progress,
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Move the best starts to better neighbours: positions (K, 3) [m] and scores (K,) of each route."""
+    best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]
+    routes = [([starts_m[index]], [start_scores[index]]) for index in best]
+    for number, step_m in enumerate(STEPS_M):
+        report(0.4 + 0.5 * number / len(STEPS_M), f"refining, step {number + 1} of {len(STEPS_M)}")
+        neighbours_m = np.array([route_m[-1] for route_m, _ in routes])[:, None] + step_m * _DIRECTIONS
+        neighbours_m[..., :2] = np.round(neighbours_m[..., :2], 3)
+        stands = area.stands(neighbours_m)
+        scores = np.full(stands.shape, -math.inf)
+        scores[stands] = objective.scores(neighbours_m[stands], area)
+        for (route_m, route_scores), around_m, around_scores in zip(routes, neighbours_m, scores, strict=True):
+            if around_scores.max() > route_scores[-1]:
+                route_m.append(around_m[around_scores.argmax()])
+                route_scores.append(around_scores.max())
+    return [(np.array(route_m), np.array(route_scores)) for route_m, route_scores in routes]
+
+
+def _per_area(area: PlacementArea, fewest: int, most: int, each_m2: float) -> int:
+    return min(max(round(area.size_m2 / each_m2), fewest), most)

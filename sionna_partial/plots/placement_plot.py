@@ -1,4 +1,4 @@
-"""Pictures of how a place for a transmitter was found."""
+"""Figure of a transmitter's placement: the map, the search, and the predicted coverage."""
 
 from typing import Any
 
@@ -11,11 +11,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import PercentFormatter
 
+from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.style import BLUE, RED, corners_m, shade, window_m
-from sionna_partial.settings import require
+from sionna_partial.plots.style import RED, corners_m, shade, window_m
 
 _WIDTH_IN, _DPI = 9.0, 130
 _WALL, _UNKNOWN = "black", "0.86"
@@ -23,10 +23,10 @@ _STAR: dict[str, Any] = {"marker": "*", "markersize": 15, "markerfacecolor": "wh
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
-    """Draw the map, the places that were looked at, the climbs, and the best place with what it covers.
+    """Draw the map, the positions that were traced first, the refinement, and the best position with its coverage.
 
     Squares are receivers, in the colour of their probability of being covered from there (or of their mean gain), the
-    paler the less likely they are indoors. The way to the best place is red, other climbs are blue.
+    paler the less likely they are indoors. The refinement that led to the best position is red.
 
     Parameters
     ----------
@@ -53,8 +53,8 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     squares = _draw_receivers(axis, placement)
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
-    coverage = placement.objective.name == "coverage"
-    label = f"probability of more than {placement.objective.threshold_db:g} dB" if coverage else "mean path gain [dB]"
+    coverage = placement.settings.objective == "coverage"
+    label = f"probability of more than {placement.settings.threshold_db:g} dB" if coverage else "mean path gain [dB]"
     bar = figure.colorbar(squares, ax=axis, label=label, shrink=0.8)
     if coverage:
         bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
@@ -65,7 +65,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
 def _headline(placement: TransmitterPlacement) -> str:
     x, y, z = placement.position_m
     score = placement.score
-    if placement.objective.name == "coverage":
+    if placement.settings.objective == "coverage":
         return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, predicted coverage {score:.1%}"
     return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, worst tenth at {score:.1f} dB"
 
@@ -90,7 +90,7 @@ def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollect
     """Draw a square for each receiver, and return them as what the colour scale is for."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
-    coverage = placement.objective.name == "coverage"
+    coverage = placement.settings.objective == "coverage"
     norm = Normalize(0.0, 1.0) if coverage else Normalize(-150.0, -60.0)
     squares = PatchCollection(patches, cmap="viridis", norm=norm, linewidths=0.0, zorder=1)
     squares.set_array(placement.values)
@@ -104,10 +104,8 @@ def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollect
 def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
     x, y = placement.starts_m[:, :2].T
     axis.scatter(x, y, s=26, facecolors="white", edgecolors="black", linewidths=1.0, zorder=4)
-    for climb in placement.climbs:
-        won = np.array_equal(climb.trajectory_m, placement.trajectory_m)
-        x, y = climb.trajectory_m[:, :2].T
-        axis.plot(x, y, color=RED if won else BLUE, marker="o", markersize=4, linewidth=1.8, zorder=5 if won else 4.5)
+    x, y = placement.trajectory_m[:, :2].T
+    axis.plot(x, y, color=RED, marker="o", markersize=4, linewidth=1.8, zorder=5)
     x, y = placement.position_m[:2]
     axis.plot(x, y, linestyle="none", zorder=6, **_STAR)
 
@@ -115,11 +113,8 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
 def _add_legend(figure: Figure) -> None:
     handles = [
         Line2D([], [], linestyle="none", label="transmitter", **_STAR),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="way there"),
-        Line2D([], [], color=BLUE, marker="o", markersize=4, label="other climb"),
-        Line2D(
-            [], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="looked at"
-        ),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
+        Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
         Patch(color=_WALL, label="wall"),
         Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
     ]

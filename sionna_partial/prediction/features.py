@@ -1,23 +1,23 @@
-"""What the predictor sees of a link: TracedLinks + PartialMap -> LinkFeatures."""
+"""Features of links: TracedLinks + PartialMap -> LinkFeatures."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.errors import PositionError, PredictorError
+from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.prediction.link_context import ContextSums, LinkContext
-from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.prediction.link_context import IndirectPaths, LinkContext
+from sionna_partial.prediction.unobserved import Bools, Floats, unobserved_lengths_m
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import TracedLinks, link_summary
 
 
 @dataclass(frozen=True, eq=False)
 class LinkFeatures:
-    """Features of N links: those of the paper (eq. 8), and where the links run.
+    """Features of N links: those of the paper (eq. 8), and what the other predictors need beside them.
 
     Parameters
     ----------
@@ -30,18 +30,26 @@ class LinkFeatures:
     gain_db : (N,) float64 array
         Omnidirectional path gain traced on the partial map [dB], at least -150.
     context : LinkContext, optional
-        What the map shows along and around the links; `link_features` gives it. The paper's predictor does not use it.
+        What the map shows along and around the links, as arrays, from `link_features`. The paper's predictor does not
+        use it.
 
     Raises
     ------
     PredictorError
         For arrays of other shapes, or with values that no link has.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> phi = sp.LinkFeatures([1, 0], unobserved_distance_m=[0.0, 2.5], distance_m=[3.0, 6.0], gain_db=[-71.0, -150.0])
+    >>> len(phi)
+    2
     """
 
     link_state: NDArray[np.uint8]
-    unobserved_distance_m: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    gain_db: NDArray[np.float64]
+    unobserved_distance_m: Floats
+    distance_m: Floats
+    gain_db: Floats
     context: LinkContext | None = None
 
     def __post_init__(self) -> None:
@@ -49,11 +57,11 @@ class LinkFeatures:
         object.__setattr__(self, "link_state", link_states("link_state", self.link_state, count))
         for name in ("distance_m", "unobserved_distance_m", "gain_db"):
             object.__setattr__(self, name, link_numbers(name, getattr(self, name), count))
-        _require(self.distance_m >= 0.0, "distance_m", self.distance_m, "a distance is not negative.")
+        require_each(self.distance_m >= 0.0, "distance_m", self.distance_m, "a distance is not negative.")
         inside = (self.unobserved_distance_m >= 0.0) & (self.unobserved_distance_m <= self.distance_m)
-        _require(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
+        require_each(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
         remedy = f"clip gains at {GAIN_FLOOR_DB:g} dB, the gain of an outage."
-        _require(self.gain_db >= GAIN_FLOOR_DB, "gain_db", self.gain_db, remedy)
+        require_each(self.gain_db >= GAIN_FLOOR_DB, "gain_db", self.gain_db, remedy)
         if self.context is not None and len(self.context) != count:
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
 
@@ -73,53 +81,40 @@ class LinkFeatures:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
-        return cls(
-            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in _PAPER}, context=context
-        )
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PAPER}
+        return cls(**columns, context=context)
+
+    def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
+        """Return the features with what map networks read of the maps; `map_index` (N,) is the map of each link."""
+        if self.context is None or self.context.windows is not None:
+            return self
+        return replace(self, context=self.context.with_windows(maps, map_index))
 
 
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name != "context")
 
 
-def link_numbers(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
-    """Check numbers of links and return them as an array.
-
-    Parameters
-    ----------
-    name : str
-        What they are, for the message.
-    values : (count,) array-like
-    count : int
-        Number of links.
-
-    Returns
-    -------
-    (count,) float64 array
-
-    Raises
-    ------
-    PredictorError
-        For another shape, or a value that is not a finite number.
-    """
+def link_numbers(name: str, values: ArrayLike, count: int) -> Floats:
+    """Return numbers of links as a (count,) array; a PredictorError for another shape, or what is not finite."""
     try:
         numbers = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise PredictorError(f"{name} = {values!r} is not numeric: give an array of {count} numbers.") from error
     if numbers.shape != (count,):
         raise PredictorError(f"{name} has shape {numbers.shape}: give one number for each of the {count} links.")
-    _require(np.isfinite(numbers), name, numbers, "give finite numbers.")
+    require_each(np.isfinite(numbers), name, numbers, "give finite numbers.")
     return numbers
 
 
 def link_states(name: str, values: ArrayLike, count: int) -> NDArray[np.uint8]:
-    """Check link states and return them as a (count,) uint8 array; arguments and errors as for `link_numbers`."""
+    """Return link states as a (count,) uint8 array; a PredictorError for another shape, or what is none."""
     states = link_numbers(name, values, count)
     known = ", ".join(f"{state.name} {state.value}" for state in LinkState)
-    _require(np.isin(states, [*LinkState]), name, states, f"use LinkState: {known}.")
+    require_each(np.isin(states, [*LinkState]), name, states, f"use LinkState: {known}.")
     return states.astype(np.uint8)
 
 
-def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
+def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = True) -> LinkFeatures:
     """Extract the features of traced links (paper, eq. 8).
 
     Parameters
@@ -128,6 +123,8 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
         The map on which the links were traced.
     links : TracedLinks
         From one or T transmitters to N receivers.
+    windows : bool
+        Whether to draw the map around the transmitters, which only the predictor "map" needs (20 ms each).
 
     Returns
     -------
@@ -141,81 +138,41 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     """
     require_map("partial", partial)
     transmitters = links.tx.reshape(-1, 3)
-    sums = ContextSums(partial, transmitters, links.rx)
-    sums.add(links)
-    return LinkFeatures(
-        link_state=links.link_state.ravel(),
-        unobserved_distance_m=np.concatenate([unobserved_distance_m(partial, tx, links.rx) for tx in transmitters]),
-        distance_m=_distance_m(transmitters[:, None], links.rx).ravel(),
-        gain_db=links.gain_db.ravel(),
-        context=sums.context(),
-    )
+    paths = IndirectPaths(partial, transmitters, links.rx)
+    paths.add(links)
+    link_state = links.link_state.ravel()
+    unobserved_m = np.concatenate([unobserved_lengths_m(partial, tx, links.rx) for tx in transmitters])
+    distance_m = np.linalg.norm(links.rx - transmitters[:, None], axis=-1).ravel()
+    context = paths.context(link_state, unobserved_m)
+    phi = LinkFeatures(link_state, unobserved_m, distance_m, links.gain_db.ravel(), context)
+    return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
 
 
 def features_of_paths(
-    partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], blocks: Iterable[SolvedPaths]
+    partial: PartialMap, tx_m: Floats, rx_m: Floats, blocks: Iterable[SolvedPaths], *, context: bool = True
 ) -> LinkFeatures:
-    """Extract the features of N links while their paths are traced, without keeping any path.
+    """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
-    Parameters
-    ----------
-    partial : PartialMap
-        The map on which the links are traced.
-    tx_m, rx_m : (3,) and (N, 3) float64 arrays
-        Transmitter and receivers [m].
-    blocks : iterable of SolvedPaths
-        All paths between them, from `Tracer.paths`.
+    `blocks` are all paths between them, from `Tracer.paths`. The paper's predictor needs no context.
     """
-    power, is_direct, sums = np.zeros(len(rx_m)), np.zeros(len(rx_m), bool), ContextSums(partial, tx_m[None], rx_m)
+    power, is_direct = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool)
+    indirect = IndirectPaths(partial, tx_m[None], rx_m)
     for paths in blocks:
         np.add.at(power, paths.path_rx, np.abs(paths.a) ** 2)
         is_direct[paths.path_rx[paths.is_direct]] = True
-        sums.add(paths)
+        if context:
+            indirect.add(paths)
     link_state, gain_db = link_summary(power, is_direct)
-    unobserved_m = unobserved_distance_m(partial, tx_m, rx_m)
-    return LinkFeatures(link_state, unobserved_m, _distance_m(tx_m, rx_m), gain_db, sums.context())
+    unobserved_m, distance_m = unobserved_lengths_m(partial, tx_m, rx_m), np.linalg.norm(rx_m - tx_m, axis=-1)
+    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db)
+    if not context:
+        return phi
+    phi = replace(phi, context=indirect.context(link_state, unobserved_m))
+    return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64))
 
 
-def unobserved_distance_m(partial: PartialMap, tx: ArrayLike, rx: ArrayLike) -> NDArray[np.float64]:
-    """Measure how much of the direct line has not been observed: d_unobs of the paper (Section III-C).
-
-    This is the length of the segment from transmitter to receiver inside unknown cells, exact to rounding. Everything
-    outside the grid is unknown. On a complete map nothing unknown can be reached from a known cell, and the length
-    is 0 by definition where an end is in one.
-    A segment along the border of cells is in the freest of them, as in `PartialMap.state_at`.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    tx : (3,) array-like
-        Transmitter position [m].
-    rx : (N, 3) array-like
-        Receiver positions [m]; N may be 0.
-
-    Returns
-    -------
-    (N,) float64 array
-        Between 0 and the distance of transmitter and receiver [m].
-
-    Raises
-    ------
-    PositionError
-        For another shape, or a position that is not finite.
-    """
-    tx_m, rx_m = np.asarray(tx, dtype=np.float64), np.asarray(rx, dtype=np.float64)
-    for name, points, shape in (("tx", tx_m, "(3,)"), ("rx", rx_m, "(N, 3)")):
-        if points.shape[-1:] != (3,) or points.ndim != (1 if name == "tx" else 2):
-            raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, {shape}.")
-        if not np.isfinite(points).all():
-            raise PositionError(f"{name} holds a position that is not finite: give finite numbers in metres.")
-    return unobserved_lengths_m(partial, tx_m, rx_m)
-
-
-def _distance_m(tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.linalg.norm(rx_m - tx_m, axis=-1)
-
-
-def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], remedy: str) -> None:
+def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
+    """Raise a PredictorError that names the first value that is not good."""
     if not good.all():
         index = int(np.argmin(good))
         raise PredictorError(f"{name}[{index}] = {values[index]:g} is not allowed: {remedy}")

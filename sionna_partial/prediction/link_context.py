@@ -1,22 +1,32 @@
-"""Where links run: what their paths cross, and the maps around them. TracedLinks + PartialMap -> LinkContext."""
+"""What is known of links beside the paper's features, as arrays: TracedLinks + PartialMap -> LinkContext."""
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from sionna_partial.constants import CellState
-from sionna_partial.errors import PredictorError
+from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.unobserved import is_enclosed, unobserved_lengths_m, walled_lengths_m
+from sionna_partial.prediction.unobserved import (
+    GRAZE,
+    Bools,
+    Floats,
+    in_cells,
+    is_enclosed,
+    map_line_fractions,
+    unobserved_lengths_m,
+    walled_lengths_m,
+)
+from sionna_partial.prediction.windows import draw_windows, transmitters
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import TracedLinks, path_gain_db
 
-REACHES_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
-"""How far paths are taken to get through unobserved space [m]: a path that crosses u of it counts exp(-u / reach)."""
+ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
+"""Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
 
 _PATHS_AT_ONCE = 100_000
 """Number of paths that are measured together, which bounds the memory."""
@@ -24,128 +34,124 @@ _PATHS_AT_ONCE = 100_000
 SEEN_M = 1e-3
 """Unobserved length below which a path is wholly in observed space [m]."""
 
+_ASIDE_CELLS = 1.5
+"""How far to both sides a line has to run into known walls to cross one: the uncertainty of a map [cells]."""
+
 
 @dataclass(frozen=True, eq=False)
 class LinkContext:
-    """What the map shows along and around N links, beyond the paper's features.
+    """What the paths of N links cross, what the map leaves possible, and what it shows around their transmitters.
 
     Parameters
     ----------
-    maps : tuple of M PartialMap
-        The maps on which the links were traced.
-    map_index : (N,) int64 array
-        Which of them is each link's.
     tx_m, rx_m : (N, 3) float64 arrays
         Positions of transmitter and receiver [m].
-    indirect_gain_db : (N, R) float64 array
-        Gain of all traced paths but the direct one, each path weakened by the unobserved space that it crosses, for
-        each of `REACHES_M` [dB], at least -150: of all of them first, of those wholly in observed space last.
+    tx_seen, rx_seen : (N,) bool arrays
+        Whether they are in observed cells.
+    complete : (N,) bool array
+        Whether the map is complete, and one of the ends is in an observed cell: then the trace is the truth.
+    walled_m : (N,) float64 array
+        Length of the direct line in cells of known walls [m]: outlines of walls may leave them open.
+    possible : (N, 3) bool array
+        Whether the map leaves each LinkState possible; at least one is.
+    indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
+        Gain of all traced paths but the direct one, each attenuated by the unobserved space that it crosses [dB], at
+        least -150: of all of them first, of those wholly in observed space last.
     strongest_unobserved_m : (N,) float64 array
         Unobserved length of the strongest path but the direct one [m]; the distance where there is none.
-
-    Raises
-    ------
-    PredictorError
-        For arrays of other shapes, or a map that is not there.
+    windows : (W, *WINDOWS) uint8 array, optional
+        What the map networks read around the transmitters.
+    window_index : (N,) int array
+        The transmitter, and window, of each link.
     """
 
-    maps: tuple[PartialMap, ...]
-    map_index: NDArray[np.int64]
-    tx_m: NDArray[np.float64]
-    rx_m: NDArray[np.float64]
-    indirect_gain_db: NDArray[np.float64]
-    strongest_unobserved_m: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        count = len(self.map_index)
-        shapes = {"tx_m": (3,), "rx_m": (3,), "indirect_gain_db": (len(REACHES_M),), "strongest_unobserved_m": ()}
-        for name, shape in shapes.items():
-            found = np.shape(getattr(self, name))
-            if found != (count, *shape):
-                raise PredictorError(f"{name} has shape {found}: give {(count, *shape)}, a row for each link.")
-        there = (self.map_index >= 0) & (self.map_index < len(self.maps))
-        if not there.all():
-            index = int(np.argmin(there))
-            raise PredictorError(
-                f"map_index[{index}] = {self.map_index[index]} is not allowed: give places in maps, which has "
-                f"{len(self.maps)}, from 0."
-            )
+    tx_m: Floats
+    rx_m: Floats
+    tx_seen: Bools
+    rx_seen: Bools
+    complete: Bools
+    walled_m: Floats
+    possible: Bools
+    indirect_gain_db: Floats
+    strongest_unobserved_m: Floats
+    window_index: NDArray[np.intp]
+    windows: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         """Return the number of links N."""
-        return len(self.map_index)
+        return len(self.tx_m)
 
-    @cached_property
-    def tx_seen(self) -> NDArray[np.bool_]:
-        """Whether each transmitter (N,) is in an observed cell of its map."""
-        return self._seen(self.tx_m)
+    @classmethod
+    def on_maps(
+        cls,
+        maps: Sequence[PartialMap],
+        map_index: NDArray[np.int64],
+        *,
+        tx_m: Floats,
+        rx_m: Floats,
+        link_state: NDArray[np.uint8],
+        unobserved_distance_m: Floats,
+        indirect_gain_db: Floats,
+        strongest_unobserved_m: Floats,
+    ) -> "LinkContext":
+        """Compute what the maps show of links, without windows.
 
-    @cached_property
-    def rx_seen(self) -> NDArray[np.bool_]:
-        """Whether each receiver (N,) is in an observed cell of its map."""
-        return self._seen(self.rx_m)
+        `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`.
+        """
+        count = len(map_index)
+        tx_seen, rx_seen, complete = (np.zeros(count, dtype=bool) for _ in range(3))
+        walled_m, possible = np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
+        for number in np.unique(map_index):
+            here, partial = map_index == number, maps[number]
+            ends = tx_m[here], rx_m[here]
+            tx_seen[here], rx_seen[here] = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in ends)
+            complete[here] = is_enclosed(partial, *ends)
+            walled_m[here] = walled_lengths_m(partial, *ends)
+            seen, walled = unobserved_distance_m[here] == 0.0, walled_m[here] > 0.0
+            possible[here] = _possible_states(partial, ends, link_state[here], seen, walled)
+        found = (tx_seen, rx_seen, complete, walled_m, possible)
+        _, window_index = transmitters(map_index, tx_m)
+        return cls(tx_m, rx_m, *found, indirect_gain_db, strongest_unobserved_m, window_index)
 
-    @cached_property
-    def walled_m(self) -> NDArray[np.float64]:
-        """Length of the direct line of each link (N,) in cells of known walls [m]: outlines may leave them open."""
-        walled_m = np.zeros(len(self))
-        for number in np.unique(self.map_index):
-            here = self.map_index == number
-            walled_m[here] = walled_lengths_m(self.maps[number], self.tx_m[here], self.rx_m[here])
-        return walled_m
-
-    @cached_property
-    def complete(self) -> NDArray[np.bool_]:
-        """Whether the map of each link (N,) is complete, and knows one of its ends."""
-        complete = np.array([each.is_complete for each in self.maps], dtype=bool)[self.map_index]
-        return complete & (self.tx_seen | self.rx_seen)
+    def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkContext":
+        """Return the context with the windows of the maps that `on_maps` was given."""
+        keys, window_index = transmitters(map_index, self.tx_m)
+        return replace(self, windows=draw_windows(maps, keys), window_index=window_index)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
-        """Return the links that an index array, a mask (N,) or a slice selects."""
-        return LinkContext(self.maps, *(getattr(self, name)[index] for name in _COLUMNS))
+        """Return the links that an index array, a mask (N,) or a slice selects; the windows are shared."""
+        return LinkContext(**{name: getattr(self, name)[index] for name in _COLUMNS}, windows=self.windows)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkContext"]) -> "LinkContext":
-        """Return the links of all `parts`, one part after the other."""
-        if not parts:
-            raise PredictorError("parts is empty: give at least one LinkContext.")
-        places: dict[int, int] = {}
-        maps: list[PartialMap] = []
-        index = []
+        """Return the links of all `parts`, one part after the other; without windows unless all parts have them."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
+        first: dict[int, int] = {}
+        index, windows, count = [], [], 0
         for part in parts:
-            for each in part.maps:
-                if places.setdefault(id(each), len(maps)) == len(maps):
-                    maps.append(each)
-            index.append(np.array([places[id(each)] for each in part.maps], dtype=np.int64)[part.map_index])
-        columns = (np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS[1:])
-        return cls(tuple(maps), np.concatenate(index), *columns)
-
-    def _seen(self, places_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        seen = np.zeros(len(self), dtype=bool)
-        for number in np.unique(self.map_index):
-            here = self.map_index == number
-            seen[here] = self.maps[number].state_at(places_m[here]) != CellState.UNKNOWN
-        return seen
+            key = id(part if part.windows is None else part.windows)
+            if key not in first:
+                first[key] = count
+                count += part.window_index.max(initial=-1) + 1 if part.windows is None else len(part.windows)
+                windows.append(part.windows)
+            index.append(part.window_index + first[key])
+        columns["window_index"] = np.concatenate(index)
+        drawn = [each for each in windows if each is not None]
+        if len(drawn) < len(windows):
+            return cls(**columns)
+        return cls(**columns, windows=drawn[0] if len(drawn) == 1 else np.concatenate(drawn))
 
 
-_COLUMNS = ("map_index", "tx_m", "rx_m", "indirect_gain_db", "strongest_unobserved_m")
+_COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "windows")
 
 
-class ContextSums:
-    """What the paths of links cross, summed up while they are traced.
+class IndirectPaths:
+    """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced."""
 
-    Parameters
-    ----------
-    partial : PartialMap
-        The map on which the links are traced.
-    tx_m, rx_m : (T, 3) and (N, 3) float64 arrays
-        Transmitters and receivers [m].
-    """
-
-    def __init__(self, partial: PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> None:
+    def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats) -> None:
         self._partial, self._tx_m, self._rx_m = partial, tx_m, rx_m
         count = len(tx_m) * len(rx_m)
-        self._power, self._strongest = np.zeros((len(REACHES_M), count)), np.zeros(count)
+        self._power, self._strongest = np.zeros((len(ATTENUATION_LENGTHS_M), count)), np.zeros(count)
         self._strongest_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
 
     def add(self, paths: TracedLinks | SolvedPaths) -> None:
@@ -154,21 +160,13 @@ class ContextSums:
             block = slice(start, start + _PATHS_AT_ONCE)
             indirect = start + np.flatnonzero(np.any(paths.interactions[block] > 0, axis=1))
             tx, rx = paths.path_tx[indirect], paths.path_rx[indirect]
-            self._add(
-                tx.astype(np.int64) * len(self._rx_m) + rx,
-                np.abs(paths.a[indirect]) ** 2,
-                path_unobserved_m(
-                    self._partial,
-                    self._tx_m[tx],
-                    paths.interactions[indirect],
-                    paths.vertices_m[indirect],
-                    self._rx_m[rx],
-                ),
-            )
+            interactions, vertices_m = paths.interactions[indirect], paths.vertices_m[indirect]
+            unobserved_m = path_unobserved_m(self._partial, self._tx_m[tx], interactions, vertices_m, self._rx_m[rx])
+            self._add(tx.astype(np.int64) * len(self._rx_m) + rx, np.abs(paths.a[indirect]) ** 2, unobserved_m)
 
-    def _add(self, link: NDArray[np.int64], power: NDArray[np.float64], unobserved_m: NDArray[np.float64]) -> None:
-        for total, reach in zip(self._power, REACHES_M, strict=True):
-            np.add.at(total, link, power * kept_shares(unobserved_m, reach))
+    def _add(self, link: NDArray[np.int64], power: Floats, unobserved_m: Floats) -> None:
+        for total, length_m in zip(self._power, ATTENUATION_LENGTHS_M, strict=True):
+            np.add.at(total, link, power * attenuation(unobserved_m, length_m))
         order = np.argsort(power, kind="stable")
         strongest = np.full(len(self._strongest), -1)
         strongest[link[order]] = order
@@ -176,54 +174,108 @@ class ContextSums:
         links = links[power[strongest[links]] >= self._strongest[links]]
         self._strongest[links], self._strongest_m[links] = power[strongest[links]], unobserved_m[strongest[links]]
 
-    def context(self) -> LinkContext:
-        """Return the context of all T N links, transmitter by transmitter."""
-        tx_m = np.repeat(self._tx_m, len(self._rx_m), axis=0)
-        rx_m = np.tile(self._rx_m, (len(self._tx_m), 1))
-        gains_db = np.stack([path_gain_db(total) for total in self._power], axis=1)
-        return LinkContext((self._partial,), np.zeros(len(tx_m), np.int64), tx_m, rx_m, gains_db, self._strongest_m)
+    def context(self, link_state: NDArray[np.uint8], unobserved_distance_m: Floats) -> LinkContext:
+        """Return the context of all T N links, transmitter by transmitter, without windows."""
+        tx_m, rx_m = np.repeat(self._tx_m, len(self._rx_m), axis=0), np.tile(self._rx_m, (len(self._tx_m), 1))
+        return LinkContext.on_maps(
+            (self._partial,),
+            np.zeros(len(tx_m), dtype=np.int64),
+            tx_m=tx_m,
+            rx_m=rx_m,
+            link_state=link_state,
+            unobserved_distance_m=unobserved_distance_m,
+            indirect_gain_db=np.stack([path_gain_db(total) for total in self._power], axis=1),
+            strongest_unobserved_m=self._strongest_m,
+        )
 
 
 def path_unobserved_m(
-    partial: PartialMap,
-    start_m: NDArray[np.float64],
-    interactions: NDArray[np.uint8],
-    vertices_m: NDArray[np.float64],
-    end_m: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Measure the length of paths in unknown cells.
+    partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
+) -> Floats:
+    """Return the length (P,) [m] of paths in unknown cells; 0 for links that a complete map encloses.
 
-    Parameters
-    ----------
-    partial : PartialMap
-    start_m, end_m : (P, 3) float64 arrays
-        Ends of the paths [m].
-    interactions : (P, D) uint8 array
-        0 where there is none.
-    vertices_m : (P, D, 3) float64 array
-        Places of the interactions [m].
-
-    Returns
-    -------
-    (P,) float64 array
-        [m]; 0 for links that a complete map encloses.
+    They lead from `start_m` (P, 3) by `vertices_m` (P, D, 3), where `interactions` (P, D) is not 0, to `end_m` (P, 3).
     """
     total_m = np.zeros(len(start_m))
-    crossing = ~is_enclosed(partial, start_m, end_m)
-    if not crossing.all():
-        rows = np.flatnonzero(crossing)
-        if len(rows):
-            total_m[rows] = path_unobserved_m(partial, start_m[rows], interactions[rows], vertices_m[rows], end_m[rows])
-        return total_m
-    here_m = start_m.copy()
-    for depth in range(interactions.shape[1]):
-        bends = np.flatnonzero(interactions[:, depth])
-        there_m = vertices_m[bends, depth]
-        total_m[bends] += unobserved_lengths_m(partial, here_m[bends], there_m)
-        here_m[bends] = there_m
-    return total_m + unobserved_lengths_m(partial, here_m, end_m)
+    rows = np.flatnonzero(~is_enclosed(partial, start_m, end_m))
+    here_m = start_m[rows]
+    for depth in range(interactions.shape[1] if len(rows) else 0):
+        there = interactions[rows, depth] > 0
+        there_m = vertices_m[rows[there], depth]
+        total_m[rows[there]] += unobserved_lengths_m(partial, here_m[there], there_m)
+        here_m[there] = there_m
+    total_m[rows] += unobserved_lengths_m(partial, here_m, end_m[rows])
+    return total_m
 
 
-def kept_shares(unobserved_m: NDArray[np.float64], reach_m: float) -> NDArray[np.float64]:
-    """Return the share (P,) of the power of paths that gets through the unobserved space that they cross [m]."""
-    return np.exp(-unobserved_m / reach_m) if reach_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
+def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
+    """Return the fraction (P,) of the power of paths that unobserved space of an attenuation length [m] lets pass."""
+    return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
+
+
+def _possible_states(
+    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: NDArray[np.uint8], seen: Bools, walled: Bools
+) -> Bools:
+    """Return which link states a map leaves possible (N, 3), whatever the networks predict.
+
+    - A direct line that crosses a known wall has no LOS. It crosses one where the lines a cell and a half to its left
+      and right both run into known walls, and it does itself (`walled`), or is blocked in the trace: past the corner or
+      along the face of a wall, one of the three stays clear.
+    - On a direct line that is wholly observed (`seen`) and meets no wall, LOS is as traced.
+    - Regions are the parts of a map that known walls separate, gaps of two cells or less being closed. Where the ends
+      are in different regions, or in one that is wholly observed, an outage of the trace is an outage, and in one that
+      is wholly observed there is no other.
+
+    The cells of a mesh do not show at which height its surfaces are: there the second rule alone holds.
+    """
+    los, states = link_state == LinkState.LOS, np.arange(len(LinkState))
+    possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
+    if partial.mesh is None:
+        doubtful = (walled & ~(seen & los)) | ~los
+        blocked[doubtful] = _crosses_wall(partial, *(end_m[doubtful] for end_m in ends_m))
+        walled_off, enclosed = _regions(partial, *ends_m)
+        outage = (walled_off | enclosed) & (link_state == LinkState.OUTAGE)
+        possible[outage] = states == LinkState.OUTAGE
+        possible[enclosed & ~outage, LinkState.OUTAGE] = False
+        seen = seen & ~walled
+    possible[blocked | (seen & ~los), LinkState.LOS] = False
+    possible[seen & los] = states == LinkState.LOS
+    return possible
+
+
+def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
+    """Whether the lines `_ASIDE_CELLS` to the left and right of direct lines (N,) both run into known walls."""
+    starts, ends = in_cells(partial, tx_m), in_cells(partial, rx_m)
+    along = ends - starts
+    lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
+    aside = _ASIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
+    left, right = (
+        map_line_fractions(partial, starts + step, ends + step)[:, CellState.WALL] > GRAZE for step in (aside, -aside)
+    )
+    return left & right
+
+
+def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
+    """Whether both ends of links (N,) are in different regions, and whether both are in one that is wholly observed."""
+    state = np.pad(partial.state, 1, constant_values=CellState.UNKNOWN)
+    regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
+    observed = np.ones(count + 1, dtype=bool)
+    observed[regions[state == CellState.UNKNOWN]] = False
+    tx, rx = (_region_at(partial, regions, points_m) for points_m in (tx_m, rx_m))
+    known = (tx > 0) & (rx > 0)
+    return known & (tx != rx), known & (tx == rx) & observed[tx]
+
+
+def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats) -> NDArray[np.int32]:
+    """Return the region (N,) of points (N, 3) [m], which may be in it or beside it; 0 where there is none, or two.
+
+    `regions` (ny + 2, nx + 2) are those of the map's cells and of the cells around it; 0 within a cell of a wall.
+    """
+    row, column = partial.cell_index(points_m)
+    around = [
+        regions[np.clip(row + 1 + up, 0, len(regions) - 1), np.clip(column + 1 + right, 0, regions.shape[1] - 1)]
+        for up, right in itertools.product((-1, 0, 1), repeat=2)
+    ]
+    largest = np.max(around, axis=0)
+    alone = np.all([(each == 0) | (each == largest) for each in around], axis=0)
+    return np.where(alone, largest, 0)

@@ -1,15 +1,17 @@
-"""The networks that see where links run, as Keras 3 models: two map networks and a link network.
+"""The networks that read maps and paths, as Keras 3 models: two map networks and a link network, and their training.
 
 The map networks read the windows around the transmitter, near and far, and write `MAP_FEATURES` numbers into each of
-their cells: U-Nets (Ronneberger, Fischer and Brox 2015), a smaller one for afar. What they make of an empty window is
-taken off, so that a map says nothing where nothing was observed, and the numbers fade to 0 towards the border of each
-window: nothing changes where one ends. The link network reads what the trace gives of a link, and the numbers of all
-windows at its receiver. It returns P(link state), and mean and log-variance of the gain in line of sight and without.
+their cells: U-Nets (Ronneberger, Fischer and Brox 2015), a smaller one for the far window. What they make of an empty
+window is subtracted, so that a map contributes nothing where nothing was observed, and the numbers fade to 0 towards
+the border of each window: nothing changes where one ends. The link network reads what the trace gives of a link, and
+the numbers of all windows at its receiver. It returns P(link state), and mean and log-variance of the gain in line of
+sight and without.
 """
 
+import itertools
+import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.prediction.certainty import possible_states
+from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import REACHES_M, LinkContext
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, own_input
-from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, map_windows, transmitter_places
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
+from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer
+from sionna_partial.prediction.unobserved import Bools, Floats
+from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
+from sionna_partial.settings import PredictorSettings
+from sionna_partial.tracing.trace import Progress
 
 if TYPE_CHECKING:
     import keras
 
-Shape = tuple[int | None, ...]
+Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
+Networks = Mapping[str, "keras.Model"]
 
 MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
 """Names of the networks; those of maps are in the order of `CELLS_M`."""
@@ -36,6 +42,21 @@ MAP_FEATURES = 16
 
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
+
+BINARY_INPUTS = len(LinkState) + 2 + len(LinkState)
+"""Number of values that `binary_features` gives of a link."""
+
+LINK_INPUTS = BINARY_INPUTS + 7 + 2 + len(ATTENUATION_LENGTHS_M) + 1 + len(ATTENUATION_LENGTHS_M)
+"""Number of values that `link_inputs` gives of a link."""
+
+WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
+"""Number of windows in a gradient step, and of links that are drawn for each of them."""
+
+LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
+"""Of AdamW; the rate falls to 0 along a cosine."""
+
+GAIN_WEIGHT = 0.05
+"""Weight of the score of the gain beside the log-likelihood of the link state [1/dB]."""
 
 _WIDTHS = ((16, 32, 48, 64), (8, 16, 24, 32))
 _HIDDEN_UNITS = 64
@@ -51,45 +72,24 @@ _FADE_CELLS = 8.0
 _SCALE_M, _SCALE_DB = 3.0, 100.0
 _NEAREST_M = 0.1
 _IMPOSSIBLE = -1e30
-_LINKS_AT_ONCE, _WINDOWS_AT_ONCE = 16_384, 8
+_LINKS_AT_ONCE, _MAPS_AT_ONCE = 16_384, 8
+_REPORT_STEPS = 50
+
+_log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class LinkNumbers:
-    """The numbers among what the trace knows of N links; every one (N,) unless said otherwise, an array or a tensor.
+_SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
+_LINK_INPUTS_WITH_MAP = LINK_INPUTS + len(CELLS_M) * MAP_FEATURES
 
-    Parameters
-    ----------
-    distance_m, unobserved_distance_m : float64
-        Length of the direct line, and of its unobserved part [m].
-    walled_m : float64
-        Its length in cells of known walls [m]: outlines of walls may leave them open.
-    gain_db : float64
-        Of the partial trace [dB].
-    indirect_gain_db : (N, len(REACHES_M)) float64
-    strongest_unobserved_m : float64
-        See `LinkContext`.
-    """
-
-    distance_m: Any
-    unobserved_distance_m: Any
-    walled_m: Any
-    gain_db: Any
-    indirect_gain_db: Any
-    strongest_unobserved_m: Any
-
-    @classmethod
-    def of(cls, phi: LinkFeatures) -> "LinkNumbers":
-        """Take them from features with a context."""
-        context = context_of(phi)
-        return cls(
-            phi.distance_m,
-            phi.unobserved_distance_m,
-            context.walled_m,
-            phi.gain_db,
-            context.indirect_gain_db,
-            context.strongest_unobserved_m,
-        )
+CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
+    {},
+    {LINK_NETWORK: ((None, LINK_INPUTS), (None, LINK_OUTPUTS))},
+    {
+        LINK_NETWORK: ((None, _LINK_INPUTS_WITH_MAP), (None, LINK_OUTPUTS)),
+        **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
+    },
+)
+"""Inputs and outputs of the networks that a predictor may have beside the paper's: none, "paths", or "map"."""
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:
@@ -98,148 +98,108 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     return phi.context
 
 
-def link_marks(phi: LinkFeatures) -> NDArray[np.float64]:
-    """Return binary features (N, `LINK_MARKS`) of N links, which have a context: 0 or 1."""
+def binary_features(phi: LinkFeatures) -> Floats:
+    """Return binary features (N, `BINARY_INPUTS`) of N links, which have a context: 0 or 1."""
     context, states = context_of(phi), (phi.link_state == state for state in LinkState)
-    return np.stack([*states, context.tx_seen, context.rx_seen, *possible_states(phi).T], axis=1) * 1.0
+    return np.stack([*states, context.tx_seen, context.rx_seen, *context.possible.T], axis=1) * 1.0
 
 
-def input_columns(marks: Any, numbers: LinkNumbers, frequency_hz: float, ops: ModuleType = np) -> Any:
-    """Scale what the trace knows of N links to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
+def numeric_features(phi: LinkFeatures) -> dict[str, Floats]:
+    """Return numeric features of N links, which have a context, as named in `LinkFeatures` and `LinkContext`."""
+    of_phi = {name: getattr(phi, name) for name in ("distance_m", "unobserved_distance_m", "gain_db")}
+    names = ("walled_m", "indirect_gain_db", "strongest_unobserved_m")
+    return of_phi | {name: getattr(phi.context, name) for name in names}
 
-    Parameters
-    ----------
-    marks : (N, LINK_MARKS) float64 array or tensor
-    numbers : LinkNumbers
-    frequency_hz : float
-        Carrier frequency [Hz].
-    ops : module
-        NumPy, or keras.ops for tensors.
+
+def input_columns(binary: Any, numeric: Mapping[str, Any], frequency_hz: float, ops: ModuleType = np) -> Any:
+    """Scale features to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
+
+    They are those of `binary_features` and `numeric_features`; `ops` is NumPy, or keras.ops for tensors.
     """
-    distance_m, unobserved_m = numbers.distance_m, numbers.unobserved_distance_m
+    distance_m, unobserved_m, gain_db = (numeric[name] for name in FEATURES)
     free_db, near_m = free_space_gain_db(distance_m, frequency_hz, ops), ops.maximum(distance_m, _NEAREST_M)
-    indirect_db = [numbers.indirect_gain_db[:, reach] for reach in range(len(REACHES_M))]
-    lengths_m = (distance_m, unobserved_m, distance_m - unobserved_m, numbers.strongest_unobserved_m)
+    traced_db = [gain_db, *(numeric["indirect_gain_db"][:, column] for column in range(len(ATTENUATION_LENGTHS_M)))]
+    lengths_m = (distance_m, unobserved_m, distance_m - unobserved_m, numeric["strongest_unobserved_m"])
     columns = [
-        *(ops.minimum(numbers.walled_m, 1.0), ops.log(near_m), unobserved_m / near_m),
+        *(ops.minimum(numeric["walled_m"], 1.0), ops.log(near_m), unobserved_m / near_m),
         *(ops.log(1.0 + length_m / _SCALE_M) for length_m in lengths_m),
-        *((gain_db - GAIN_FLOOR_DB) / _SCALE_DB for gain_db in (numbers.gain_db, free_db, *indirect_db)),
-        *(ops.clip((gain_db - free_db) / 30.0, -2.0, 0.5) for gain_db in (numbers.gain_db, *indirect_db)),
+        *((each_db - GAIN_FLOOR_DB) / _SCALE_DB for each_db in (gain_db, free_db, *traced_db[1:])),
+        *(ops.clip((each_db - free_db) / 30.0, -2.0, 0.5) for each_db in traced_db),
     ]
-    return ops.concatenate([marks, ops.stack(columns, axis=1)], axis=1)
+    return ops.concatenate([binary, ops.stack(columns, axis=1)], axis=1)
 
 
 def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
     """Return the inputs (N, `LINK_INPUTS`) of the link network for the features of N links, which have a context."""
-    return input_columns(link_marks(phi), LinkNumbers.of(phi), frequency_hz).astype(np.float32)
+    return input_columns(binary_features(phi), numeric_features(phi), frequency_hz).astype(np.float32)
 
 
-LINK_MARKS = len(LinkState) + 2 + len(LinkState)
-"""Number of values that `link_marks` gives of a link."""
-
-LINK_INPUTS = LINK_MARKS + 7 + 2 + len(REACHES_M) + 1 + len(REACHES_M)
-"""Number of values that `link_inputs` gives of a link."""
-
-
-@dataclass(frozen=True)
-class Shapes:
-    """Shapes of what goes in and comes out of networks that `assemble` puts together, by name."""
-
-    inputs: dict[str, Shape]
-    outputs: dict[str, Shape]
-
-    @classmethod
-    def of(cls, **networks: tuple[Shape, Shape]) -> "Shapes":
-        """Take (input, output) of each network, without the first axis."""
-        inputs = {own_input(name): (None, *ends[0]) for name, ends in networks.items()}
-        return cls(inputs, {name: (None, *ends[1]) for name, ends in networks.items()})
-
-
-_SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
-
-CONTEXT_SHAPES = (
-    Shapes.of(),
-    Shapes.of(link_network=((LINK_INPUTS,), (LINK_OUTPUTS,))),
-    Shapes.of(
-        link_network=((LINK_INPUTS + len(CELLS_M) * MAP_FEATURES,), (LINK_OUTPUTS,)),
-        **dict.fromkeys(MAP_NETWORKS, ((*_SQUARE, len(CHANNELS)), (*_SQUARE, MAP_FEATURES))),
-    ),
-)
-"""What a predictor may have beside the networks of the paper: nothing, "paths", or "map"."""
+def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
+    """Return x and y (N, 2) [m] of receivers relative to their transmitters."""
+    context = context_of(phi)
+    return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
 
 
 def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
-    """Build the networks, untrained, by name.
-
-    Parameters
-    ----------
-    seed : int
-        Of the first weights.
-    with_map : bool
-        Whether there are map networks; without them, the link network knows nothing but the trace.
-
-    Returns
-    -------
-    dict of str to keras.Model
-    """
+    """Build the networks, untrained, by name; the link network alone without map networks."""
     keras = import_keras()
-    start = _Seeds(keras, seed)
-    told = len(CELLS_M) * MAP_FEATURES if with_map else 0
-    networks = {LINK_NETWORK: _link_network(keras, start, LINK_INPUTS + told)}
-    if with_map:
-        networks |= {
-            name: _map_network(keras, start, name, each) for name, each in zip(MAP_NETWORKS, _WIDTHS, strict=True)
-        }
+    seeds = itertools.count(1000 * seed + 1)
+
+    def start() -> Any:
+        return keras.initializers.GlorotUniform(seed=next(seeds))
+
+    networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else LINK_INPUTS)}
+    for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
+        networks[name] = _map_network(keras, start, name, widths)
     return networks
 
 
-def look(
-    networks: Mapping[str, "keras.Model"], windows: Any, links: Any, offsets_m: Any, *, training: bool = False
-) -> Any:
-    """Evaluate the networks on R links of each of B transmitters.
+def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[int, ...]) -> "keras.Model":
+    def convolved(x: Any, units: int, name: str) -> Any:
+        options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
+        x = layer(keras, "Conv2D", name, units, 3, **options)(x)
+        x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
+        return layer(keras, "ReLU", f"{name}_active")(x)
 
-    Parameters
-    ----------
-    networks : mapping of str to keras.Model
-        By name.
-    windows : (B, *WINDOWS) float32 tensor
-        In [0, 255]; without map networks they are not read, and may be None.
-    links : (B, R, LINK_INPUTS) float32 tensor
-    offsets_m : (B, R, 2) float32 tensor
-        Of the receivers from the transmitter: x, y [m].
-    training : bool
-        See `read_maps`.
-
-    Returns
-    -------
-    (B, R, LINK_OUTPUTS) float32 tensor
-    """
-    known = read_maps(networks, windows, training=training) if reads_maps(networks) else []
-    return read_links(networks, known, links, offsets_m)
+    window = keras.Input((*_SQUARE, len(CHANNELS)), name="window", dtype="float32")
+    fractions = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
+    x = convolved(fractions, widths[0], "down_0")
+    levels = []
+    for depth, units in enumerate(widths[1:], 1):
+        levels.append(x)
+        x = layer(keras, "MaxPooling2D", f"pool_{depth}")(x)
+        x = convolved(convolved(x, units, f"down_{depth}"), units, f"down_{depth}_again")
+    for depth in reversed(range(len(levels))):
+        x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
+        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), widths[depth], f"up_{depth}")
+        x = convolved(x, widths[depth], f"up_{depth}_again") if depth else x
+    joined = layer(keras, "Concatenate", "all")([x, fractions])
+    values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
+    return keras.Model(window, values, name=name)
 
 
-def reads_maps(networks: Mapping[str, "keras.Model"]) -> bool:
+def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.Model":
+    x = link = keras.Input((inputs,), name="link", dtype="float32")
+    for number in (1, 2):
+        options = {"activation": "silu", "kernel_initializer": start()}
+        x = layer(keras, "Dense", f"hidden_{number}", _HIDDEN_UNITS, **options)(x)
+    outputs = layer(keras, "Dense", "outputs", LINK_OUTPUTS, kernel_initializer="zeros")(x)
+    return keras.Model(link, outputs, name=LINK_NETWORK)
+
+
+def reads_maps(networks: Networks) -> bool:
     """Whether there are map networks."""
     return MAP_NETWORKS[0] in networks
 
 
-def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: bool = False) -> list[Any]:
-    """Let the map networks read windows.
+def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> list[Any]:
+    """Return what the map networks write into the cells of windows (B, *WINDOWS) in [0, 255], beyond an empty window's.
 
-    Parameters
-    ----------
-    networks : mapping of str to keras.Model
-        By name.
-    windows : (B, *WINDOWS) float32 tensor
-        In [0, 255].
-    training : bool
-        Whether values are normalised by the statistics of these windows, which are kept, rather than by the kept ones.
-
-    Returns
-    -------
-    list of (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensors
-        What each cell says beyond what one of an empty window does, near and far.
+    There is a tensor (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) for each network, none without map networks. In
+    training, values are normalised by the statistics of these windows rather than by those kept.
     """
+    if not reads_maps(networks):
+        return []
     import tensorflow as tf
 
     windows = tf.concat([windows, tf.zeros_like(windows[:1])], axis=0)
@@ -247,41 +207,38 @@ def read_maps(networks: Mapping[str, "keras.Model"], windows: Any, *, training: 
     return [each[:-1] - each[-1:] for each in maps]
 
 
-def read_links(networks: Mapping[str, "keras.Model"], known: Sequence[Any], links: Any, offsets_m: Any) -> Any:
-    """Let the link network read R links of each of B transmitters: (B, R, LINK_OUTPUTS) float32 tensor.
+def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
+    """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters.
 
-    Parameters
-    ----------
-    networks : mapping of str to keras.Model
-        By name.
-    known : sequence of (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) float32 tensors
-        From `read_maps`; none without map networks.
-    links, offsets_m : tensors
-        See `look`.
+    `maps` are from `read_maps`, `links` are (B, R, LINK_INPUTS), `offsets_m` (B, R, 2) of `receiver_offsets_m`.
     """
     import tensorflow as tf
 
-    at_receivers = [_between(maps, offsets_m / cell_m) for maps, cell_m in zip(known, CELLS_M, strict=False)]
+    at_receivers = [_interpolated(each, offsets_m / cell_m) for each, cell_m in zip(maps, CELLS_M, strict=False)]
     links = tf.concat([links, *at_receivers], axis=-1)
     outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
     return tf.reshape(outputs, (tf.shape(offsets_m)[0], -1, LINK_OUTPUTS))
 
 
+def _interpolated(maps: Any, offsets: Any) -> Any:
+    """Values (B, R, C) of maps (B, S, S, C) at offsets (B, R, 2) from their centres [cells].
+
+    They are bilinear between the centres of cells, and fade to 0 towards the border.
+    """
+    import tensorflow as tf
+
+    half = WINDOW_CELLS / 2
+    inside = tf.clip_by_value((half - tf.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
+    centres = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5 - half
+    x, y = tf.unstack(inside[..., None] * tf.maximum(1.0 - tf.abs(offsets[..., None] - centres), 0.0), axis=2)
+    return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))
+
+
 def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
-    """Return log-probabilities of the link states, and means and log-variances of the gain given LOS and NLOS.
+    """Return log-probabilities (..., 3) of the link states, and means [dB] and log-variances (..., 2) given LOS, NLOS.
 
-    Parameters
-    ----------
-    outputs : (..., LINK_OUTPUTS) tensor
-    free_db : (...) tensor
-        Gain of free space [dB].
-
-    Returns
-    -------
-    log_probabilities : (..., 3) tensor
-        By LinkState.
-    means_db, log_variances : (..., 2) tensors
-        Of LOS and NLOS [dB, dB^2]. The mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
+    `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB]. The
+    mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
     """
     import tensorflow as tf
 
@@ -292,53 +249,10 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
 
 
-def evaluate_context_networks(
-    networks: Mapping[str, "keras.Model"], phi: LinkFeatures, frequency_hz: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Evaluate the networks on N links.
+def distribution(outputs: Any, free_db: Any, possible: Bools) -> tuple[Any, Any, Any]:
+    """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
-    Parameters
-    ----------
-    networks : mapping of str to keras.Model
-        By name.
-    phi : LinkFeatures
-        With a context.
-    frequency_hz : float
-        Carrier frequency [Hz].
-
-    Returns
-    -------
-    probabilities, means_db, stds_db : (3, N) float64 arrays
-        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
-    """
-    context = context_of(phi)
-    inputs, offsets_m = link_inputs(phi, frequency_hz), receiver_offsets_m(context)
-    outputs = np.zeros((len(phi), LINK_OUTPUTS))
-    for known, links in _by_window(networks, context):
-        for start in range(0, len(links), _LINKS_AT_ONCE):
-            here = links[start : start + _LINKS_AT_ONCE]
-            outputs[here] = read_links(networks, known, inputs[None, here], offsets_m[None, here])[0]
-    free_db = free_space_gain_db(phi.distance_m, frequency_hz)
-    possible = possible_states(phi)
-    probabilities, means_db, stds_db = distribution(outputs, free_db, possible)
-    return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
-
-
-def distribution(outputs: Any, free_db: Any, possible: NDArray[np.bool_]) -> tuple[Any, Any, Any]:
-    """Read the outputs of the link network for N links; states that the map excludes have probability 0.
-
-    Parameters
-    ----------
-    outputs : (N, LINK_OUTPUTS) float64 tensor
-    free_db : (N,) float64 tensor
-        Gain of free space [dB].
-    possible : (N, 3) bool array
-        From `possible_states`.
-
-    Returns
-    -------
-    probabilities, means_db, stds_db : (3, N) float64 tensors
-        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not `possible` (N, 3) have probability 0.
     """
     import tensorflow as tf
 
@@ -351,80 +265,159 @@ def distribution(outputs: Any, free_db: Any, possible: NDArray[np.bool_]) -> tup
     return tf.transpose(tf.exp(log_probabilities)), means_db, stds_db
 
 
-class _Seeds:
-    """First weights, each layer with a seed of its own."""
-
-    def __init__(self, keras: Any, seed: int) -> None:
-        self._keras, self._next = keras, 1000 * seed
-
-    def __call__(self) -> Any:
-        self._next += 1
-        return self._keras.initializers.GlorotUniform(seed=self._next)
-
-
-def _map_network(keras: Any, start: _Seeds, name: str, widths: tuple[int, ...]) -> "keras.Model":
-    def convolved(x: Any, units: int, name: str) -> Any:
-        options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
-        x = layer(keras, "Conv2D", name, units, 3, **options)(x)
-        x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
-        return layer(keras, "ReLU", f"{name}_active")(x)
-
-    window = keras.Input((WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS)), name="window", dtype="float32")
-    shares = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
-    x = convolved(shares, widths[0], "down_0")
-    levels = []
-    for depth, units in enumerate(widths[1:], 1):
-        levels.append(x)
-        x = layer(keras, "MaxPooling2D", f"pool_{depth}")(x)
-        x = convolved(convolved(x, units, f"down_{depth}"), units, f"down_{depth}_again")
-    for depth in reversed(range(len(levels))):
-        x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
-        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), widths[depth], f"up_{depth}")
-        x = convolved(x, widths[depth], f"up_{depth}_again") if depth else x
-    joined = layer(keras, "Concatenate", "all")([x, shares])
-    values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
-    return keras.Model(window, values, name=name)
+def evaluate_context_networks(
+    networks: Networks, phi: LinkFeatures, frequency_hz: float
+) -> tuple[Floats, Floats, Floats]:
+    """Evaluate the networks on the features of N links, which have a context: see `distribution`."""
+    inputs, offsets_m = link_inputs(phi, frequency_hz), receiver_offsets_m(phi)
+    outputs = np.zeros((len(phi), LINK_OUTPUTS))
+    for maps, links in _by_window(networks, context_of(phi)):
+        for start in range(0, len(links), _LINKS_AT_ONCE):
+            here = links[start : start + _LINKS_AT_ONCE]
+            outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
+    free_db = free_space_gain_db(phi.distance_m, frequency_hz)
+    probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi).possible)
+    return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
-def _link_network(keras: Any, start: _Seeds, inputs: int) -> "keras.Model":
-    x = link = keras.Input((inputs,), name="link", dtype="float32")
-    for number in (1, 2):
-        options = {"activation": "silu", "kernel_initializer": start()}
-        x = layer(keras, "Dense", f"hidden_{number}", _HIDDEN_UNITS, **options)(x)
-    outputs = layer(keras, "Dense", "outputs", LINK_OUTPUTS, kernel_initializer="zeros")(x)
-    return keras.Model(link, outputs, name=LINK_NETWORK)
-
-
-def receiver_offsets_m(context: LinkContext) -> NDArray[np.float32]:
-    """Return where receivers (N, 2) are as seen from their transmitters: x, y [m]."""
-    return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
-
-
-def _by_window(networks: Mapping[str, Any], context: LinkContext) -> Iterator[tuple[list[Any], NDArray[np.intp]]]:
+def _by_window(networks: Networks, context: LinkContext) -> Iterator[tuple[list[Any], NDArray[np.intp]]]:
     """Yield what the map networks read around each transmitter, and its links; without them nothing, and all links."""
     if not reads_maps(networks):
         yield [], np.arange(len(context))
         return
-    places, index = transmitter_places(context)
-    links = np.split(np.argsort(index, kind="stable"), np.cumsum(np.bincount(index, minlength=len(places)))[:-1])
-    for number in np.unique(places[:, 0]).astype(int):
-        rows = np.flatnonzero(places[:, 0] == number)
-        windows = map_windows(context.maps[number], places[rows, 1:]).astype(np.float32)
-        for start in range(0, len(rows), _WINDOWS_AT_ONCE):
-            known = read_maps(networks, windows[start : start + _WINDOWS_AT_ONCE])
-            for here, row in enumerate(rows[start : start + _WINDOWS_AT_ONCE]):
-                yield [maps[here : here + 1] for maps in known], links[row]
+    assert context.windows is not None
+    used, links = _links_by_window(context)
+    for start in range(0, len(used), _MAPS_AT_ONCE):
+        numbers = used[start : start + _MAPS_AT_ONCE]
+        maps = read_maps(networks, context.windows[numbers].astype(np.float32))
+        for here, number in enumerate(range(start, start + len(numbers))):
+            yield [each[here : here + 1] for each in maps], links[number]
 
 
-def _between(maps: Any, offsets: Any) -> Any:
-    """Values (B, R, C) of maps (B, S, S, C) at offsets (B, R, 2) from their middles [cells].
+def _links_by_window(context: LinkContext) -> tuple[NDArray[np.intp], list[NDArray[np.intp]]]:
+    """Return which windows (U,) links have, and the links of each of them."""
+    used, counts = np.unique(context.window_index, return_counts=True)
+    return used, np.split(np.argsort(context.window_index, kind="stable"), np.cumsum(counts)[:-1])
 
-    They are bilinear between the middles of cells, and fade to 0 towards the border.
+
+def fit_context_networks(
+    phi: LinkFeatures,
+    link_state: NDArray[np.uint8],
+    gain_db: Floats,
+    settings: PredictorSettings,
+    *,
+    progress: Progress | None = None,
+) -> dict[str, "keras.Model"]:
+    """Fit the networks of `settings` to links with a context, and their true states and gains [dB] (N,).
+
+    Windows are turned and mirrored at random. The same links and settings give the same weights.
+    """
+    networks = context_networks(settings.seed, with_map=settings.networks == "map")
+    examples = _Examples(phi, link_state, gain_db, settings)
+    steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
+    step = _gradient_step(networks, steps)
+    losses = []
+    for number, batch in enumerate(examples.batches(steps, np.random.default_rng(settings.seed))):
+        losses.append(float(step(**batch)))
+        if progress and number % _REPORT_STEPS == 0:
+            recent = np.mean(losses[-_REPORT_STEPS:])
+            progress(number / steps, f"step {number} of {steps}, loss {recent:.4f}")
+    _log.info("%d steps on %d windows: loss %.4f", steps, len(examples), np.mean(losses[-_REPORT_STEPS:]))
+    if not np.isfinite(losses).all():
+        raise PredictorError(f"training diverged in step {int(np.argmin(np.isfinite(losses)))}: give another seed.")
+    return networks
+
+
+class _Examples:
+    """Training links by window; their columns have the names of the arguments of a gradient step."""
+
+    def __init__(
+        self, phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: Floats, settings: PredictorSettings
+    ) -> None:
+        self._used, links = _links_by_window(context_of(phi))
+        self._windows = context_of(phi).windows if settings.networks == "map" else None
+        self._first = np.cumsum([0, *map(len, links)])
+        columns = {
+            "links": link_inputs(phi, settings.frequency_hz),
+            "offsets_m": receiver_offsets_m(phi),
+            "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
+            "link_state": link_state.astype(np.int32),
+            "gain_db": gain_db.astype(np.float32),
+        }
+        order = np.concatenate(links)
+        self._columns = {name: column[order] for name, column in columns.items()}
+
+    def __len__(self) -> int:
+        """Return the number of windows W."""
+        return len(self._used)
+
+    def batches(self, steps: int, rng: np.random.Generator) -> Iterator[dict[str, NDArray[np.generic]]]:
+        """Yield the arguments of so many gradient steps."""
+        order = np.zeros(0, dtype=np.intp)
+        for _ in range(steps):
+            while len(order) < WINDOWS_AT_ONCE:
+                order = np.concatenate([order, rng.permutation(len(self))])
+            chosen, order = order[:WINDOWS_AT_ONCE], order[WINDOWS_AT_ONCE:]
+            low, high = self._first[chosen], self._first[chosen + 1]
+            links = rng.integers(low[:, None], high[:, None], (len(chosen), LINKS_OF_WINDOW))
+            batch = {name: column[links] for name, column in self._columns.items()}
+            turns = rng.integers(8, size=len(chosen))
+            pairs = zip(batch["offsets_m"], turns, strict=True)
+            batch["offsets_m"] = np.stack([_turned_offsets(offset_m, turn) for offset_m, turn in pairs])
+            if self._windows is not None:
+                images = zip(self._windows[self._used[chosen]], turns, strict=True)
+                batch["windows"] = np.stack([_turned(image, turn) for image, turn in images]).astype(np.float32)
+            yield batch
+
+
+def _turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
+    """One of the eight orientations of squares (K, S, S, C)."""
+    image = image[:, :, ::-1] if turn & 1 else image
+    image = image[:, ::-1] if turn & 2 else image
+    return image.transpose(0, 2, 1, 3) if turn & 4 else image
+
+
+def _turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
+    """Offsets (R, 2) from the centre of a window that is turned so [m]."""
+    x, y = offsets_m.T
+    x = -x if turn & 1 else x
+    y = -y if turn & 2 else y
+    return np.stack([y, x] if turn & 4 else [x, y], axis=1)
+
+
+def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
+    """Return a function that takes one of so many gradient steps and returns the loss."""
+    import tensorflow as tf
+
+    keras = import_keras()
+    rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
+    optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
+    weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
+
+    def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
+        with tf.GradientTape() as tape:
+            outputs = read_links(networks, read_maps(networks, windows, training=True), links, offsets_m)
+            log_p, means_db, log_variances = decode(outputs, free_db)
+            loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
+            scores_db = _crps(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
+            states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
+            linked = tf.cast(link_state[..., None] == states, tf.float32)
+            loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db * linked, axis=-1))
+        optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
+        return loss
+
+    compiled: Callable[..., Any] = tf.function(step, jit_compile=False)
+    return compiled
+
+
+def _crps(errors_db: Any, stds_db: Any) -> Any:
+    """Continuous ranked probability score of Gaussians [dB] (Gneiting and Raftery 2007, Eq. 21).
+
+    Gains have longer tails than Gaussians. The likelihood widens them until the tails are covered, which makes the
+    90 % interval too wide for most links; this score does not.
     """
     import tensorflow as tf
 
-    half = WINDOW_CELLS / 2
-    inside = tf.clip_by_value((half - tf.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
-    middles = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5 - half
-    x, y = tf.unstack(inside[..., None] * tf.maximum(1.0 - tf.abs(offsets[..., None] - middles), 0.0), axis=2)
-    return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))
+    z = errors_db / stds_db
+    density = tf.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+    return stds_db * (z * tf.math.erf(z / math.sqrt(2.0)) + 2.0 * density - 1.0 / math.sqrt(math.pi))

@@ -1,12 +1,14 @@
-"""The networks of the paper's predictor, as Keras 3 models: architecture and evaluation.
+"""The networks of the paper's predictor, as Keras 3 models: architecture, evaluation, and training by likelihood.
 
-All of them stand side by side in one functional model. Its inputs are the features of `FEATURES` in their own units,
+All of them are side by side in one functional model. Its inputs are the features of `FEATURES` in their own units,
 each (N, 1); its outputs, by name, are P(link state) given each partial link state (N, 3), mean and log-variance of the
 gain for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are
 scaled and clamped to the range of the training links inside the networks, so that nothing is extrapolated but an anchor
-known to physics: the gain of the partial trace, or that of free space.
+of physics: the gain of the partial trace, or that of free space.
 """
 
+import itertools
+import logging
 import math
 import os
 from collections.abc import Iterator, Mapping
@@ -16,10 +18,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.special import log_softmax
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.errors import PredictorError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.unobserved import Bools, Floats
+from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
     import keras
@@ -35,27 +42,22 @@ NEAREST_M = 0.01
 
 _LINKS_AT_ONCE = 65_536
 _LARGEST = 1e30
+_DEFAULT_RANGES = {"distance_m": (0.0, 30.0), "unobserved_distance_m": (0.0, 30.0), "gain_db": (GAIN_FLOOR_DB, -40.0)}
+_PRIOR_LINKS = 10
+_WEIGHT_PENALTY = 0.01
+_INDOORS = 20.0
+
+_log = logging.getLogger(__name__)
 
 Ranges = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class GainNetwork:
-    """One row of the paper's table: a network for the gain, given link state and partial link state.
+    """One row of the paper's table: a network for the gain given a link state and partial link states.
 
-    Parameters
-    ----------
-    name : str
-    link_state : LinkState
-        The link state given which the gain is predicted.
-    partial_states : tuple of LinkState
-        Partial link states that the network serves.
-    inputs : tuple of str
-        Of `FEATURES`.
-    hidden_units : int
-        Of each of the two hidden layers.
-    prior_offset_db, prior_std_db : float
-        Mean and standard deviation of gain minus anchor where there are no links to learn from [dB].
+    Where there are no links to learn from, gain minus anchor has the mean `prior_offset_db` and the standard deviation
+    `prior_std_db`.
     """
 
     name: str
@@ -71,7 +73,7 @@ class GainNetwork:
         """Whether the mean is an offset from the gain of the partial trace; else from the gain of free space."""
         return self.partial_states == (LinkState.LOS,) and "gain_db" in self.inputs
 
-    def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float64]:
+    def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> Floats:
         """Return the gain (N,) from which the network gives the offset [dB]."""
         return phi.gain_db if self.anchored_to_trace else free_space_gain_db(phi.distance_m, frequency_hz)
 
@@ -120,28 +122,13 @@ def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleTy
 
 
 def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
-    """Build a logistic classifier that gives the same probabilities everywhere until it is trained.
-
-    Parameters
-    ----------
-    name : str
-    inputs : tuple of str
-        Of `FEATURES`.
-    ranges : mapping of str to (low, high)
-        Range to which each input is clamped and scaled.
-    bias : (K,) array-like
-        First logits: K classes by softmax, or one event by sigmoid where K is 1.
-
-    Returns
-    -------
-    keras.Model
-    """
+    """Build a logistic classifier on clamped inputs: by softmax or, for one event, sigmoid; `bias` (K,) are logits."""
     keras = import_keras()
     count = np.size(bias)
-    places, scaled = _scaled_inputs(inputs, ranges)
+    tensors, scaled = _scaled_inputs(inputs, ranges)
     activation = "softmax" if count > 1 else "sigmoid"
     dense = layer(keras, "Dense", "probability", count, activation=activation, kernel_initializer="zeros")
-    network = keras.Model(places, dense(scaled), name=name)
+    network = keras.Model(tensors, dense(scaled), name=name)
     dense.bias.assign(np.asarray(bias, dtype=np.float32))
     return network
 
@@ -149,40 +136,25 @@ def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike
 def gain_network(
     row: GainNetwork, ranges: Ranges, offset_db: float, std_db: float, frequency_hz: float, seed: int
 ) -> "keras.Model":
-    """Build a gain network that says one offset and spread everywhere until it is trained.
+    """Build a gain network that gives one offset from its anchor and one spread [dB] until it is trained.
 
-    Parameters
-    ----------
-    row : GainNetwork
-    ranges : mapping of str to (low, high)
-        Range to which each input is clamped and scaled.
-    offset_db, std_db : float
-        First offset from the anchor, and first standard deviation [dB].
-    frequency_hz : float
-        Carrier frequency of the anchor [Hz].
-    seed : int
-        Of the first weights of the hidden layers.
-
-    Returns
-    -------
-    keras.Model
-        Its output is mean [dB] and natural logarithm of the variance [dB^2], (N, 2).
+    Its output (N, 2) is mean [dB] and natural logarithm of the variance [dB^2].
     """
     keras = import_keras()
-    places, hidden = _scaled_inputs(row.inputs, ranges)
+    tensors, hidden = _scaled_inputs(row.inputs, ranges)
     for number in (1, 2):
         start = keras.initializers.GlorotUniform(seed=seed + number)
         units, name = row.hidden_units, f"hidden_{number}"
         hidden = layer(keras, "Dense", name, units, activation="relu", kernel_initializer=start)(hidden)
     shape = layer(keras, "Dense", "mean_shape", 1, kernel_initializer="zeros")(hidden)
     offset = layer(keras, "Rescaling", "offset_db", std_db, offset_db)(shape)
-    mean = layer(keras, "Add", "mean_db")([_anchor(keras, row, places, frequency_hz), offset])
+    mean = layer(keras, "Add", "mean_db")([_anchor(keras, row, tensors, frequency_hz), offset])
     low, high = (2.0 * math.log(std) for std in STD_RANGE_DB)
-    share = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
+    first = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
     spread = layer(keras, "Dense", "spread_shape", 1, activation="sigmoid", kernel_initializer="zeros")
     log_variance = layer(keras, "Rescaling", "log_variance", high - low, low)(spread(hidden))
-    spread.bias.assign([math.log(share / (1.0 - share))])
-    return keras.Model(places, layer(keras, "Concatenate", "gain")([mean, log_variance]), name=row.name)
+    spread.bias.assign([math.log(first / (1.0 - first))])
+    return keras.Model(tensors, layer(keras, "Concatenate", "gain")([mean, log_variance]), name=row.name)
 
 
 def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
@@ -191,9 +163,9 @@ def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
     inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in FEATURES}
     outputs = {name: networks[name]({key: inputs[key] for key in networks[name].input}) for name in OUTPUT_WIDTHS}
     for name in sorted(networks.keys() - outputs.keys()):
-        place = own_input(name)
-        inputs[place] = keras.Input(networks[name].input_shape[1:], name=place, dtype="float32")
-        outputs[name] = networks[name](inputs[place])
+        own = own_input(name)
+        inputs[own] = keras.Input(networks[name].input_shape[1:], name=own, dtype="float32")
+        outputs[name] = networks[name](inputs[own])
     return keras.Model(inputs, outputs, name="predictor")
 
 
@@ -216,21 +188,9 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict
 def distribution_by_paper(
     networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: NDArray[np.uint8]
 ) -> tuple[Any, Any, Any]:
-    """Let the paper's networks answer for N links.
+    """Evaluate the paper's networks on `inputs` (N, 1) of `FEATURES` and partial link states (N,).
 
-    Parameters
-    ----------
-    networks : mapping of str to keras.Model
-        By name.
-    inputs : mapping of str to (N, 1) float32 tensors
-        Of `FEATURES`.
-    link_state : (N,) uint8 array of LinkState
-        On the partial map.
-
-    Returns
-    -------
-    probabilities, means_db, stds_db : (3, N) float64 tensors
-        Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
+    Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
     import tensorflow as tf
 
@@ -250,16 +210,14 @@ def distribution_by_paper(
     return tf.transpose(probabilities / total), tf.stack(means_db), tf.stack(stds_db)
 
 
-def evaluate_paper(
-    networks: Mapping[str, "keras.Model"], phi: LinkFeatures
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def evaluate_paper(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> tuple[Floats, Floats, Floats]:
     """Evaluate `distribution_by_paper` on the features of N links, to arrays."""
     blocks = [distribution_by_paper(networks, network_inputs(block), block.link_state) for block in _blocks(phi)]
     probabilities, means_db, stds_db = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
     return probabilities, means_db, stds_db
 
 
-def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> NDArray[np.float64]:
+def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> Floats:
     """Return P(indoor) (N,) by the network that serves the partial link state of each link."""
     p_indoor = np.zeros(len(phi))
     for state, name in INDOOR_NETWORKS.items():
@@ -290,20 +248,20 @@ def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
 def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, Any], Any]:
     """Return inputs by name, and the tensor (N, len(names)) of them, scaled to [0, 1] and clamped."""
     keras = import_keras()
-    places = {name: keras.Input((1,), name=name, dtype="float32") for name in names}
-    columns = list(places.values())
+    tensors = {name: keras.Input((1,), name=name, dtype="float32") for name in names}
+    columns = list(tensors.values())
     joined = layer(keras, "Concatenate", "joined")(columns) if len(columns) > 1 else columns[0]
     scale = [1.0 / (ranges[name][1] - ranges[name][0]) for name in names]
     offset = [-ranges[name][0] * factor for name, factor in zip(names, scale, strict=True)]
     scaled = layer(keras, "Rescaling", "scaled", scale, offset)(joined)
-    return places, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
+    return tensors, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
 
 
-def _anchor(keras: ModuleType, row: GainNetwork, places: Mapping[str, Any], frequency_hz: float) -> Any:
+def _anchor(keras: ModuleType, row: GainNetwork, tensors: Mapping[str, Any], frequency_hz: float) -> Any:
     """Return the tensor (N, 1) of the gain from which the network gives the offset [dB]."""
     if row.anchored_to_trace:
-        return places["gain_db"]
-    decades = keras.ops.log10(keras.ops.maximum(places["distance_m"], NEAREST_M))
+        return tensors["gain_db"]
+    decades = keras.ops.log10(keras.ops.maximum(tensors["distance_m"], NEAREST_M))
     return layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
 
 
@@ -314,3 +272,121 @@ def _gain_at_1m_db(frequency_hz: float) -> float:
 def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:
     """Return a stock layer in single precision, whatever the user's global policy is."""
     return getattr(keras.layers, kind)(*arguments, name=name, dtype="float32", **options)
+
+
+def fit_networks(
+    phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: Floats, settings: PredictorSettings
+) -> "keras.Model":
+    """Fit the classifiers and the gain networks to links and their true states and gains [dB] (N,), all indoors."""
+    networks = {}
+    for partial_state, name in STATE_NETWORKS.items():
+        cell = phi.link_state == partial_state
+        links, states = phi.take(cell), link_state[cell]
+        counts = np.bincount(states, minlength=len(LinkState)) + 1.0
+        networks[name] = logistic(name, STATE_INPUTS, _ranges(links, settings), np.log(counts / counts.sum()))
+        if len(links) >= settings.minimum_links:
+            _fit_logistic(networks[name], links, states)
+    for row in GAIN_NETWORKS:
+        cell = (link_state == row.link_state) & np.isin(phi.link_state, row.partial_states)
+        networks[row.name] = _fit_gain(row, phi.take(cell), gain_db[cell], settings)
+    for name in INDOOR_NETWORKS.values():
+        networks[name] = logistic(name, INDOOR_INPUTS, _DEFAULT_RANGES, [_INDOORS])
+    return assemble(networks)
+
+
+def fit_indoor_networks(
+    model: "keras.Model", phi: LinkFeatures, inside: Bools, settings: PredictorSettings
+) -> "keras.Model":
+    """Return the networks of `model` with P(indoor) fitted to N links; `inside` (N,) is whether they are indoors.
+
+    A partial link state with fewer links than `minimum_links` keeps what `model` has.
+    """
+    networks = parts(model)
+    for partial_state, name in INDOOR_NETWORKS.items():
+        cell = phi.link_state == partial_state
+        if cell.sum() >= settings.minimum_links:
+            links = phi.take(cell)
+            networks[name] = logistic(name, INDOOR_INPUTS, _ranges(links, settings), [0.0])
+            _fit_logistic(networks[name], links, inside[cell].astype(np.uint8))
+    return assemble(networks)
+
+
+def _fit_gain(row: GainNetwork, phi: LinkFeatures, gain_db: Floats, settings: PredictorSettings) -> "keras.Model":
+    offsets_db = gain_db - row.anchor_db(phi, settings.frequency_hz)
+    count = len(phi) + _PRIOR_LINKS
+    mean_db = (offsets_db.sum() + _PRIOR_LINKS * row.prior_offset_db) / count
+    prior = row.prior_std_db**2 + (row.prior_offset_db - mean_db) ** 2
+    variance = (((offsets_db - mean_db) ** 2).sum() + _PRIOR_LINKS * prior) / count
+    first_db, seed = (float(mean_db), math.sqrt(variance)), settings.seed + 10 * GAIN_NETWORKS.index(row)
+    network = gain_network(row, _ranges(phi, settings), *first_db, settings.frequency_hz, seed)
+    if len(phi) >= settings.minimum_links:
+        _train(network, phi, gain_db, settings)
+    return network
+
+
+def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
+    """Range of every feature of the links; a wide one if they are too few to tell."""
+    if len(phi) < settings.minimum_links:
+        return _DEFAULT_RANGES
+    spans = {name: (float(getattr(phi, name).min()), float(getattr(phi, name).max())) for name in _DEFAULT_RANGES}
+    return {name: (low, max(high, low + 1.0)) for name, (low, high) in spans.items()}
+
+
+def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: NDArray[np.uint8]) -> None:
+    """Set the weights of a logistic classifier to those of the smallest cross-entropy, a convex problem.
+
+    A slight penalty keeps weights finite where a straight line parts the classes.
+    """
+    keras = import_keras()
+    scaled = keras.Model(network.input, network.get_layer("clamped").output)(network_inputs(phi, tuple(network.input)))
+    rows = np.concatenate([np.asarray(scaled, dtype=np.float64), np.ones((len(phi), 1))], axis=1)
+    classes = max(2, network.output.shape[1])
+    picked = truth[:, None] == np.arange(classes)
+
+    def loss(flat: Floats) -> tuple[float, Floats]:
+        weights = flat.reshape(-1, classes)
+        log_p = log_softmax(rows @ weights, axis=1)
+        slope = rows.T @ (np.exp(log_p) - picked) + _WEIGHT_PENALTY * weights
+        return -log_p[picked].sum() + 0.5 * _WEIGHT_PENALTY * (flat**2).sum(), slope.ravel()
+
+    found = minimize(loss, np.zeros(rows.shape[1] * classes), jac=True, method="L-BFGS-B", options={"maxiter": 1000})
+    weights = found.x.reshape(-1, classes)
+    if network.output.shape[1] == 1:
+        weights = weights[:, 1:] - weights[:, :1]
+    network.get_layer("probability").set_weights([weights[:-1], weights[-1]])
+    _log.info("%s: cross-entropy %.4f over %d links", network.name, found.fun / len(phi), len(phi))
+
+
+def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
+    """Negative log-likelihood of gains (N, 1) under means and log-variances (N, 2), up to a constant."""
+    ops = import_keras().ops
+    mean, log_variance = prediction[:, :1], prediction[:, 1:]
+    return 0.5 * (log_variance + ops.square(gain_db - mean) * ops.exp(-log_variance))
+
+
+def _train(network: "keras.Model", phi: LinkFeatures, gain_db: Floats, settings: PredictorSettings) -> None:
+    """Minimise the loss of a gain network in place; the same links and settings give the same weights."""
+    keras = import_keras()
+    trainer = keras.Model(network.input, network.output)
+    decay = keras.optimizers.schedules.CosineDecay(settings.learning_rate, settings.steps)
+    trainer.compile(optimizer=keras.optimizers.Adam(decay), loss=_gaussian_loss, jit_compile=False)
+    inputs = network_inputs(phi, tuple(network.input))
+    seed = (settings.seed, [row.name for row in GAIN_NETWORKS].index(network.name))
+    batches = _batches(inputs, gain_db.astype(np.float32)[:, None], settings.batch_size, np.random.default_rng(seed))
+    history = trainer.fit(batches, steps_per_epoch=settings.steps, shuffle=False, verbose=0)
+    _log.info("%s: loss %.4f over %d links", network.name, history.history["loss"][-1], len(phi))
+    if not all(np.isfinite(weights).all() for weights in network.get_weights()):
+        raise PredictorError(
+            f"training of {network.name} diverged: learning_rate = {settings.learning_rate:g}, give a smaller one."
+        )
+
+
+def _batches(
+    inputs: dict[str, NDArray[np.float32]], gain_db: NDArray[np.float32], size: int, rng: np.random.Generator
+) -> Iterator[tuple[dict[str, NDArray[np.float32]], NDArray[np.float32]]]:
+    """Yield shuffled batches without end."""
+    for start in itertools.cycle(range(0, len(gain_db), size)):
+        if start == 0:
+            order = rng.permutation(len(gain_db))
+        index = order[start : start + size]
+        yield {name: column[index] for name, column in inputs.items()}, gain_db[index]

@@ -1,29 +1,36 @@
-"""Predictor: LinkFeatures -> LinkPrediction, by the paper's networks or by ones that see where links run."""
+"""Predictor: LinkFeatures -> LinkPrediction, by the paper's networks or by those that read maps and paths."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states
-from sionna_partial.prediction.map_fitting import fit_context_networks
-from sionna_partial.prediction.map_networks import LINK_NETWORK, evaluate_context_networks
-from sionna_partial.prediction.paper_fitting import fit_indoor_networks, fit_networks
+from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states, require_each
+from sionna_partial.prediction.map_networks import (
+    LINK_NETWORK,
+    evaluate_context_networks,
+    fit_context_networks,
+    reads_maps,
+)
 from sionna_partial.prediction.paper_networks import (
     assemble,
     evaluate_indoor,
     evaluate_paper,
+    fit_indoor_networks,
+    fit_networks,
     import_keras,
     network_ranges,
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.tracing.trace import Progress
@@ -39,7 +46,7 @@ SHIPPED = ("map", "paper")
 class LinkPrediction:
     """Predictive distribution of link state and path gain of N links; every array is (N,) float64.
 
-    `Predictor.predict` makes it for receivers that are indoors, `anywhere` for receivers that may be outside.
+    `Predictor.predict` returns it for receivers that are indoors, `anywhere` for receivers that may be outdoors.
 
     Parameters
     ----------
@@ -51,15 +58,15 @@ class LinkPrediction:
         The same given line of sight, and given paths without it [dB].
     """
 
-    p_los: NDArray[np.float64]
-    p_nlos: NDArray[np.float64]
-    p_outage: NDArray[np.float64]
-    gain_mean_db: NDArray[np.float64]
-    gain_std_db: NDArray[np.float64]
-    gain_los_mean_db: NDArray[np.float64]
-    gain_los_std_db: NDArray[np.float64]
-    gain_nlos_mean_db: NDArray[np.float64]
-    gain_nlos_std_db: NDArray[np.float64]
+    p_los: Floats
+    p_nlos: Floats
+    p_outage: Floats
+    gain_mean_db: Floats
+    gain_std_db: Floats
+    gain_los_mean_db: Floats
+    gain_los_std_db: Floats
+    gain_nlos_mean_db: Floats
+    gain_nlos_std_db: Floats
 
     @property
     def link_state(self) -> NDArray[np.uint8]:
@@ -67,28 +74,20 @@ class LinkPrediction:
         return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
 
     @classmethod
-    def of_parts(
-        cls, probabilities: NDArray[np.float64], means_db: NDArray[np.float64], stds_db: NDArray[np.float64]
-    ) -> "LinkPrediction":
-        """Put the distribution together by the laws of total expectation and variance.
+    def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, *, ops: ModuleType = np) -> Self:
+        """Combine the distributions given each LinkState (3, N), by the laws of total expectation and variance.
 
-        Parameters
-        ----------
-        probabilities, means_db, stds_db : (3, N) arrays
-            Probability of each LinkState, and mean and standard deviation of the gain given it [dB].
-
-        Returns
-        -------
-        LinkPrediction
+        `ops` is NumPy, or keras.ops for tensors, of which the standard deviation has finite derivatives.
         """
-        mean = np.maximum((probabilities * means_db).sum(axis=0), GAIN_FLOOR_DB)
-        variance = (probabilities * (stds_db**2 + (means_db - mean) ** 2)).sum(axis=0)
+        mean_db = ops.maximum(ops.sum(probabilities * means_db, axis=0), GAIN_FLOOR_DB)
+        variance = ops.sum(probabilities * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
+        spread = variance > 0.0
         return cls(
             p_los=probabilities[LinkState.LOS],
             p_nlos=probabilities[LinkState.NLOS],
             p_outage=probabilities[LinkState.OUTAGE],
-            gain_mean_db=mean,
-            gain_std_db=np.sqrt(variance),
+            gain_mean_db=mean_db,
+            gain_std_db=ops.where(spread, ops.sqrt(ops.where(spread, variance, 1.0)), 0.0),
             gain_los_mean_db=means_db[LinkState.LOS],
             gain_los_std_db=stds_db[LinkState.LOS],
             gain_nlos_mean_db=means_db[LinkState.NLOS],
@@ -97,7 +96,7 @@ class LinkPrediction:
 
     @classmethod
     def of_trace(cls, phi: LinkFeatures) -> "LinkPrediction":
-        """Take the trace itself for the answer, as on a complete map (paper, eq. 9): no uncertainty is left.
+        """Return the trace itself as the prediction, as on a complete map (paper, eq. 9): no uncertainty is left.
 
         The components of link states that a link is not in have its traced gain, too.
         """
@@ -108,13 +107,13 @@ class LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
 
-    def where(self, taken: NDArray[np.bool_], other: "LinkPrediction") -> "LinkPrediction":
+    def where(self, taken: Bools, other: "LinkPrediction") -> "LinkPrediction":
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
         columns = (column.name for column in fields(self))
         return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
 
     def anywhere(self, p_indoor: ArrayLike) -> "LinkPrediction":
-        """Return the distribution for receivers that may be outside, where every link is in outage.
+        """Return the distribution for receivers that may be outdoors, where every link is in outage.
 
         By total probability (paper, "Indoor-Outdoor Estimation"), the probabilities of LOS and NLOS are those of a
         receiver indoors times `p_indoor`, the rest is outage; mean and spread of the gain follow.
@@ -133,31 +132,28 @@ class LinkPrediction:
         PredictorError
             For another shape, or a value outside [0, 1].
         """
-        share = link_numbers("p_indoor", p_indoor, len(self.p_los))
-        wrong = (share < 0.0) | (share > 1.0)
-        if wrong.any():
-            index = int(np.argmax(wrong))
-            raise PredictorError(f"p_indoor[{index}] = {share[index]:g} is not allowed: it lies between 0 and 1.")
-        floor = np.full_like(share, GAIN_FLOOR_DB)
+        indoors = link_numbers("p_indoor", p_indoor, len(self.p_los))
+        require_each((indoors >= 0.0) & (indoors <= 1.0), "p_indoor", indoors, "it lies between 0 and 1.")
+        floor = np.full_like(indoors, GAIN_FLOOR_DB)
         return LinkPrediction.of_parts(
-            np.stack([share * self.p_outage + (1.0 - share), share * self.p_los, share * self.p_nlos]),
+            np.stack([indoors * self.p_outage + (1.0 - indoors), indoors * self.p_los, indoors * self.p_nlos]),
             np.stack([floor, self.gain_los_mean_db, self.gain_nlos_mean_db]),
-            np.stack([np.zeros_like(share), self.gain_los_std_db, self.gain_nlos_std_db]),
+            np.stack([np.zeros_like(indoors), self.gain_los_std_db, self.gain_nlos_std_db]),
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Predictor:
-    """A predictor of link state and path gain, made by `fit` or `load`.
+    """A predictor of link state and path gain, from `fit` or `load`.
 
     That of the paper (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on
     distance and unobserved distance for each partial link state; the gain given the link state is Gaussian, its mean
     and log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved
     distance for each partial link state; it is 1 until `fit_indoor`, as the paper has every receiver indoors.
 
-    With settings other than "paper", networks beside these see what each path crosses, and the map around the
-    transmitter (`context_networks`). They answer for features with a context; the trace itself does where the map is
-    complete. For features without one the paper's networks answer, fitted to the same links.
+    With settings other than "paper", networks beside these read what each path crosses, and the map around the
+    transmitter (`map_networks`). They predict links whose features have a context; where the map is complete, the trace
+    itself is the prediction. For features without a context the paper's networks predict, fitted to the same links.
 
     Parameters
     ----------
@@ -177,6 +173,14 @@ class Predictor:
         Of the packages that trained it.
     name : str
         "fitted", a shipped name, or the file's path.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> phi = sp.LinkFeatures([1, 0], unobserved_distance_m=[0.0, 4.5], distance_m=[3.0, 6.0], gain_db=[-71.0, -150.0])
+    >>> prediction = sp.Predictor.load("paper").predict(phi)
+    >>> prediction.p_los.round() + 0.0
+    array([1., 0.])
     """
 
     model: "keras.Model"
@@ -193,6 +197,11 @@ class Predictor:
         """SHA-256 of the `.keras` file, in hexadecimal."""
         return digest(self.archive)
 
+    @property
+    def reads_maps(self) -> bool:
+        """Whether it needs the windows of `link_features`."""
+        return reads_maps(parts(self.model))
+
     @classmethod
     def fit(
         cls,
@@ -206,8 +215,8 @@ class Predictor:
     ) -> "Predictor":
         """Train on links of known truth; the same links and settings give the same weights.
 
-        Link states are learned by cross-entropy; the gain by the paper's networks by Gaussian likelihood, and by those
-        beside them by the continuous ranked probability score.
+        Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, and by the
+        continuous ranked probability score (CRPS) in those beside them.
 
         Parameters
         ----------
@@ -222,7 +231,7 @@ class Predictor:
         settings : PredictorSettings, optional
             The paper's networks by default.
         progress : callable, optional
-            Called as ``progress(share_done, message)``.
+            Called as ``progress(fraction_done, message)``.
 
         Returns
         -------
@@ -241,7 +250,11 @@ class Predictor:
         gains_db = np.maximum(link_numbers("gain_db", gain_db, len(features)), GAIN_FLOOR_DB)
         context_networks = {}
         if settings.networks != "paper":
-            _require_context(features)
+            if features.context is None:
+                remedy = "give the LinkFeatures of link_features, or PredictorSettings(networks='paper')."
+                raise PredictorError(f"features has no context, which all networks but the paper's need: {remedy}")
+            if settings.networks == "map":
+                _require_windows(features)
             context_networks = fit_context_networks(features, states, gains_db, settings, progress=progress)
         model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
         links = {
@@ -291,15 +304,22 @@ class Predictor:
         Returns
         -------
         LinkPrediction
+
+        Raises
+        ------
+        PredictorError
+            For features with a context, but without the windows that map networks read.
         """
         _require_features(features)
         networks = parts(self.model)
         if features.context is None or LINK_NETWORK not in networks:
             return LinkPrediction.of_parts(*evaluate_paper(networks, features))
-        answer = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
-        return answer.where(features.context.complete, LinkPrediction.of_trace(features))
+        if self.reads_maps:
+            _require_windows(features)
+        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
+        return prediction.where(features.context.complete, LinkPrediction.of_trace(features))
 
-    def predict_indoor(self, features: LinkFeatures) -> NDArray[np.float64]:
+    def predict_indoor(self, features: LinkFeatures) -> Floats:
         """Predict the probability (N,) that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
         _require_features(features)
         return evaluate_indoor(parts(self.model), features)
@@ -370,12 +390,9 @@ class Predictor:
         return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
 
 
-def _require_context(features: LinkFeatures) -> None:
-    if features.context is None:
-        raise PredictorError(
-            "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
-            "or PredictorSettings(networks='paper')."
-        )
+def _require_windows(features: LinkFeatures) -> None:
+    if features.context is None or features.context.windows is None:
+        raise PredictorError("features has no windows, which map networks read: call link_features with windows=True.")
 
 
 def _require_features(features: object) -> None:

@@ -17,29 +17,22 @@ from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
-from sionna_partial.prediction.paper_networks import FEATURES, OUTPUT_WIDTHS, import_keras
+from sionna_partial.prediction.paper_networks import FEATURES, OUTPUT_WIDTHS, import_keras, own_input
 
 if TYPE_CHECKING:
     import keras
 
 FORMAT = "sionna_partial predictor 2"
-"""First entry of every card. Who raises it brings the shipped files along: trainings are measured beside them."""
+"""First entry of every card."""
 
 SUFFIX = ".keras"
 
 _MAX_BYTES = 64_000_000
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
-_LAYERS = {"Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"}
-_LAYERS |= {"Conv2D", "BatchNormalization", "MaxPooling2D", "UpSampling2D"}
-_CLASSES = _LAYERS | {
-    "Maximum",
-    "Log10",
-    "DTypePolicy",
-    "GlorotUniform",
-    "Zeros",
-    "Ones",
-    "Constant",
-    "__keras_tensor__",
+_CLASSES = {
+    *("Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"),
+    *("Conv2D", "BatchNormalization", "MaxPooling2D", "UpSampling2D", "Maximum", "Log10"),
+    *("DTypePolicy", "GlorotUniform", "Zeros", "Ones", "Constant", "__keras_tensor__"),
 }
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
 """Names that Keras numbers through a process; each of our networks has one of each."""
@@ -57,6 +50,10 @@ _FIXED_ENTRIES = {
 
 def pack(model: "keras.Model") -> bytes:
     """Return the `.keras` archive of a model, without dates, addresses and counters that differ from run to run."""
+
+    def without_run(entry: dict[str, Any]) -> dict[str, Any]:
+        return {key: value for key, value in entry.items() if key not in ("shared_object_id", "date_saved")}
+
     with temporary_folder() as folder:
         path = folder / f"model{SUFFIX}"
         model.save(path)
@@ -65,7 +62,7 @@ def pack(model: "keras.Model") -> bytes:
             for name in sorted(source.namelist()):
                 content = source.read(name)
                 if name.endswith(".json"):
-                    content = json.dumps(json.loads(content, object_hook=_without_run), sort_keys=True).encode()
+                    content = json.dumps(json.loads(content, object_hook=without_run), sort_keys=True).encode()
                     content = _COUNTED.sub(rb'"\1"', content)
                 target.writestr(zipfile.ZipInfo(name, _FIXED_DATE), content, zipfile.ZIP_DEFLATED)
     return packed.getvalue()
@@ -77,22 +74,9 @@ def digest(archive: bytes) -> str:
 
 
 def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
-    """Write archive and card, whole or not at all.
+    """Write the `.keras` file at `path` and the card beside it, whole or not at all.
 
-    Parameters
-    ----------
-    path : pathlib.Path
-        The `.keras` file; the card is the `.json` beside it.
-    archive : bytes
-    card : mapping
-        Settings, homes, metrics and the like; format, features and hash are added.
-
-    Raises
-    ------
-    OutputError
-        If writing fails.
-    PredictorError
-        If `path` does not end in `.keras`.
+    Format, features and hash are added to the entries of `card`.
     """
     _require_suffix(path)
     entries = {**_FIXED_ENTRIES, "sha256": digest(archive), **card}
@@ -102,24 +86,7 @@ def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
 
 
 def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
-    """Read and check a predictor.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The `.keras` file; the card is the `.json` beside it.
-
-    Returns
-    -------
-    model : keras.Model
-    archive : bytes
-    card : dict
-
-    Raises
-    ------
-    PredictorError
-        If a file is missing, damaged, of another kind, or if the two do not belong together.
-    """
+    """Return model, archive and card of the predictor in the `.keras` file at `path` and its card, checked."""
     _require_suffix(path)
     archive = _read(path)
     card = _read_card(path.with_suffix(".json"))
@@ -130,10 +97,6 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
         )
     _require_stock_classes(path, archive)
     return _unpack(path, archive), archive, card
-
-
-def _without_run(entry: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in entry.items() if key not in ("shared_object_id", "date_saved")}
 
 
 def _require_suffix(path: Path) -> None:
@@ -212,6 +175,13 @@ def _unpack(path: Path, archive: bytes) -> "keras.Model":
             )
         except Exception as error:
             raise PredictorError(f"path = '{path}' cannot be loaded by Keras ({error}): train it anew.") from error
-    if not any(inputs == _INPUTS | more.inputs and outputs == _OUTPUTS | more.outputs for more in CONTEXT_SHAPES):
+    known = [
+        (
+            _INPUTS | {own_input(name): shapes[0] for name, shapes in more.items()},
+            _OUTPUTS | {name: shapes[1] for name, shapes in more.items()},
+        )
+        for more in CONTEXT_SHAPES
+    ]
+    if (inputs, outputs) not in known:
         raise PredictorError(f"path = '{path}' has inputs {sorted(inputs)} and outputs {outputs}: train it anew.")
     return model

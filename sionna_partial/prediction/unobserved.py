@@ -1,15 +1,18 @@
-"""How much of straight lines has not been observed: the grid integral behind d_unobs (paper, Section III-C)."""
+"""Fractions of straight lines in each kind of cell: the grid integral behind d_unobs (paper, Section III-C)."""
 
 import itertools
-from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
-from sionna_partial.cores import core_count
+from sionna_partial.cores import core_count, in_order
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
+
+Floats: TypeAlias = NDArray[np.float64]
+Bools: TypeAlias = NDArray[np.bool_]
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
@@ -22,204 +25,159 @@ _BORDER_CELLS = 1e-6
 _ALONG_CELLS = 1e-3
 """Extent along one axis below which a segment may run along the border of cells [cells]."""
 
-_SEGMENTS_OF_CORE = 20_000
-"""Number of segments that are worth another core."""
+_SEGMENTS_PER_CORE = 20_000
+"""Number of segments from which another core is used."""
 
 
-def unobserved_lengths_m(
-    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Measure the length of segments inside unknown cells, exact to rounding.
+def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
+    """Return the lengths (N,) [m] of segments inside unknown cells, exact to rounding; ends are (N, 3) or (3,) [m].
 
     Everything outside the grid is unknown. On a complete map nothing unknown can be reached from a known cell, and the
     length of a segment that has an end in one is 0 by definition. A segment along the border of cells is in the freest
     of them, as in `PartialMap.state_at`.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    start_m, end_m : (N, 3) float64 arrays
-        Ends of the segments [m]; one may be (3,).
-
-    Returns
-    -------
-    (N,) float64 array
-        Between 0 and the lengths of the segments [m].
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m, open_ended = np.zeros(len(end_m)), ~is_enclosed(partial, start_m, end_m)
-    start_m, end_m = start_m[open_ended], end_m[open_ended]
-    shares = map_line_shares(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, CellState.UNKNOWN]
-    lengths_m[open_ended] = shares * np.linalg.norm(end_m - start_m, axis=1)
+    lengths_m[open_ended] = _lengths_m(partial, CellState.UNKNOWN, start_m[open_ended], end_m[open_ended])
     return lengths_m
 
 
-def is_enclosed(partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether a complete map holds at least one end of each link (N,), so that nothing unknown is on its way."""
+def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
+    """Return the lengths (N,) [m] of segments inside cells of known walls; ends are (N, 3) or (3,) [m].
+
+    Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are.
+    """
+    return _lengths_m(partial, CellState.WALL, *np.broadcast_arrays(start_m, end_m))
+
+
+def _lengths_m(partial: PartialMap, kind: CellState, start_m: Floats, end_m: Floats) -> Floats:
+    fractions = map_line_fractions(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, kind]
+    return fractions * np.linalg.norm(end_m - start_m, axis=1)
+
+
+def is_enclosed(partial: PartialMap, start_m: Floats, end_m: Floats) -> Bools:
+    """Whether the map is complete and at least one end of each link (N,) is known, so that nothing unknown is met."""
     if not partial.is_complete:
         return np.zeros(len(end_m), dtype=bool)
     known = (partial.state_at(points_m) != CellState.UNKNOWN for points_m in (start_m, end_m))
-    enclosed: NDArray[np.bool_] = np.logical_or(*known)
+    enclosed: Bools = np.logical_or(*known)
     return enclosed
 
 
-def walled_lengths_m(
-    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Measure the length of segments inside cells of known walls, exact to rounding.
-
-    Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    start_m, end_m : (N, 3) float64 arrays
-        Ends of the segments [m]; one may be (3,).
-
-    Returns
-    -------
-    (N,) float64 array
-        Between 0 and the lengths of the segments [m].
-    """
-    start_m, end_m = np.broadcast_arrays(start_m, end_m)
-    shares = map_line_shares(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, CellState.WALL]
-    return shares * np.linalg.norm(end_m - start_m, axis=1)
-
-
-def in_cells(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def in_cells(partial: PartialMap, points_m: Floats) -> Floats:
     """Return x and y of points (..., 2 or 3) [m] in cells of a map's grid, rounded to 1e-6: borders are met exactly."""
     return np.round((points_m[..., :2] - partial.origin_m) / partial.resolution_m, 6)
 
 
-def map_line_shares(partial: PartialMap, starts: NDArray[np.float64], ends: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return `line_shares` on the cells of a map."""
-    return _shares(partial.state, partial.alike_cells, starts, ends)
+def map_line_fractions(partial: PartialMap, starts: Floats, ends: Floats) -> Floats:
+    """Return `line_fractions` on the cells of a map."""
+    return line_fractions(partial.state, starts, ends, partial.alike_cells)
 
 
-def line_shares(
-    state: NDArray[np.uint8], starts: NDArray[np.float64], ends: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def line_fractions(
+    state: NDArray[np.uint8], starts: Floats, ends: Floats, alike: NDArray[np.int32] | None = None
+) -> Floats:
     """Return the fractions (N, 3), in [0, 1], of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
 
-    All cells outside the grid are unknown.
+    All cells outside the grid are unknown. `alike` is what `alike_cells` returns of `state`, where it is at hand.
     """
-    return _shares(state, alike_cells(state), starts, ends)
-
-
-def _shares(
-    state: NDArray[np.uint8], alike: NDArray[np.int32], starts: NDArray[np.float64], ends: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    shares = np.zeros((len(ends), len(CellState)))
-    bounds = np.linspace(0, len(ends), 1 + min(core_count(), 1 + len(ends) // _SEGMENTS_OF_CORE))
-    blocks = [slice(int(low), int(high)) for low, high in itertools.pairwise(bounds)]
+    alike = alike_cells(state) if alike is None else alike
+    fractions = np.zeros((len(ends), len(CellState)))
+    bounds = np.linspace(0, len(ends), 1 + min(core_count(), 1 + len(ends) // _SEGMENTS_PER_CORE)).astype(int)
 
     def fill(block: slice) -> None:
-        _fill_shares(state, alike, starts[block], ends[block], shares[block])
+        _fill_fractions(state, alike, starts[block], ends[block], fractions[block])
 
-    if len(blocks) == 1:
-        fill(blocks[0])
-    else:
-        with ThreadPoolExecutor(len(blocks)) as pool:
-            list(pool.map(fill, blocks))
-    return np.clip(shares, 0.0, 1.0)
+    blocks = itertools.starmap(slice, itertools.pairwise(bounds))
+    for _ in map(fill, blocks) if len(bounds) == 2 else in_order(fill, blocks):
+        pass
+    return np.clip(fractions, 0.0, 1.0)
+
+
+class Segment(NamedTuple):
+    """A segment in the plane: its start, its extent along each axis, and the inverse of that [cells]."""
+
+    x: float
+    y: float
+    step_x: float
+    step_y: float
+    pace_x: float
+    pace_y: float
+
+
+@njit(cache=True)
+def segment_between(x: float, y: float, end_x: float, end_y: float) -> Segment:
+    """Return the segment between two points [cells]."""
+    step_x, step_y = end_x - x, end_y - y
+    pace_x = 1.0 / step_x if step_x != 0.0 else np.inf
+    pace_y = 1.0 / step_y if step_y != 0.0 else np.inf
+    return Segment(x, y, step_x, step_y, pace_x, pace_y)
+
+
+@njit(cache=True)
+def enter_grid(segment: Segment, ny: int, nx: int) -> tuple[float, float, int, int]:
+    """Return the fractions at which a segment enters and leaves a grid, and the x and y lines it meets first inside."""
+    enter_x, leave_x = _enter_axis(segment.x, segment.step_x, nx)
+    enter_y, leave_y = _enter_axis(segment.y, segment.step_y, ny)
+    enter, leave = max(enter_x, enter_y), min(leave_x, leave_y)
+    line_x = _first_line(segment.x + enter * segment.step_x, segment.step_x)
+    line_y = _first_line(segment.y + enter * segment.step_y, segment.step_y)
+    return enter, leave, line_x, line_y
+
+
+@njit(cache=True)
+def leave_cells(
+    segment: Segment, line_x: int, line_y: int, skip: int, here: float, leave: float
+) -> tuple[float, int, int]:
+    """Walk from fraction `here` out of a cell and `skip` cells around it (Amanatides and Woo 1987).
+
+    Returns the fraction reached, at most `leave`, and the x and y lines met next. The distance to each line is computed
+    afresh, so that rounding does not add up.
+    """
+    turn_x, turn_y = (1 if segment.step_x > 0.0 else -1), (1 if segment.step_y > 0.0 else -1)
+    at_x = (line_x + turn_x * skip - segment.x) * segment.pace_x if segment.step_x != 0.0 else np.inf
+    at_y = (line_y + turn_y * skip - segment.y) * segment.pace_y if segment.step_y != 0.0 else np.inf
+    there = min(max(here, min(at_x, at_y)), leave)
+    if at_x <= there:
+        line_x += turn_x * (skip + 1)
+    elif skip:
+        line_x = _first_line(segment.x + there * segment.step_x, segment.step_x)
+    if at_y <= there:
+        line_y += turn_y * (skip + 1)
+    elif skip:
+        line_y = _first_line(segment.y + there * segment.step_y, segment.step_y)
+    return there, line_x, line_y
 
 
 @njit(cache=True, nogil=True)
-def _fill_shares(
-    state: NDArray[np.uint8],
-    alike: NDArray[np.int32],
-    starts: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    shares: NDArray[np.float64],
+def _fill_fractions(
+    state: NDArray[np.uint8], alike: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats
 ) -> None:
-    """Add the shares of segments in cells of each state to `shares` (N, 3)."""
+    """Add the fractions of segments in cells of each state to `fractions` (N, 3), over alike cells at once."""
+    ny, nx = state.shape
     for i in range(len(ends)):
-        start_x, start_y = starts[i, 0], starts[i, 1]
-        step_x, step_y = ends[i, 0] - start_x, ends[i, 1] - start_y
-        if min(abs(step_x), abs(step_y)) < _ALONG_CELLS:
-            _add_along_axis(state, start_x, start_y, step_x, step_y, shares[i])
-        else:
-            _add_across(state, alike, start_x, start_y, step_x, step_y, shares[i])
+        segment = segment_between(starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
+        along = min(abs(segment.step_x), abs(segment.step_y)) < _ALONG_CELLS
+        here, leave, line_x, line_y = enter_grid(segment, ny, nx)
+        fractions[i, _UNKNOWN] += 1.0 - max(0.0, leave - here)
+        while here < leave:
+            column = line_x - 1 if segment.step_x > 0.0 else line_x
+            row = line_y - 1 if segment.step_y > 0.0 else line_y
+            within = 0 <= row < ny and 0 <= column < nx
+            skip = alike[row, column] if within and not along else 0
+            there, line_x, line_y = leave_cells(segment, line_x, line_y, skip, here, leave)
+            if along:
+                middle = 0.5 * (here + there)
+                kind = _freest(state, segment.x + middle * segment.step_x, segment.y + middle * segment.step_y)
+            else:
+                kind = state[row, column] if within else _UNKNOWN
+            fractions[i, kind] += there - here
+            here = there
 
 
 @njit(cache=True)
-def _add_across(
-    state: NDArray[np.uint8],
-    alike: NDArray[np.int32],
-    start_x: float,
-    start_y: float,
-    step_x: float,
-    step_y: float,
-    shares: NDArray[np.float64],
-) -> None:
-    """Add the shares of a segment that runs along no border of cells.
-
-    The grid is walked from line to line (Amanatides and Woo 1987), and over cells that are all alike at once. The
-    distance to each line is computed afresh, so that rounding does not add up.
-    """
-    ny, nx = state.shape
-    here, leave = _inside_grid(state, start_x, start_y, step_x, step_y, shares)
-    turn_x, turn_y = (1 if step_x > 0.0 else -1), (1 if step_y > 0.0 else -1)
-    pace_x, pace_y = 1.0 / step_x, 1.0 / step_y
-    line_x = int(first_line(start_x + here * step_x, step_x))
-    line_y = int(first_line(start_y + here * step_y, step_y))
-    while here < leave:
-        column = line_x - 1 if turn_x > 0 else line_x
-        row = line_y - 1 if turn_y > 0 else line_y
-        within = 0 <= row < ny and 0 <= column < nx
-        over = alike[row, column] if within else 0
-        reach_x = (line_x + turn_x * over - start_x) * pace_x
-        reach_y = (line_y + turn_y * over - start_y) * pace_y
-        there = min(max(here, min(reach_x, reach_y)), leave)
-        shares[state[row, column] if within else _UNKNOWN] += there - here
-        if reach_x <= there:
-            line_x += turn_x * (over + 1)
-        elif over:
-            line_x = int(first_line(start_x + there * step_x, step_x))
-        if reach_y <= there:
-            line_y += turn_y * (over + 1)
-        elif over:
-            line_y = int(first_line(start_y + there * step_y, step_y))
-        here = there
-
-
-@njit(cache=True)
-def _add_along_axis(
-    state: NDArray[np.uint8], start_x: float, start_y: float, step_x: float, step_y: float, shares: NDArray[np.float64]
-) -> None:
-    """Add the shares of a segment along an axis, which may run along the border of cells for a while."""
-    here, leave = _inside_grid(state, start_x, start_y, step_x, step_y, shares)
-    line_x = first_line(start_x + here * step_x, step_x)
-    line_y = first_line(start_y + here * step_y, step_y)
-    while here < leave:
-        reach_x = (line_x - start_x) / step_x if step_x != 0.0 else np.inf
-        reach_y = (line_y - start_y) / step_y if step_y != 0.0 else np.inf
-        there = min(max(here, min(reach_x, reach_y)), leave)
-        middle = 0.5 * (here + there)
-        shares[_freest(state, start_x + middle * step_x, start_y + middle * step_y)] += there - here
-        if reach_x <= there:
-            line_x += np.sign(step_x)
-        if reach_y <= there:
-            line_y += np.sign(step_y)
-        here = there
-
-
-@njit(cache=True)
-def _inside_grid(
-    state: NDArray[np.uint8], start_x: float, start_y: float, step_x: float, step_y: float, shares: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Return the shares of a segment at which it enters and leaves the grid, and add that outside as unknown."""
-    ny, nx = state.shape
-    enter_x, leave_x = shares_inside(start_x, step_x, nx)
-    enter_y, leave_y = shares_inside(start_y, step_y, ny)
-    enter, leave = max(enter_x, enter_y), min(leave_x, leave_y)
-    shares[_UNKNOWN] += 1.0 - max(0.0, leave - enter)
-    return enter, leave
-
-
-@njit(cache=True)
-def shares_inside(start: float, step: float, size: int) -> tuple[float, float]:
-    """Return the shares of a segment at which it enters and leaves [0, size] along one axis; enter > leave if never."""
+def _enter_axis(start: float, step: float, size: int) -> tuple[float, float]:
+    """Return the fractions at which a segment enters and leaves [0, size] along one axis; enter > leave if never."""
     if step == 0.0:
         return (0.0, 1.0) if 0.0 <= start <= size else (1.0, 0.0)
     low, high = -start / step, (size - start) / step
@@ -227,20 +185,15 @@ def shares_inside(start: float, step: float, size: int) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def first_line(place: float, step: float) -> float:
-    """Return the first grid line that is met from `place` in the direction of `step`."""
-    return np.floor(place) + 1.0 if step > 0.0 else np.ceil(place) - 1.0
+def _first_line(position: float, step: float) -> int:
+    """Return the first grid line that is met from `position` in the direction of `step`."""
+    return int(np.floor(position)) + 1 if step > 0.0 else int(np.ceil(position)) - 1
 
 
 @njit(cache=True)
 def _freest(state: NDArray[np.uint8], x: float, y: float) -> int:
     """Return the state of the freest cell within 1e-6 cells of a point [cells]: FREE before UNKNOWN before WALL."""
     ny, nx = state.shape
-    row, column = int(np.floor(y)), int(np.floor(x))
-    deep_x = _BORDER_CELLS < x - column < 1.0 - _BORDER_CELLS
-    deep_y = _BORDER_CELLS < y - row < 1.0 - _BORDER_CELLS
-    if deep_x and deep_y and 0 <= row < ny and 0 <= column < nx:
-        return int(state[row, column])
     found = _WALL
     for row in range(int(np.floor(y - _BORDER_CELLS)), int(np.floor(y + _BORDER_CELLS)) + 1):
         for column in range(int(np.floor(x - _BORDER_CELLS)), int(np.floor(x + _BORDER_CELLS)) + 1):

@@ -1,4 +1,4 @@
-"""What a map shows around a transmitter, as the image that a convolutional network reads: PartialMap -> window."""
+"""Windows of a map around transmitters: the images that the map networks read."""
 
 import math
 from collections.abc import Sequence
@@ -11,17 +11,16 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.link_context import LinkContext
-from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_shares
+from sionna_partial.prediction.unobserved import GRAZE, Floats, in_cells, line_fractions
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
 """Number of cells along each side of a window, and their edge in each of a transmitter's windows, near to far [m]."""
 
 CHANNELS = ("free", "wall", "seen", "hidden", "detour")
-"""What a cell of a window says, each in 255ths, and 0 where nothing was observed.
+"""Values of a cell of a window, each in 255ths, and 0 where nothing was observed.
 
-free, wall: share of the cell's area that is known to be so. seen: share of the direct line from the transmitter that is
-observed. hidden: whether that line meets a known wall. detour: how much longer the way on foot is, see `_detours`.
+free, wall: fraction of the cell's area that is known to be so. seen: fraction of the direct line from the transmitter
+that is observed. hidden: whether that line meets a known wall. detour: how much longer the walk is, see `_detours`.
 """
 
 WINDOWS = (len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
@@ -31,49 +30,41 @@ _FINEST = 4
 """Number of cells of the map along a cell of the window, at most: finer maps are made coarser, once for all windows."""
 
 _WALL_COST = 100.0
-"""Cost of a cell of nothing but wall to one who walks, in cells."""
+"""Cost of walking through a cell of nothing but wall [cells]."""
 
 _LONGEST_DETOUR = 40.0
 """[cells]"""
 
 
-def transmitter_places(context: LinkContext) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Return map number, x and y (W, 3) of every transmitter on every map, and which of them is each link's (N,)."""
-    keys = np.column_stack([context.map_index, context.tx_m[:, :2]])
-    places, index = np.unique(keys, axis=0, return_inverse=True)
-    return places, index.reshape(-1)
+def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Return map, x and y (W, 3) of the transmitters of links, and which is each link's (N,).
+
+    `map_index` (N,) is the map of each link, `tx_m` (N, 3) its transmitter [m].
+    """
+    keys, index = np.unique(np.column_stack([map_index, tx_m[:, :2]]), axis=0, return_inverse=True)
+    return keys, index.reshape(-1)
 
 
-def transmitter_windows(context: LinkContext) -> NDArray[np.uint8]:
-    """Draw the windows (W, *WINDOWS) of every transmitter on every map, in the order of `transmitter_places`."""
-    places, _ = transmitter_places(context)
-    windows = np.zeros((len(places), *WINDOWS), dtype=np.uint8)
-    for number in np.unique(places[:, 0]).astype(int):
-        here = places[:, 0] == number
-        windows[here] = map_windows(context.maps[number], places[here, 1:])
+def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
+    """Draw the windows (W, *WINDOWS) of transmitters of `transmitters`."""
+    windows = np.zeros((len(keys), *WINDOWS), dtype=np.uint8)
+    for number in np.unique(keys[:, 0]).astype(int):
+        here = keys[:, 0] == number
+        windows[here] = map_windows(maps[number], keys[here, 1:])
     return windows
 
 
-def map_windows(partial: PartialMap, tx_m: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Draw the windows around the transmitters of one map.
+def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
+    """Draw the windows (T, *WINDOWS) around transmitters (T, 2) [m] of one map.
 
-    Parameters
-    ----------
-    partial : PartialMap
-    tx_m : (T, 2) float64 array
-        Their x and y [m].
-
-    Returns
-    -------
-    (T, *WINDOWS) uint8 array
-        Row 0 of a window has the smallest y, and the transmitter is in the middle.
+    Row 0 of a window has the smallest y, and the transmitter is in the middle.
     """
     windows = np.zeros((len(tx_m), *WINDOWS), dtype=np.uint8)
     if not (partial.state == CellState.UNKNOWN).all():
         for scale, cell_m in enumerate(CELLS_M):
             plan = _coarser(partial, cell_m / _FINEST)
             for window, at_m in zip(windows[:, scale], tx_m, strict=True):
-                window[:] = _window(plan, at_m, cell_m, beside_walls=plan is not partial)
+                window[:] = _window(plan, at_m, cell_m, clear_around_tx=plan is not partial)
     return windows
 
 
@@ -90,36 +81,31 @@ def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
     return PartialMap(coarse, factor * partial.resolution_m, partial.origin_m)
 
 
-def _window(partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float, *, beside_walls: bool) -> NDArray[np.uint8]:
-    """Draw the window with cells of `cell_m` around a transmitter, which may stand in a wall that was drawn coarser."""
+def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
+    """Draw the window with cells of `cell_m` around a transmitter, which may be in a wall that was drawn coarser."""
     state, start = _surroundings(partial, tx_m, cell_m)
-    if beside_walls:
+    if clear_around_tx:
         column, row = np.floor(start).astype(int)
         beside = state[row - 1 : row + 2, column - 1 : column + 2]
         beside[beside == CellState.WALL] = CellState.FREE
     steps = cell_m / partial.resolution_m * (np.arange(WINDOW_CELLS + 1) - WINDOW_CELLS / 2)
     edges = start[:, None] + steps
-    free, wall = _plan(state, edges)
+    columns, rows = (_overlaps(edge, len(state)) for edge in edges)
+    free, wall = (rows @ (state == kind) @ columns.T for kind in (CellState.FREE, CellState.WALL))
     centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
-    starts = np.tile(start, (len(centres), 1))
-    lines = line_shares(state, starts, centres).reshape(*free.shape, -1)
+    lines = line_fractions(state, np.tile(start, (len(centres), 1)), centres).reshape(*free.shape, -1)
     hidden = lines[..., CellState.WALL] > GRAZE
-    return _in_255ths([free, wall, 1.0 - lines[..., CellState.UNKNOWN], hidden, _detours(wall)])
-
-
-def _in_255ths(layers: Sequence[NDArray[np.generic]]) -> NDArray[np.uint8]:
+    layers = [free, wall, 1.0 - lines[..., CellState.UNKNOWN], hidden, _detours(wall)]
     return np.round(255.0 * np.stack(layers, axis=-1)).astype(np.uint8)
 
 
-def _surroundings(
-    partial: PartialMap, tx_m: NDArray[np.float64], cell_m: float
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Extend or cut a map to what a window covers, and say where the transmitter is in it [cells]."""
-    reach = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
+def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[NDArray[np.uint8], Floats]:
+    """Extend or cut a map to what a window covers, and return where the transmitter is in it [cells]."""
+    half = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
     start = in_cells(partial, tx_m)
     column, row = np.floor(start).astype(int)
-    spans = [(low - reach, low + reach + 1) for low in (row, column)]
-    state = np.full((2 * reach + 1, 2 * reach + 1), CellState.UNKNOWN, dtype=np.uint8)
+    spans = [(low - half, low + half + 1) for low in (row, column)]
+    state = np.full((2 * half + 1, 2 * half + 1), CellState.UNKNOWN, dtype=np.uint8)
     inner = [(max(low, 0), min(high, count)) for (low, high), count in zip(spans, partial.shape, strict=True)]
     if all(low < high for low, high in inner):
         known = partial.state[inner[0][0] : inner[0][1], inner[1][0] : inner[1][1]]
@@ -128,33 +114,27 @@ def _surroundings(
     return state, start - np.array([spans[1][0], spans[0][0]])
 
 
-def _plan(state: NDArray[np.uint8], edges: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-    """Shares of the area of the window's cells that are free, and wall."""
-    columns, rows = (_overlaps(edge, len(state)) for edge in edges)
-    return [rows @ (state == kind) @ columns.T for kind in (CellState.FREE, CellState.WALL)]
-
-
-def _overlaps(edges: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Share of each interval between `edges` (K + 1,) that each of `count` unit cells covers: (K, count)."""
+def _overlaps(edges: Floats, count: int) -> Floats:
+    """Fraction of each interval between `edges` (K + 1,) that each of `count` unit cells covers: (K, count)."""
     cells = np.arange(count)
     low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)
     return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
 
 
-def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
-    """How much longer the way around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR`.
+def _detours(wall: Floats) -> Floats:
+    """How much longer the route around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR`.
 
-    Ways go from the four cells in the middle from cell to cell, also across corners. Walls are crossed at a price.
+    Routes go from the four cells in the middle from cell to cell, also across corners; walls are crossed at a cost.
     """
-    ends, lengths = _steps()
+    ends, lengths = _neighbours()
     half = WINDOW_CELLS // 2
     middle = np.s_[half - 1 : half + 1, half - 1 : half + 1]
     cost = 1.0 + _WALL_COST * wall
     cost[middle] = 1.0
     weights = lengths * 0.5 * (cost.ravel()[ends[0]] + cost.ravel()[ends[1]])
-    ways = csr_array((weights, ends), shape=(cost.size, cost.size))
+    graph = csr_array((weights, ends), shape=(cost.size, cost.size))
     start = np.arange(cost.size).reshape(cost.shape)[middle].ravel()
-    costs = dijkstra(ways, directed=False, indices=start, min_only=True).reshape(wall.shape)
+    costs = dijkstra(graph, directed=False, indices=start, min_only=True).reshape(wall.shape)
     offsets = np.abs(np.arange(WINDOW_CELLS) - half + 0.5) - 0.5
     short, long = np.minimum.outer(offsets, offsets), np.maximum.outer(offsets, offsets)
     straight = long + (math.sqrt(2.0) - 1.0) * short
@@ -162,7 +142,7 @@ def _detours(wall: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @cache
-def _steps() -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _neighbours() -> tuple[NDArray[np.intp], Floats]:
     """Pairs of neighbouring cells (2, E), and their distances (E,) [cells]."""
     cell = np.arange(WINDOW_CELLS**2).reshape(WINDOW_CELLS, WINDOW_CELLS)
     pairs = [(cell[:, :-1], cell[:, 1:]), (cell[:-1], cell[1:]), (cell[:-1, :-1], cell[1:, 1:])]

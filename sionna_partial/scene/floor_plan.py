@@ -22,14 +22,8 @@ _WALLS_PER_CELL = 4.0
 class WallIndex(NamedTuple):
     """Square cells over a plan, row by row, and the wall pieces that may cross each.
 
-    Parameters
-    ----------
-    grid : (5,) float64 array
-        Corner x0 and y0 and edge of the cells [m], numbers of columns and rows.
-    start : (B + 1,) int64 array
-        First entry of each cell.
-    piece : (E,) int32 array
-        Pieces, cell by cell.
+    `grid` (5,) is the corner x0 and y0 and the edge of the cells [m], and the numbers of columns and rows. The pieces
+    of a cell are `piece` (E,) from `start` (B + 1,) of the cell to that of the next.
     """
 
     grid: NDArray[np.float64]
@@ -40,13 +34,8 @@ class WallIndex(NamedTuple):
 class Plan(NamedTuple):
     """Walls of a floor plan, cut where they cross.
 
-    Parameters
-    ----------
-    pieces_m : (K, 2, 2) float64 array
-        End points of the pieces [m].
-    owner, line : (K,) int32 arrays
-        Wall segment that each piece is a part of, and number of the infinite line that it lies on.
-    cells : WallIndex
+    `pieces_m` (K, 2, 2) are the end points of the pieces [m], `owner` (K,) the wall segments that they are parts of,
+    and `line` (K,) the numbers of the infinite lines that they lie on.
     """
 
     pieces_m: NDArray[np.float64]
@@ -56,18 +45,10 @@ class Plan(NamedTuple):
 
 
 class PointBins(NamedTuple):
-    """Points sorted into square bins, row by row.
+    """Points (N, 2) [m] sorted into square bins, row by row.
 
-    Parameters
-    ----------
-    points_m : (N, 2) float64 array
-        The points in the order of their bins [m].
-    order : (N,) int64 array
-        Index of each of them before sorting.
-    start : (B + 1,) int64 array
-        First point of each bin.
-    grid : (4,) float64 array
-        Corner x0 and y0 and edge of the bins [m], and number of columns.
+    `order` (N,) is the index of each of them before sorting, `start` (B + 1,) the first point of each bin; `grid` (4,)
+    the corner x0 and y0 and the edge of the bins [m], and the number of columns.
     """
 
     points_m: NDArray[np.float64]
@@ -102,8 +83,8 @@ def grow(array, size):  # type: ignore[no-untyped-def]
     if size <= array.shape[0]:
         return array
     larger = np.empty((max(size, 2 * array.shape[0]),) + array.shape[1:], array.dtype)  # noqa: RUF005 (numba)
-    for place in np.ndindex(array.shape):
-        larger[place] = array[place]
+    for index in np.ndindex(array.shape):
+        larger[index] = array[index]
     return larger
 
 
@@ -118,10 +99,10 @@ def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64]
     u, v = cross(away, along[other]) / area, cross(away, along[own]) / area
     crossed = (u > 1e-9) & (u < 1.0 - 1e-9) & (v > 1e-9) & (v < 1.0 - 1e-9)
     owner = np.concatenate([np.repeat(np.arange(len(walls)), 2), own[crossed]])
-    place = np.concatenate([np.tile([0.0, 1.0], len(walls)), u[crossed]])
-    order = np.lexsort([place, owner])
-    owner, place = owner[order], place[order, None]
-    ends = np.where(place < 1.0, start[owner] + place * along[owner], walls[owner, 1])
+    fraction = np.concatenate([np.tile([0.0, 1.0], len(walls)), u[crossed]])
+    order = np.lexsort([fraction, owner])
+    owner, fraction = owner[order], fraction[order, None]
+    ends = np.where(fraction < 1.0, start[owner] + fraction * along[owner], walls[owner, 1])
     piece = np.flatnonzero(owner[:-1] == owner[1:])
     return np.stack([ends[piece], ends[piece + 1]], axis=1), owner[piece].astype(np.int32)
 

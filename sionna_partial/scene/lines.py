@@ -18,51 +18,42 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 
 
 def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Split a polyline of straight elements into few straight runs.
+    """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` of the middle of every unit edge, measured along x or y
-    (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
+    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, measured along x or
+    y (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
     lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
     more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
     notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
     residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a
     ragged one is parallel to an axis where that moves its ends by half a cell at most.
 
-    Parameters
-    ----------
-    points : (n, 2) float64 array
-        Corners of the polyline [cells].
-    tolerance : float
-        Largest deviation where the polyline is not ragged [cells].
-
-    Returns
-    -------
-    starts : (r,) int64 array
-        Index of the corner where every run begins.
-    lines : (r, 4) float64 array
-        Point x, y on and direction x, y of every run's line.
+    Returns the index of the corner where every run begins (r,), and a point x, y on and the direction x, y of its line
+    (r, 4).
     """
-    points, tolerance = np.ascontiguousarray(points), tolerance + 1e-6
+    upright, lying = np.ascontiguousarray(points[:, ::-1]), np.ascontiguousarray(points)
+    tolerance = tolerance + 1e-6
     previous, along_y = np.zeros(len(points), np.int64), np.zeros(len(points), np.bool_)
-    _find_runs(points, tolerance, np.full(len(points), np.inf), previous, along_y)
+    _find_runs(lying, upright, tolerance, np.full(len(points), np.inf), previous, along_y)
     starts, lines, end = [], [], len(points) - 1
     while end > 0:
         starts.append(int(previous[end]))
-        lines.append(_line(points, starts[-1], end, tolerance, along_y[end]))
+        x, y, along, across = _line(upright if along_y[end] else lying, starts[-1], end, tolerance)
+        lines.append((y, x, across, along) if along_y[end] else (x, y, along, across))
         end = starts[-1]
     return np.array(starts[::-1], np.int64), np.array(lines[::-1]).reshape(-1, 4)
 
 
 @njit(cache=True)
-def _find_runs(points, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
+def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
     """Write where the cheapest run to every corner begins, and whether it is along y, by dynamic programming."""
     cost[0] = 0.0
     for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
             cost[i + 1], previous[i + 1] = cost[i] + 1.0, i
             along_y[i + 1] = abs(points[i + 1, 1] - points[i, 1]) > abs(points[i + 1, 0] - points[i, 0])
-        for swap in (False, True):
-            _extend(points, tolerance, i, swap, cost, previous, along_y)
+        _extend(points, tolerance, i, False, cost, previous, along_y)
+        _extend(swapped, tolerance, i, True, cost, previous, along_y)
 
 
 @njit(cache=True)
@@ -71,21 +62,21 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
     near, near_size = _all_lines()
     far, far_size = _all_lines()
     sums = np.zeros(6)
-    sign, turn, reversals, i = 0.0, 0.0, 0, int(swap)
+    sign, turn, reversals = 0.0, 0.0, 0
     for k in range(start, len(points) - 1):
-        ahead, aside = points[k + 1, i] - points[k, i], points[k + 1, 1 - i] - points[k, 1 - i]
+        ahead, aside = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
         if ahead * sign < 0.0:
             return
         sign = ahead if sign == 0.0 else sign
         reversals += int(aside * turn < 0.0)
         turn = aside if aside != 0.0 else turn
-        element = _middles(points, start, k, swap)
+        element = _middles(points, start, k)
         near_size = _clip_element(near, near_size, element, tolerance)
         far_size = _clip_element(far, far_size, element, RAGGED_FACTOR * tolerance)
         if far_size == 0:
             return
         _accumulate(sums, element)
-        length = abs(points[k + 1, i] - points[start, i])
+        length = abs(points[k + 1, 0] - points[start, 0])
         if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
             total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums) / max(tolerance, 0.25) ** 2
             if total < cost[k + 1] - 1e-12:
@@ -93,41 +84,35 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
 
 
 @njit(cache=True)
-def _line(points, start, end, tolerance, swap):  # type: ignore[no-untyped-def]
+def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
     """Point on and direction of the line that fits a run; a ragged one is parallel to an axis if that is as good."""
-    polygon, size, sums = _lines_within(points, start, end, tolerance, swap)
-    ragged = size == 0
-    if ragged:
-        tolerance = RAGGED_FACTOR * tolerance
-        polygon, size, sums = _lines_within(points, start, end, tolerance, swap)
+    for factor in (1.0, RAGGED_FACTOR):
+        limit, sums = factor * tolerance, np.zeros(6)
+        polygon, size = _all_lines()
+        for k in range(start, end):
+            element = _middles(points, start, k)
+            size = _clip_element(polygon, size, element, limit)
+            _accumulate(sums, element)
+        ragged = factor > 1.0
+        if size > 0:
+            break
     mean_x, mean_y = sums[1] / sums[0], sums[2] / sums[0]
     spread = sums[3] - sums[1] * mean_x
     slope = (sums[4] - sums[1] * mean_y) / spread if spread > 1e-9 else 0.0
-    if ragged and abs(slope * (points[end, int(swap)] - points[start, int(swap)])) <= _LEVEL_CELLS:
+    if ragged and abs(slope * (points[end, 0] - points[start, 0])) <= _LEVEL_CELLS:
         slope = 0.0
     offset = mean_y - slope * mean_x
-    if size > 0 and not _fits(points, start, end, tolerance, swap, slope, offset):
+    fits = True
+    for k in range(start, end):
+        x0, y0, x1, y1, _ = _middles(points, start, k)
+        fits = fits and max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) <= limit
+    if size > 0 and not fits:
         slope, offset = 0.0, 0.0
         for k in range(size):
             slope, offset = slope + polygon[k, 0], offset + polygon[k, 1]
         slope, offset = slope / size, offset / size
-    x, y = points[start, int(swap)] + mean_x, points[start, 1 - int(swap)] + slope * mean_x + offset
-    norm = np.sqrt(1.0 + slope * slope)
-    if swap:
-        return y, x, slope / norm, 1.0 / norm
+    x, y, norm = points[start, 0] + mean_x, points[start, 1] + slope * mean_x + offset, np.sqrt(1.0 + slope * slope)
     return x, y, 1.0 / norm, slope / norm
-
-
-@njit(cache=True)
-def _lines_within(points, start, end, tolerance, swap):  # type: ignore[no-untyped-def]
-    """Polygon of the lines that fit a run, its number of corners, and the sums over the run."""
-    polygon, size = _all_lines()
-    sums = np.zeros(6)
-    for k in range(start, end):
-        element = _middles(points, start, k, swap)
-        size = _clip_element(polygon, size, element, tolerance)
-        _accumulate(sums, element)
-    return polygon, size, sums
 
 
 @njit(cache=True)
@@ -142,20 +127,10 @@ def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _fits(points, start, end, tolerance, swap, slope, offset):  # type: ignore[no-untyped-def]
-    for k in range(start, end):
-        x0, y0, x1, y1, _ = _middles(points, start, k, swap)
-        if max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) > tolerance:
-            return False
-    return True
-
-
-@njit(cache=True)
-def _middles(points, origin, k, swap):  # type: ignore[no-untyped-def]
+def _middles(points, origin, k):  # type: ignore[no-untyped-def]
     """Middles of the first and last unit edge of element k, relative to a corner, and the number of edges."""
-    i, j = int(swap), 1 - int(swap)
-    x, y = points[k, i] - points[origin, i], points[k, j] - points[origin, j]
-    dx, dy = points[k + 1, i] - points[k, i], points[k + 1, j] - points[k, j]
+    x, y = points[k, 0] - points[origin, 0], points[k, 1] - points[origin, 1]
+    dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
     a, b = abs(round(dx)), abs(round(dy))
     while b > 0:
         a, b = b, a % b
@@ -213,9 +188,9 @@ def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
                 kept[count, 0], kept[count, 1] = slope, offset
                 count += 1
             if inside * next_inside < 0.0:
-                share = inside / (inside - next_inside)
-                kept[count, 0] = slope + (next_slope - slope) * share
-                kept[count, 1] = offset + (next_offset - offset) * share
+                fraction = inside / (inside - next_inside)
+                kept[count, 0] = slope + (next_slope - slope) * fraction
+                kept[count, 1] = offset + (next_offset - offset) * fraction
                 count += 1
             if count > _CORNERS - 2:
                 return 0

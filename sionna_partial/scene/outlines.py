@@ -1,21 +1,30 @@
-"""PartialMap -> wall outlines: few straight segments through the centres of the boundary wall cells."""
+"""PartialMap -> wall outlines: straight segments through the centres of the boundary wall cells."""
 
+import itertools
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.graph import wall_graph
+from sionna_partial.planar import cross
 from sionna_partial.scene.lines import fit_runs
-from sionna_partial.scene.polylines import Chain, WallGraph, turns, wall_chains
 from sionna_partial.scene.wall_cells import wall_cells
 
+_KEY = 1 << 32
+_LOOK_EDGES = 6
+_THROUGH_COSINE = -0.85
 _REACH_CELLS = 1.0
 _OFFSET_CELLS = 1.0
 _MIN_SHIFT_CELLS = 0.25
+
+Points = NDArray[np.float64]
+"""Points (n, 2) [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,114 +45,222 @@ class Outlines:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
-    """A chain's corners (n,), as indices into its points, and the straight runs between them."""
+class _Graph:
+    """Edges (E, 2) between lattice points (V, 2), x and y in half cells; odd numbers are cell centres."""
 
-    corners: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    points: NDArray[np.int64]
+    edges: NDArray[np.int64]
+
+    @cached_property
+    def degree(self) -> NDArray[np.intp]:
+        """Number of edges (V,) at every point."""
+        return np.bincount(self.edges.ravel(), minlength=len(self.points))
+
+
+@dataclass(eq=False)
+class _FittedChain:
+    """A chain of points (n,) of a graph, and the straight runs that fit it.
+
+    Runs have lines (R, 4) of a point x, y on them and a direction x, y [cells], and begin at `first` (R,). `corners`
+    are the indices of its points where the chain turns. Runs that are `plain` (R,) keep their corners.
+    """
+
+    points: NDArray[np.int64]
+    corners: NDArray[np.intp]
+    first: NDArray[np.intp]
     lines: NDArray[np.float64]
+    plain: NDArray[np.bool_]
+
+    @property
+    def closed(self) -> bool:
+        return bool(self.points[0] == self.points[-1])
+
+    @cached_property
+    def beside(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Runs before and after each of the points."""
+        k = np.arange(len(self.points))
+        before, after = np.searchsorted(self.first, k) - 1, np.searchsorted(self.first, k, side="right") - 1
+        if self.closed:
+            return before % len(self.first), np.where(k == len(k) - 1, 0, after)
+        return np.maximum(before, 0), after
 
 
 def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.5) -> Outlines:
-    """Outline the walls of a map.
+    """Outline the walls of a map by few straight segments, which meet only at shared vertices.
 
     A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Of a wall that
-    was seen from one side, the face on that side is outlined. Only WALL cells, and short gaps between them, bear
-    outlines. An end that UNKNOWN cells follow reaches the border of the last cell. A map that is turned, mirrored,
-    padded with UNKNOWN cells or moved has the same outlines, transformed; only where a map equals its own mirror image
-    may they depend on the orientation.
+    was seen from one side, the face on that side is outlined. Only WALL cells, and short gaps between them
+    (`bridge_gap_m`), bear outlines. An end that UNKNOWN cells follow reaches the border of the last cell. A map that is
+    turned, mirrored, padded with UNKNOWN cells or moved has the same outlines, transformed; only where a map equals its
+    own mirror image may they depend on the orientation.
 
-    Parameters
-    ----------
-    partial : PartialMap
-    tolerance_cells : float
-        Largest distance of an outline from the lattice line through the cell centres [cells]. From 0.5 on, the
-        staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
-        noise made thick and rough, and again twice as much where a face turns to and fro at least once in 10 cells.
-    bridge_gap_m : float
-        Longest gap of UNKNOWN cells in a seen wall that is closed [m].
-
-    Returns
-    -------
-    Outlines
-        Segments meet only at shared vertices.
+    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres. From 0.5 on,
+    the staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
+    noise made thick and rough, and again twice as much where a face turns to and fro at least once in 10 cells.
     """
-    state, corner = _crop(partial.state, 1 + int(bridge_gap_m / partial.resolution_m + 1e-6))
-    turned, turn = _canonical(state)
-    cells = assemble(_lines(PartialMap(turned, partial.resolution_m), tolerance_cells, bridge_gap_m), 1.0)
-    vertices = turn.back(_extended(cells, turned)) + corner
-    return Outlines(vertices * partial.resolution_m, cells.segments)
-
-
-def _extended(outlines: Outlines, state: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Vertices [cells], with ends that UNKNOWN cells follow moved from the centre of the last cell to its border."""
-    vertices, segments = outlines.vertices_m.copy(), outlines.segments
-    ends, tails = segments.ravel(), segments[:, ::-1].ravel()
-    along = vertices[ends] - vertices[tails]
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    column, row = np.clip(np.floor(vertices[ends] + along).astype(int), 0, np.array(state.shape)[::-1] - 1).T
-    is_open = (np.bincount(ends)[ends] == 1) & (state[row, column] == CellState.UNKNOWN)
-    tips = shapely.linestrings(np.stack([vertices[ends], vertices[ends] + 0.5 * along], axis=1)[is_open])
-    index = np.nonzero(is_open)[0]
-    tip, line = shapely.STRtree(np.append(shapely.linestrings(vertices[segments]), tips)).query(tips, "intersects")
-    own = (line == index[tip] // 2) | (line == len(segments) + tip)
-    index = np.delete(index, tip[~own])
-    vertices[ends[index]] += 0.5 * along[index]
-    return vertices
-
-
-def _lines(partial: PartialMap, tolerance_cells: float, bridge_gap_m: float) -> list[NDArray[np.float64]]:
-    """Polylines (n, 2) [cells] that meet only at equal vertices."""
-    walls = wall_cells(partial, bridge_gap_m)
-    graph = wall_graph(walls.cells)
-    chains = wall_chains(graph)
-    places, shift = graph.points / 2.0, _layer_shift(graph.points, walls.peeled)
-    fits = [_fit(places, shift, chain, (1.0 + walls.noise) * tolerance_cells) for chain in chains]
-    plain = [np.full(len(f.lines), graph.points[c.points[0], 0] % 2 == 0) for c, f in zip(chains, fits, strict=True)]
-    while True:
-        lines, runs = _polylines(graph, places, chains, fits, plain)
-        if not _keep_crossing(lines, runs, plain):
-            return lines
-
-
-def _crop(state: NDArray[np.uint8], margin: int) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Cut cells to the walls and a margin around, and return where the lower-left corner was [cells]."""
-    row, column = (np.nonzero((state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
+    margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
+    row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
     (bottom, top), (left, right) = ((used[0], used[-1]) if len(used) else (0, 0) for used in (row, column))
-    padded = np.pad(state, margin, constant_values=CellState.UNKNOWN)
-    part = padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1]
-    return part, np.array([left, bottom], dtype=float) - margin
+    padded = np.pad(partial.state, margin, constant_values=CellState.UNKNOWN)
+    state, transpose, flips = _canonical(padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1])
+
+    walls = wall_cells(PartialMap(state, partial.resolution_m), bridge_gap_m)
+    graph = _wall_graph(walls.cells, cut_spurs=True)
+    shift = _layer_shift(graph.points, walls.peeled)
+    chains = [_fitted(graph, shift, points, (1.0 + walls.noise) * tolerance_cells) for points in _chains(graph)]
+    while True:
+        lines, runs = _polylines(graph, chains)
+        if not _make_crossing_plain(lines, runs, chains):
+            break
+    outlines = _assembled(lines, 1.0)
+    vertices = _extended(outlines, state)
+    vertices = np.where(flips, np.array(state.shape[::-1]) - vertices, vertices)
+    vertices = (vertices[:, ::-1] if transpose else vertices) + (np.array([left, bottom], dtype=float) - margin)
+    return Outlines(vertices * partial.resolution_m, outlines.segments)
 
 
-@dataclass(frozen=True)
-class _Turn:
-    """Transposes a grid or not, then flips rows and columns or not."""
+def lattice_outlines(partial: PartialMap) -> Outlines:
+    """Outline the wall cells of a map as they are: the staircase through the centres of the boundary wall cells.
 
-    transpose: bool
-    flips: tuple[bool, bool]
-    shape: tuple[int, int]
-
-    def apply(self, state: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        turned = state.T if self.transpose else state
-        return np.ascontiguousarray(turned[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1])
-
-    def back(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (n, 2) of the turned grid, in the original one."""
-        height, width = self.shape[::-1] if self.transpose else self.shape
-        flipped = np.where(self.flips[::-1], np.array([width, height]) - points, points)
-        return flipped[:, ::-1] if self.transpose else flipped
-
-
-def _canonical(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], _Turn]:
-    """Turn or mirror a grid to its one orientation of the smallest bytes: the outlines turn with the map."""
-    turns = [_Turn(t, (r, c), state.shape) for t in (False, True) for r in (False, True) for c in (False, True)]
-    turned = [turn.apply(state) for turn in turns]
-    best = min(range(8), key=lambda k: (turned[k].shape, turned[k].tobytes()))
-    return turned[best], turns[best]
+    Cells that touch by a side are joined from centre to centre, and so are two that touch by a corner where no other
+    cell joins them. Collinear steps become one segment, at 0, 45 or 90 degrees; segments meet only at shared vertices.
+    Between the faces of thick walls there is nothing: a step with full blocks of two by two cells on either side is
+    left out. A lone cell is a square, its own border.
+    """
+    graph = _wall_graph(partial.state == CellState.WALL, cut_spurs=False)
+    lines = []
+    for chain in _chains(graph):
+        points = graph.points[chain]
+        kept = graph.degree[chain] != 2
+        kept[1:-1] |= _turns(points)
+        kept[[0, -1]] = True
+        lines.append(points[kept] / 2.0)
+    return _assembled(lines, partial.resolution_m)
 
 
-def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Vectors [cells] from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
+def _canonical(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], bool, tuple[bool, bool]]:
+    """Turn or mirror a grid to its one orientation of the smallest bytes, so that the outlines turn with the map.
+
+    Returns the grid, whether it was transposed, and whether columns and rows were flipped then.
+    """
+
+    def turned(transpose: bool, flip_y: bool, flip_x: bool) -> NDArray[np.uint8]:
+        grid = state.T if transpose else state
+        return np.ascontiguousarray(grid[:: -1 if flip_y else 1, :: -1 if flip_x else 1])
+
+    turns = itertools.product((False, True), repeat=3)
+    best = min(turns, key=lambda turn: (turned(*turn).shape, turned(*turn).tobytes()))
+    return turned(*best), best[0], (best[2], best[1])
+
+
+def _wall_graph(wall: NDArray[np.bool_], *, cut_spurs: bool) -> _Graph:
+    """Connect the centres of boundary wall cells (ny, nx).
+
+    Edges join wall cells that touch by a side, unless both blocks of two by two cells beside the edge are full, and
+    by a corner where a block holds just these two. Spurs of one cell are cut off. Single cells become squares.
+    """
+    w = np.pad(wall, 1)
+    block = w[:-1, :-1] & w[:-1, 1:] & w[1:, :-1] & w[1:, 1:]
+    across = w[:, :-1] & w[:, 1:]
+    across[1:-1] &= ~(block[:-1] & block[1:])
+    upright = w[:-1] & w[1:]
+    upright[:, 1:-1] &= ~(block[:, :-1] & block[:, 1:])
+    rising = w[:-1, :-1] & w[1:, 1:] & ~w[:-1, 1:] & ~w[1:, :-1]
+    falling = ~w[:-1, :-1] & ~w[1:, 1:] & w[:-1, 1:] & w[1:, :-1]
+    kinds = ((across, 0, 0, 1, 0), (upright, 0, 0, 0, 1), (rising, 0, 0, 1, 1), (falling, 1, 0, 0, 1))
+    parts = [np.argwhere(mask)[:, None, ::-1] + np.reshape(ends, (2, 2)) for mask, *ends in kinds]
+    graph = _indexed(2 * np.concatenate(parts) - 1)
+    if cut_spurs:
+        ends_degree = graph.degree[graph.edges]
+        spur = (ends_degree.min(axis=1) == 1) & (ends_degree.max(axis=1) >= 3)
+        junction = np.where(ends_degree[:, 0] > ends_degree[:, 1], graph.edges[:, 0], graph.edges[:, 1])
+        spurs = np.bincount(junction[spur], minlength=len(graph.points))
+        spur &= spurs[junction] < graph.degree[junction]
+        graph = _indexed(graph.points[graph.edges[~spur]])
+    around = ndimage.convolve(wall.astype(np.uint8), np.ones((3, 3), dtype=np.uint8), mode="constant")
+    lone = 2 * np.argwhere(wall & (around == 1))[:, ::-1] + 1
+    corners = lone[:, None] + np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    squares = np.stack([corners, np.roll(corners, -1, axis=1)], 2).reshape(-1, 2, 2)
+    return _indexed(np.concatenate([graph.points[graph.edges], squares]))
+
+
+def _indexed(ends: NDArray[np.int64]) -> _Graph:
+    """Graph of edges given by the points of their ends (E, 2, 2)."""
+    unique, inverse = np.unique(ends[..., 1].ravel() * _KEY + ends[..., 0].ravel(), return_inverse=True)
+    edges = np.sort(inverse.reshape(-1, 2), axis=1)
+    edges = np.unique(edges, axis=0) if len(edges) else edges
+    return _Graph(np.stack([unique % _KEY, unique // _KEY], 1), edges.astype(np.int64))
+
+
+def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
+    """Split a graph into chains of points (n,), which have every edge once.
+
+    A chain passes points of two edges, and junctions where another edge leads on in about the same direction; it
+    ends elsewhere. Loops, whose first point is the last, begin at the point farthest from their centre.
+    """
+    beside: list[list[int]] = [[] for _ in range(len(graph.points))]
+    for a, b in graph.edges.tolist():
+        beside[a].append(b)
+        beside[b].append(a)
+    onward = _onward(graph, beside)
+    chains: list[NDArray[np.int64]] = []
+    used: set[tuple[int, int]] = set()
+    starts = [(a, b) for a, near in enumerate(beside) if len(near) != 2 for b in near if (b, a) not in onward]
+    for a, b in starts + [(a, b) for a, b in graph.edges.tolist()]:
+        if (a, b) in used:
+            continue
+        points = [a, b]
+        while True:
+            near = beside[points[-1]]
+            if len(near) == 2:
+                following: int | None = near[1] if near[0] == points[-2] else near[0]
+            else:
+                following = onward.get((points[-2], points[-1]))
+            if following is None or (points[-1], following) == (a, b):
+                break
+            points.append(following)
+        used.update(pairwise(points))
+        used.update(pairwise(points[::-1]))
+        if points[0] == points[-1]:
+            loop = graph.points[points[:-1]]
+            start = int(np.argmax(((loop - loop.mean(axis=0)) ** 2).sum(axis=1)))
+            points = points[start:-1] + points[: start + 1]
+        chains.append(np.array(points))
+    return chains
+
+
+def _onward(graph: _Graph, beside: list[list[int]]) -> dict[tuple[int, int], int]:
+    """Where a chain goes on at a junction: (from, junction) -> next point."""
+    onward: dict[tuple[int, int], int] = {}
+    for junction in np.nonzero(graph.degree > 2)[0].tolist():
+        arms, tips = beside[junction], []
+        for arm in arms:
+            previous, tip, count = junction, arm, 1
+            while count < _LOOK_EDGES and len(beside[tip]) == 2:
+                a, b = beside[tip]
+                previous, tip, count = tip, b if a == previous else a, count + 1
+            tips.append(tip)
+        vectors = (graph.points[tips] - graph.points[junction]).astype(float)
+        vectors /= np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1.0)
+        cosine = vectors @ vectors.T
+        for flat in np.argsort(cosine, axis=None, kind="stable").tolist():
+            a, b = divmod(flat, len(arms))
+            if cosine[a, b] > _THROUGH_COSINE:
+                break
+            if a < b and (arms[a], junction) not in onward and (arms[b], junction) not in onward:
+                onward[arms[a], junction] = arms[b]
+                onward[arms[b], junction] = arms[a]
+    return onward
+
+
+def _turns(points: NDArray[np.generic]) -> NDArray[np.bool_]:
+    """Whether a polyline (n, 2) turns at each of its inner points (n - 2,)."""
+    step = np.diff(points.astype(np.float64), axis=0)
+    return cross(step[1:], step[:-1]) != 0.0
+
+
+def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> Points:
+    """Vectors from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
     peeled = np.pad(peeled, 2)
     column, row = points.T // 2 + 2
     towards = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -151,115 +268,91 @@ def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> NDArra
     return beside @ towards / (1 + beside.sum(axis=1, keepdims=True))
 
 
-def _fit(places: NDArray[np.float64], shift: NDArray[np.float64], chain: Chain, tolerance: float) -> _Fit:
-    """Straight runs of a chain, moved to the middle of walls two cells thick."""
-    points = places[chain.points]
-    corners = np.concatenate([[0], np.nonzero(turns(points))[0] + 1, [len(points) - 1]])
+def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: float) -> _FittedChain:
+    """Fit straight runs to a chain, moved to the middle of walls two cells thick."""
+    points = graph.points[chain] / 2.0
+    corners = np.concatenate([[0], np.nonzero(_turns(points))[0] + 1, [len(points) - 1]])
     starts, lines = fit_runs(points[corners], tolerance)
     first = corners[starts]
-    mean = np.add.reduceat(shift[chain.points], first) / np.diff(np.append(first, len(points)))[:, None]
+    mean = np.add.reduceat(shift[chain], first) / np.diff(np.append(first, len(points)))[:, None]
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
     offset = (mean * normal).sum(axis=1, keepdims=True)
     lines[:, :2] += np.where(np.abs(offset) > _MIN_SHIFT_CELLS, offset, 0.0) * normal
-    return _Fit(corners, starts, lines)
+    is_square = graph.points[chain[0], 0] % 2 == 0
+    return _FittedChain(chain, corners, first, lines, np.full(len(lines), is_square))
 
 
-def _polylines(
-    graph: WallGraph,
-    places: NDArray[np.float64],
-    chains: list[Chain],
-    fits: list[_Fit],
-    plain: list[NDArray[np.bool_]],
-) -> tuple[list[NDArray[np.float64]], list[NDArray[np.int64]]]:
-    """Vertices [cells] of every chain, and the run that each of its segments belongs to.
-
-    Runs that are `plain` (squares, and where lines would cross) keep their corners.
-    """
-    nodes = _place_nodes(graph, places, chains, fits, plain)
+def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points], list[NDArray[np.intp]]]:
+    """Vertices of every chain, and the run that each of its segments belongs to."""
+    nodes = _placed_nodes(graph, chains)
     lines, runs = [], []
-    for chain, fit, keep in zip(chains, fits, plain, strict=True):
-        before, after = _runs_beside(fit, chain, np.arange(len(chain.points)))
-        fixed = np.array([point in nodes for point in chain.points])
+    for chain in chains:
+        (before, after), plain, last = chain.beside, chain.plain, len(chain.points) - 1
+        positions = graph.points[chain.points] / 2.0
+        fixed = graph.degree[chain.points] != 2
         breaks = fixed.copy()
-        breaks[fit.corners[keep[after[fit.corners]]]] = True
-        breaks[np.append(fit.corners[fit.starts], len(chain.points) - 1)] = True
-        route, owner = [], []
+        breaks[chain.corners[plain[after[chain.corners]]]] = True
+        breaks[np.append(chain.first, last)] = True
+        route: list[Points] = []
+        owner: list[int] = []
         for k in np.nonzero(breaks)[0].tolist():
             if fixed[k]:
-                route.append(nodes[chain.points[k]][None])
-            elif keep[before[k]] or keep[after[k]]:
-                route.append(places[chain.points[k]][None])
+                route.append(nodes[int(chain.points[k])][None])
+            elif plain[before[k]] or plain[after[k]]:
+                route.append(positions[k][None])
             else:
-                route.append(_meet(fit.lines[[before[k], after[k]]], places[chain.points[k]]))
+                route.append(_meeting(chain.lines[[before[k], after[k]]], positions[k]))
             owner += [before[k]] * (len(route[-1]) - 1) + [after[k]]
         if chain.closed and not fixed[-1]:
             owner = owner[len(route[0]) - 1 :]
             route[0] = route[-1][-1:]
         lines.append(np.round(np.concatenate(route), 6).astype(np.float64))
-        runs.append(np.array(owner[:-1], dtype=np.int64))
+        runs.append(np.array(owner[:-1], dtype=np.intp))
     return lines, runs
 
 
-def _runs_beside(fit: _Fit, chain: Chain, k: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Find the runs of a chain before and after its points k."""
-    first = fit.corners[fit.starts]
-    before, after = np.searchsorted(first, k) - 1, np.searchsorted(first, k, side="right") - 1
-    if chain.closed:
-        return before % len(first), np.where(k == len(chain.points) - 1, 0, after)
-    return np.maximum(before, 0), after
-
-
-def _place_nodes(
-    graph: WallGraph,
-    places: NDArray[np.float64],
-    chains: list[Chain],
-    fits: list[_Fit],
-    plain: list[NDArray[np.bool_]],
-) -> dict[int, NDArray[np.float64]]:
-    """Places [cells] of chain ends and junctions: where the lines that meet there come closest."""
-    is_node = graph.degree != 2
+def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points]:
+    """Positions of chain ends and junctions: where the lines that meet there come closest."""
     lines: dict[int, list[NDArray[np.float64]]] = {}
     pinned: set[int] = set()
-    for chain, fit, keep in zip(chains, fits, plain, strict=True):
-        before, after = _runs_beside(fit, chain, np.arange(len(chain.points)))
-        for k in np.nonzero(is_node[chain.points])[0].tolist():
-            runs = np.unique([before[k], after[k]])
-            lines.setdefault(chain.points[k], []).extend(fit.lines[runs])
-            if keep[runs].any():
-                pinned.add(chain.points[k])
-    return {
-        point: places[point] if point in pinned else _closest(np.array(through), places[point])
-        for point, through in lines.items()
-    }
+    for chain in chains:
+        before, after = chain.beside
+        for k in np.nonzero(graph.degree[chain.points] != 2)[0].tolist():
+            runs, point = np.unique([before[k], after[k]]), int(chain.points[k])
+            lines.setdefault(point, []).extend(chain.lines[runs])
+            if chain.plain[runs].any():
+                pinned.add(point)
+    nodes = {}
+    for point, through in lines.items():
+        position = graph.points[point] / 2.0
+        nodes[point] = position if point in pinned else _closest(np.array(through), position)
+    return nodes
 
 
-def _closest(lines: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Point of least squared distance to lines (k, 4), or the middle of the feet of `place` if that is far away."""
+def _closest(lines: NDArray[np.float64], near: Points) -> Points:
+    """Point of least squared distance to lines (k, 4), or the middle of the feet of `near` if that is far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
-    offset = (normal * (lines[:, :2] - place)).sum(axis=1)
+    offset = (normal * (lines[:, :2] - near)).sum(axis=1)
     moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
-    return place + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
+    return near + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
 
 
-def _meet(pair: NDArray[np.float64], place: NDArray[np.float64]) -> NDArray[np.float64]:
+def _meeting(pair: NDArray[np.float64], near: Points) -> Points:
     """Vertices (1 or 2, 2) where two runs with lines (2, 4) meet near a point."""
     direction = pair[:, 2:]
-    cross = direction[0, 0] * direction[1, 1] - direction[0, 1] * direction[1, 0]
-    feet = pair[:, :2] + ((place - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
-    if abs(cross) > 0.05:
+    feet = pair[:, :2] + ((near - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
+    if abs(cross(direction[0], direction[1])) > 0.05:
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
         meeting = np.linalg.solve(normal, (normal * pair[:, :2]).sum(axis=1))
-        if np.hypot(*(meeting - place)) <= _REACH_CELLS:
-            return meeting[None]
+        if np.hypot(*(meeting - near)) <= _REACH_CELLS:
+            return np.asarray(meeting[None])
     if np.hypot(*(feet[1] - feet[0])) > _OFFSET_CELLS:
         return feet
     return feet.mean(axis=0)[None]
 
 
-def _keep_crossing(
-    lines: list[NDArray[np.float64]], runs: list[NDArray[np.int64]], plain: list[NDArray[np.bool_]]
-) -> bool:
-    """Make runs plain whose segments meet others away from a shared vertex; say whether there were any."""
+def _make_crossing_plain(lines: list[Points], runs: list[NDArray[np.intp]], chains: list[_FittedChain]) -> bool:
+    """Make runs plain whose segments meet others away from a shared vertex; return whether there were any."""
     if not lines:
         return False
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
@@ -275,13 +368,13 @@ def _keep_crossing(
     bad = ~same | (shapely.get_type_id(touch) != 0)
     found = False
     for chain, run in owner[np.unique([first[bad], second[bad]])].tolist():
-        found |= not plain[chain][run]
-        plain[chain][run] = True
+        found |= not chains[chain].plain[run]
+        chains[chain].plain[run] = True
     return found
 
 
-def assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines:
-    """Join polylines (n, 2) [cells] whose segments meet only at equal vertices."""
+def _assembled(lines: list[Points], cell_m: float) -> Outlines:
+    """Join polylines whose segments meet only at equal vertices."""
     if not lines:
         return Outlines(np.zeros((0, 2)), np.zeros((0, 2), dtype=np.int64))
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
@@ -289,4 +382,21 @@ def assemble(lines: list[NDArray[np.float64]], resolution_m: float) -> Outlines:
     along = inverse.reshape(-1, 2)
     segments = along[np.unique(np.sort(along, axis=1), axis=0, return_index=True)[1]]
     segments = segments[segments[:, 0] != segments[:, 1]]
-    return Outlines(vertices * resolution_m, segments.astype(np.int64))
+    return Outlines(vertices * cell_m, segments.astype(np.int64))
+
+
+def _extended(outlines: Outlines, state: NDArray[np.uint8]) -> Points:
+    """Vertices, with ends that UNKNOWN cells follow moved from the centre of the last cell to its border."""
+    vertices, segments = outlines.vertices_m.copy(), outlines.segments
+    ends, tails = segments.ravel(), segments[:, ::-1].ravel()
+    along = vertices[ends] - vertices[tails]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    column, row = np.clip(np.floor(vertices[ends] + along).astype(int), 0, np.array(state.shape)[::-1] - 1).T
+    is_open = (np.bincount(ends)[ends] == 1) & (state[row, column] == CellState.UNKNOWN)
+    tips = shapely.linestrings(np.stack([vertices[ends], vertices[ends] + 0.5 * along], axis=1)[is_open])
+    index = np.nonzero(is_open)[0]
+    tip, line = shapely.STRtree(np.append(shapely.linestrings(vertices[segments]), tips)).query(tips, "intersects")
+    own = (line == index[tip] // 2) | (line == len(segments) + tip)
+    index = np.delete(index, tip[~own])
+    vertices[ends[index]] += 0.5 * along[index]
+    return vertices

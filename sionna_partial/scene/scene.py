@@ -1,4 +1,4 @@
-"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one place that writes scenes."""
+"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one module that writes scenes."""
 
 import os
 import xml.etree.ElementTree as ET
@@ -13,18 +13,16 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
+from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.mesh.mitsuba_xml import exported_record
-from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.maps.partial_map import PartialMap, require_map, row_runs
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
-from sionna_partial.scene.lattice import lattice_outlines
-from sionna_partial.scene.outlines import Outlines, wall_outlines
-from sionna_partial.scene.scene_xml import add_material, add_shape, write_ply, write_xml
-from sionna_partial.scene.wall_cells import row_runs
-from sionna_partial.settings import Material, SceneSettings, settings_or_default
+from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
 
 SHAPES = ("walls", "floor", "ceiling")
 """Shapes of an exported floor plan in the order in which faces are counted; those that are empty are left out."""
@@ -33,11 +31,13 @@ FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
 
 
+SIONNA_LOAD_GHZ = 3.5
+"""Frequency at which Sionna RT evaluates the materials of a scene while it loads it [GHz]."""
+
+
 @dataclass(frozen=True)
 class SceneGeometry:
-    """What is extruded: walls, floor and ceiling of a map, in its local frame.
-
-    The local frame has its origin at the lower-left corner of the grid, on the floor.
+    """Walls, floor and ceiling of a map in its local frame: the origin is the lower-left corner of the grid, on z = 0.
 
     Parameters
     ----------
@@ -48,15 +48,7 @@ class SceneGeometry:
     open_end : (V,) bool array
         Where a wall ends because observation did: what lies beyond is not free.
     floor_m : (R, 4) float64 array
-        Rectangles x0, y0, x1, y1 of floor and ceiling [m]; they do not overlap.
-    cell_m : float
-        Edge of the square lattice that the rectangles lie on [m].
-    height_m : float
-        Height of walls and ceiling [m].
-    ceiling : bool
-        Whether there is a ceiling above the floor.
-    material : Material
-        Material of everything.
+        Rectangles x0, y0, x1, y1 of floor and ceiling [m], on a lattice of `cell_m`; they do not overlap.
     origin_m : (float, float)
         World x and y of the local frame's origin [m].
     """
@@ -98,41 +90,20 @@ class SceneGeometry:
 
 
 def scene_settings_of(partial: PartialMap, settings: SceneSettings | None, name: str = "settings") -> SceneSettings:
-    """Return the settings of a map's scene: its own material, where it has one, takes the place of theirs.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    settings : SceneSettings or None
-        None is the default.
-    name : str
-        What the settings are called, for the message.
-
-    Raises
-    ------
-    SettingsError
-        For settings of another kind.
-    """
+    """Return the settings of a map's scene, called `name` in messages, with the map's own material, if it has one."""
     settings = settings_or_default(name, settings, SceneSettings)
     return settings if partial.material is None else replace(settings, material=partial.material)
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
-    """Turn a map into walls, floor and ceiling.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    settings : SceneSettings, optional
-        Tolerances, floor extent and material.
-
-    Returns
-    -------
-    SceneGeometry
-    """
+    """Turn a map into walls, floor and ceiling."""
     require_map("partial", partial)
     settings = scene_settings_of(partial, settings)
-    outlines = _outlines(partial, settings)
+    if settings.outline == "cells":
+        outlines = lattice_outlines(partial)
+    else:
+        tolerance_cells, gap_m = settings.outline_tolerance_cells, settings.bridge_gap_m
+        outlines = wall_outlines(partial, tolerance_cells=tolerance_cells, bridge_gap_m=gap_m)
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
@@ -184,35 +155,36 @@ def export_scene(
         For a frequency that the material does not cover.
     OutputError
         If writing fails; nothing half written is left behind.
+
+    Examples
+    --------
+    >>> import tempfile, sionna_partial as sp
+    >>> home = sp.make_home(3, "apartment")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     scene = sp.export_scene(home, f"{folder}/scene")
+    ...     sorted(path.name for path in scene.iterdir()), sp.load_map(scene) == home
+    (['map.pgm', 'map.yaml', 'meshes', 'scene.xml'], True)
     """
-    if isinstance(partial, PartialMap) and partial.mesh is not None:
-        return _export_mesh_scene(partial, partial.mesh, folder, settings, frequency_hz)
-    geometry = build_scene(partial, settings)
-    geometry.material.require_frequency(frequency_hz)
-    far = max(abs(value) for value in partial.bounds_m) > FAR_M
-    offset_m = partial.origin_m if far else (0.0, 0.0)
-    with atomic_folder(folder) as place:
-        write_scene(geometry, place, offset_m=offset_m, frequency_hz=frequency_hz)
-        write_ros_map(partial, place / "map.yaml", {"scene_offset": list(offset_m)})
-    return Path(folder)
-
-
-def _export_mesh_scene(
-    partial: PartialMap,
-    mesh: SceneMesh,
-    folder: str | os.PathLike[str],
-    settings: SceneSettings | None,
-    frequency_hz: float,
-) -> Path:
+    require_map("partial", partial)
     material = scene_settings_of(partial, settings).material
-    for used in mesh.used_materials(material):
-        used.require_frequency(frequency_hz)
-    x0, y0, x1, y1 = partial.bounds_m
-    offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]
-    extra = {"scene_offset": offset_m, "mesh": exported_record(mesh)}
-    with atomic_folder(folder) as place:
-        write_mesh_scene(mesh, place, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz)
-        write_ros_map(partial, place / "map.yaml", extra)
+    if partial.mesh is None:
+        materials = {material}
+        far = max(abs(value) for value in partial.bounds_m) > FAR_M
+        offset_m = [*(partial.origin_m if far else (0.0, 0.0))]
+    else:
+        materials = partial.mesh.used_materials(material)
+        x0, y0, x1, y1 = partial.bounds_m
+        offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]
+    for each in materials:
+        each.require_frequency(frequency_hz)
+    with atomic_folder(folder) as target:
+        if partial.mesh is None:
+            write_scene(build_scene(partial, settings), target, offset_m=offset_m, frequency_hz=frequency_hz)
+        else:
+            write_mesh_scene(
+                partial.mesh, target, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz
+            )
+        write_ros_map(partial, target / "map.yaml", {"scene_offset": offset_m})
     return Path(folder)
 
 
@@ -224,40 +196,22 @@ def _whole_offset_m(low_m: float, high_m: float) -> float:
 
 
 def write_scene(
-    geometry: SceneGeometry,
-    folder: Path,
-    *,
-    offset_m: tuple[float, float],
-    frequency_hz: float = CARRIER_FREQUENCY_HZ,
+    geometry: SceneGeometry, folder: Path, *, offset_m: Sequence[float], frequency_hz: float = CARRIER_FREQUENCY_HZ
 ) -> Path:
-    """Write `scene.xml` and its meshes into an existing folder.
+    """Write `scene.xml`, whose path is returned, and its meshes into an existing folder.
 
-    Wall i is made of the triangles 2 i and 2 i + 1; walls that meet share vertices, so that they form wedges.
-
-    Parameters
-    ----------
-    geometry : SceneGeometry
-    folder : pathlib.Path
-    offset_m : (float, float)
-        World x and y that become the scene's origin [m]; `geometry.origin_m` gives local coordinates.
-    frequency_hz : float
-        Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
-
-    Returns
-    -------
-    pathlib.Path
-        `scene.xml`.
+    The world x and y `offset_m` become the scene's origin; `geometry.origin_m` gives local coordinates. Wall i is made
+    of the triangles 2 i and 2 i + 1; walls that meet share vertices, so that they form wedges.
     """
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
-    (folder / "meshes").mkdir(exist_ok=True)
-    scene = ET.Element("scene", version="2.1.0")
-    add_material(scene, "material", geometry.material, frequency_hz)
+    scene = _new_scene(folder)
+    _add_material(scene, "material", geometry.material, frequency_hz)
     for name, (vertices, faces) in _meshes(geometry).items():
         if len(faces):
             mesh = trimesh.Trimesh(vertices + shift, faces, process=False)
             mesh.export(folder / "meshes" / f"{name}.ply")
-            add_shape(scene, name, "material")
-    return write_xml(scene, folder)
+            _add_shape(scene, name, "material")
+    return _write_xml(scene, folder)
 
 
 def write_mesh_scene(
@@ -268,38 +222,79 @@ def write_mesh_scene(
     default_material: Material,
     frequency_hz: float = CARRIER_FREQUENCY_HZ,
 ) -> Path:
-    """Write `scene.xml` and the meshes of a SceneMesh into an existing folder.
+    """Write `scene.xml`, whose path is returned, and the meshes of a SceneMesh into an existing folder.
 
     The shape `part0` has the triangles of the first of the mesh's materials, in their order, `part1` those of the
-    second, and so on; parts without triangles are left out. Triangles of a part share their vertices.
-
-    Parameters
-    ----------
-    mesh : SceneMesh
-    folder : pathlib.Path
-    offset_m : (x, y) or (x, y, z)
-        World position that becomes the scene's origin [m].
-    default_material : Material
-        Takes the place of None among the mesh's materials.
-    frequency_hz : float
-        Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
-
-    Returns
-    -------
-    pathlib.Path
-        `scene.xml`.
+    second, and so on; parts without triangles are left out. Triangles of a part share their vertices. The world
+    position `offset_m`, (x, y) or (x, y, z), becomes the scene's origin.
     """
     shift = np.zeros(3)
     shift[: len(offset_m)] = offset_m
-    (folder / "meshes").mkdir(exist_ok=True)
-    scene = ET.Element("scene", version="2.1.0")
+    scene = _new_scene(folder)
     for index in np.unique(mesh.material):
         name, material = f"part{index}", mesh.materials[index] or default_material
         used, triangles = np.unique(mesh.triangles[mesh.material == index], return_inverse=True)
-        write_ply(folder / "meshes" / f"{name}.ply", mesh.vertices_m[used] - shift, triangles.reshape(-1, 3))
-        add_material(scene, f"material{index}", material, frequency_hz)
-        add_shape(scene, name, f"material{index}")
-    return write_xml(scene, folder)
+        _write_ply(folder / "meshes" / f"{name}.ply", mesh.vertices_m[used] - shift, triangles.reshape(-1, 3))
+        _add_material(scene, f"material{index}", material, frequency_hz)
+        _add_shape(scene, name, f"material{index}")
+    return _write_xml(scene, folder)
+
+
+def itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
+    """Return relative permittivity and conductivity [S/m] of an ITU material (ITU-R P.2040-3, eq. 28 and 29)."""
+    load_llvm()
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    frequency_ghz = frequency_hz / 1e9
+    bands = ITU_MATERIALS_PROPERTIES[name].items()
+    a, b, c, d = next(factors for (low, high), factors in bands if low <= frequency_ghz <= high)
+    return a * frequency_ghz**b, c * frequency_ghz**d
+
+
+def _new_scene(folder: Path) -> ET.Element:
+    (folder / "meshes").mkdir(exist_ok=True)
+    return ET.Element("scene", version="2.1.0")
+
+
+def _write_xml(scene: ET.Element, folder: Path) -> Path:
+    ET.indent(scene)
+    path = folder / "scene.xml"
+    ET.ElementTree(scene).write(path, encoding="utf-8")
+    return path
+
+
+def _write_ply(path: Path, vertices_m: NDArray[np.float64], triangles: NDArray[np.integer]) -> None:
+    """Write a mesh with all digits of its vertices (trimesh would round them to float32)."""
+    faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    faces["count"], faces["index"] = 3, triangles
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices_m)}"]
+    lines += [f"property double {axis}" for axis in "xyz"]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(lines).encode() + vertices_m.astype("<f8").tobytes() + faces.tobytes())
+
+
+def _add_shape(scene: ET.Element, name: str, material: str) -> None:
+    """Add the shape of `meshes/NAME.ply` to a scene, of a material that it has."""
+    shape = ET.SubElement(scene, "shape", type="ply", id=name)
+    ET.SubElement(shape, "string", name="filename", value=f"meshes/{name}.ply")
+    ET.SubElement(shape, "boolean", name="face_normals", value="true")
+    ET.SubElement(shape, "ref", name="bsdf", id=material)
+
+
+def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz: float) -> None:
+    """Add a material to a scene: an ITU one by its name where Sionna RT can load it so, any other by its constants."""
+    itu = material.itu
+    # Sionna RT 2.2.0 has no display colour for vacuum, and fails.
+    if itu is not None and itu != "vacuum" and any(low <= SIONNA_LOAD_GHZ <= high for low, high in ITU_BANDS_GHZ[itu]):
+        bsdf = ET.SubElement(scene, "bsdf", type="itu-radio-material", id=name)
+        ET.SubElement(bsdf, "string", name="type", value=itu)
+    else:
+        constants = material.relative_permittivity, material.conductivity_s_m
+        permittivity, conductivity_s_m = constants if itu is None else itu_constants(itu, frequency_hz)
+        bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id=name)
+        ET.SubElement(bsdf, "float", name="relative_permittivity", value=repr(float(permittivity)))
+        ET.SubElement(bsdf, "float", name="conductivity", value=repr(float(conductivity_s_m)))
+    ET.SubElement(bsdf, "float", name="thickness", value=repr(float(material.thickness_m)))
 
 
 def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]]:
@@ -312,12 +307,6 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDA
     floor = np.column_stack([corners, np.zeros(len(corners))])
     meshes = {"walls": (np.concatenate([low, low + up]), walls), "floor": (floor, triangles)}
     return meshes | ({"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {})
-
-
-def _outlines(partial: PartialMap, settings: SceneSettings) -> Outlines:
-    if settings.outline == "cells":
-        return lattice_outlines(partial)
-    return wall_outlines(partial, tolerance_cells=settings.outline_tolerance_cells, bridge_gap_m=settings.bridge_gap_m)
 
 
 def _open_ends(partial: PartialMap, outlines: Outlines) -> NDArray[np.bool_]:

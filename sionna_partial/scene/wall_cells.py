@@ -1,20 +1,20 @@
 """PartialMap -> the wall cells that outlines run through: holes filled, ragged faces smoothed, short gaps closed."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, row_runs
 
 MAX_GAP_CELLS = 2
 """Longest gap of FREE cells in a wall that is closed, and longest bump or notch that is levelled [cells]."""
 
 MAX_FREE_GAP_M = 0.11
-"""Longest gap of FREE cells that is closed [m]: nobody passes there; log-odds mapping erases single wall cells."""
+"""Longest gap of FREE cells that is closed [m]: log-odds mapping erases single wall cells."""
 
 MIN_RUN_CELLS = 3
 """How far a wall must go on, on both sides of a gap, for the gap to be one in a seen wall [cells]."""
@@ -31,17 +31,11 @@ _DEEP = 0.3
 """Wall cells behind faces per cell of a face on maps of full noise: measured on simulated lidars, 0.5 to 2.5."""
 
 
-@dataclass(frozen=True)
-class CleanWalls:
-    """Wall cells that bear outlines.
+class CleanWalls(NamedTuple):
+    """Wall cells (ny, nx) that bear outlines.
 
-    Parameters
-    ----------
-    cells : (ny, nx) bool array
-    peeled : (ny, nx) bool array
-        Cells that face FREE ones and were taken off walls two cells thick: the outline lies between both layers.
-    noise : float
-        0 where walls are exact, to 1 where range noise thickened and roughened them.
+    `peeled` (ny, nx) face FREE ones and were taken off walls two cells thick: the outline lies between both layers.
+    `noise` is 0 where walls are exact, to 1 where range noise thickened and roughened them.
     """
 
     cells: NDArray[np.bool_]
@@ -53,19 +47,9 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     """Clean the wall cells of a map.
 
     Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
-    UNKNOWN cells in seen walls are closed, and short ones of FREE cells in straight walls (`MAX_FREE_GAP_M`). Of walls
-    that were seen from FREE cells, only the cells beside these are left: what is behind was not seen. Walls two cells
-    thick are thinned. Thin walls, posts and specks stay.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    bridge_gap_m : float
-        Longest gap that is closed [m].
-
-    Returns
-    -------
-    CleanWalls
+    UNKNOWN cells in seen walls are closed (up to `bridge_gap_m`), and short ones of FREE cells in straight walls
+    (`MAX_FREE_GAP_M`). Of walls that were seen from FREE cells, only the cells beside these are left: what is behind
+    was not seen. Walls two cells thick are thinned. Thin walls, posts and specks stay.
     """
     wall = _fill_pinholes(partial.state == CellState.WALL)
     free = ~_fill_pinholes((partial.state != CellState.FREE) | wall)
@@ -75,7 +59,11 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     filled |= _close_unknown_gaps(wall, free, longest)
     for cells, is_free in ((wall, free), (wall.T, free.T)):
         _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
-    thinned, peeled = _thin(_seen(wall, free) | (filled & wall), free)
+    seen = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    label, count = ndimage.label(wall, structure=_SQUARE)
+    unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
+    unseen[label[seen]] = False
+    thinned, peeled = _thin(seen | (wall & (unseen[label] | filled)), free)
     return CleanWalls(thinned, peeled, noise)
 
 
@@ -113,38 +101,15 @@ def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longes
             row = label[around] == index
             ends = np.where(ndimage.binary_dilation(row, structure=_SQUARE), pieces[around], 0)
             if len(np.unique(ends)) > 2:
-                line = _line_between(ends)
+                low, high = (np.argwhere(ends == value) for value in (ends[ends > 0].min(), ends.max()))
+                apart = np.abs(low[:, None] - high[None]).max(axis=2)
+                from_to = low[np.argmin(apart) // len(high)], high[np.argmin(apart) % len(high)]
+                line = np.zeros(ends.shape, dtype=bool)
+                line[tuple(np.rint(np.linspace(*from_to, int(apart.min()) + 1)).astype(int).T)] = True
                 filled[around] |= row if (free[around] & line).any() else line
     filled &= ~wall
     wall |= filled
     return filled
-
-
-def _line_between(ends: NDArray[np.integer]) -> NDArray[np.bool_]:
-    """Cells on the shortest line between two of the labels, the smallest and the largest."""
-    low, high = (np.argwhere(ends == value) for value in (ends[ends > 0].min(), ends.max()))
-    apart = np.abs(low[:, None] - high[None]).max(axis=2)
-    start, end = low[np.argmin(apart) // len(high)], high[np.argmin(apart) % len(high)]
-    row, column = np.rint(np.linspace(start, end, int(apart.min()) + 1)).astype(int).T
-    line = np.zeros(ends.shape, dtype=bool)
-    line[row, column] = True
-    return line
-
-
-def _seen(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Wall cells beside FREE ones, and pieces of wall that have none."""
-    seen = wall & ndimage.binary_dilation(free, structure=_SQUARE)
-    label, count = ndimage.label(wall, structure=_SQUARE)
-    unseen = np.ones(count + 1, dtype=bool)
-    unseen[label[seen]] = False
-    return seen | (wall & unseen[label])
-
-
-def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
-    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    row, start = np.nonzero(step == 1)
-    return row, start, np.nonzero(step == -1)[1]
 
 
 def _orientations(*masks: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], ...]]:
@@ -208,21 +173,16 @@ def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple[NDArray[np.
     kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
     facing = ndimage.binary_dilation(free, structure=_SQUARE)
     kept |= ~ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
-    width, height = _run_lengths(wall), _run_lengths(wall.T).T
+    width, height = np.zeros((2, *wall.shape), dtype=np.uint8)  # of the runs through every cell, at most 255
+    for length, cells in ((width, wall), (height.T, wall.T)):
+        _, start, end = row_runs(cells)
+        length[cells] = np.repeat(np.minimum(end - start, 255), end - start)
     thinned = np.pad(wall, 1)
     for removable in (~kept & ~facing, ~kept):
         for (dy, dx), across in (((1, 0), height), ((-1, 0), height), ((0, 1), width), ((0, -1), width)):
             side = ~np.roll(thinned, (-dy, -dx), (0, 1))
             _peel(thinned, side & np.pad(removable & (across <= np.minimum(width, height)), 1))
     return thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing
-
-
-def _run_lengths(wall: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Length of the horizontal run of wall through every cell, at most 255; 0 elsewhere."""
-    _, start, end = row_runs(wall)
-    length = np.zeros(wall.shape, dtype=np.uint8)
-    length[wall] = np.repeat(np.minimum(end - start, 255), end - start)
-    return length
 
 
 def _peel(wall: NDArray[np.bool_], candidates: NDArray[np.bool_]) -> None:

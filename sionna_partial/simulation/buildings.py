@@ -1,19 +1,16 @@
-"""Layouts of large buildings, up to 100 x 60 m: office floors along corridors, halls, and warehouses with shelves.
-
-A layout is rooms, whose outlines run through the middle of the walls, and fixtures that stand in them: columns,
-machines, shelves. Doors, furniture and the cells are those of all procedural homes (`homes.py`).
-"""
+"""Layouts of large buildings, up to 100 x 60 m: office floors along corridors, halls, and warehouses with shelves."""
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split
 
-from sionna_partial.simulation.furniture import parts_of, union_of
+from sionna_partial.simulation.furniture import Rng, log_uniform, parts_of, union_of
 
 LARGEST_M = (100.0, 60.0)
 """Length and width of the largest building [m]."""
@@ -25,22 +22,25 @@ _MODULE_M = (2.4, 4.0)
 _HALL_M2 = (60.0, 1200.0)
 _SERVICE_M2 = 20.0
 _COLUMNED_ROOM_M2 = 120.0
+_BAY_M = 2.4
 _FAR_M = 1e3
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Rooms, through the middle of their walls, and what stands fixed in them [m]."""
+class Layout(NamedTuple):
+    """Rooms, through the middle of their walls, and what stands fixed in them: columns, machines, shelves [m]."""
 
     rooms: list[Polygon]
     fixtures: list[Polygon]
 
 
-LayoutMaker = Callable[[np.random.Generator, float, float], Layout]
+Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
+"""Draws what stands in a hall."""
+
+LayoutMaker = Callable[[Rng, float, float], Layout]
 """Draws a layout from the area of the building and a typical area of its small rooms [m2]."""
 
 
-def floor_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> Layout:
+def floor_layout(rng: Rng, area_m2: float, room_m2: float) -> Layout:
     """Office floor: rows of rooms along one corridor, or along two or more with large rooms and services between."""
     length_m, width_m = _sides(rng, area_m2, (1.4, 4.0))
     outline = _notched(rng, box(0, 0, length_m, width_m))
@@ -57,41 +57,30 @@ def floor_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> La
     for part in [part for slab in slabs for part in parts_of(rest.intersection(slab))]:
         x0, y0, x1, y1 = part.bounds
         if min(x1 - x0, y1 - y0) > _BROAD_M:
-            rooms += _halved(rng, part, _log_uniform(rng, _HALL_M2))
+            rooms += _halved(rng, part, log_uniform(rng, _HALL_M2))
         else:
             rooms += _row(rng, part, room_m2)
     return Layout(rooms, _columns(rng, rooms, 0.5))
 
 
-def hall_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> Layout:
-    """Production hall: one or a few large rooms with columns and machines, some with a row of offices."""
+def _hall_layout(
+    rng: Rng, area_m2: float, room_m2: float, *, hall_fraction: tuple[float, float], fill: Fill, columned: float
+) -> Layout:
+    """One or a few large rooms with columns and what fills them; most have a row of offices."""
     length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
     halls, offices = _hall_and_offices(rng, _notched(rng, box(0, 0, length_m, width_m)), room_m2)
-    halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * _log_uniform(rng, (0.15, 3.0)))]
-    machines = [machine for hall in halls for machine in _machines(rng, hall)]
-    return Layout(halls + offices, _columns(rng, halls, 0.7) + machines)
+    halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * log_uniform(rng, hall_fraction))]
+    things = [thing for hall in halls for thing in fill(rng, hall)]
+    return Layout(halls + offices, _columns(rng, halls, columned) + things)
 
 
-def warehouse_layout(rng: np.random.Generator, area_m2: float, room_m2: float) -> Layout:
-    """Warehouse: a hall or two with aisles between shelves, and columns; most have a row of offices."""
-    length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
-    halls, offices = _hall_and_offices(rng, _notched(rng, box(0, 0, length_m, width_m)), room_m2)
-    halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * _log_uniform(rng, (0.5, 3.0)))]
-    shelves = [shelf for hall in halls for shelf in _shelves(rng, hall)]
-    return Layout(halls + offices, _columns(rng, halls, 0.4) + shelves)
-
-
-def _sides(rng: np.random.Generator, area_m2: float, aspect: tuple[float, float]) -> tuple[float, float]:
+def _sides(rng: Rng, area_m2: float, aspect: tuple[float, float]) -> tuple[float, float]:
     """Length and width [m] of about the wanted area."""
-    length_m = min(LARGEST_M[0], math.sqrt(area_m2 * _log_uniform(rng, aspect)))
+    length_m = min(LARGEST_M[0], math.sqrt(area_m2 * log_uniform(rng, aspect)))
     return length_m, min(LARGEST_M[1], area_m2 / length_m)
 
 
-def _log_uniform(rng: np.random.Generator, between: tuple[float, float]) -> float:
-    return float(np.exp(rng.uniform(*np.log(between))))
-
-
-def _notched(rng: np.random.Generator, outline: Polygon) -> Polygon:
+def _notched(rng: Rng, outline: Polygon) -> Polygon:
     """Outline of a building, some with one or two corners cut out."""
     _, _, x1, y1 = outline.bounds
     for x, y in rng.permutation([(0, 0), (x1, 0), (x1, y1), (0, y1)])[: rng.choice(3, p=[0.6, 0.3, 0.1])]:
@@ -100,9 +89,9 @@ def _notched(rng: np.random.Generator, outline: Polygon) -> Polygon:
     return parts_of(outline)[0]
 
 
-def _corridors(rng: np.random.Generator, length_m: float, width_m: float) -> tuple[list[Polygon], list[Polygon]]:
+def _corridors(rng: Rng, length_m: float, width_m: float) -> tuple[list[Polygon], list[Polygon]]:
     """Corridors along and across a floor, and the blocks of services beside those across."""
-    wide_m = _log_uniform(rng, _CORRIDOR_M)
+    wide_m = log_uniform(rng, _CORRIDOR_M)
     ends = [rng.choice([0.0, rng.uniform(3.0, 8.0)]) for _ in range(2)]
     if width_m > 2 * (_BAND_M[0] + wide_m) + _BROAD_M:
         deep_m = [rng.uniform(_BAND_M[0], min(_BAND_M[1], (width_m - _BROAD_M) / 2 - wide_m)) for _ in range(2)]
@@ -122,21 +111,17 @@ def _corridors(rng: np.random.Generator, length_m: float, width_m: float) -> tup
     return along + across, services
 
 
-def _sections(rng: np.random.Generator, corridor: shapely.Geometry) -> list[Polygon]:
+def _sections(rng: Rng, corridor: shapely.Geometry) -> list[Polygon]:
     """Parts of the corridors, some of which have doors across."""
     x0, y0, x1, y1 = corridor.bounds
     for x in rng.uniform(x0, x1, rng.choice(3, p=[0.6, 0.25, 0.15])):
-        corridor = shapely.GeometryCollection(
-            [
-                piece
-                for part in parts_of(corridor)
-                for piece in parts_of(split(part, LineString([(x, y0 - 1), (x, y1 + 1)])))
-            ]
-        )
+        cut = LineString([(x, y0 - 1), (x, y1 + 1)])
+        pieces = [piece for part in parts_of(corridor) for piece in parts_of(split(part, cut))]
+        corridor = shapely.GeometryCollection(pieces)
     return parts_of(corridor)
 
 
-def _row(rng: np.random.Generator, part: Polygon, room_m2: float) -> Iterator[Polygon]:
+def _row(rng: Rng, part: Polygon, room_m2: float) -> Iterator[Polygon]:
     """Divide a band into rooms side by side, of widths that are multiples of one module; some have an anteroom."""
     x0, y0, x1, y1 = part.bounds
     upright = y1 - y0 > x1 - x0
@@ -151,7 +136,7 @@ def _row(rng: np.random.Generator, part: Polygon, room_m2: float) -> Iterator[Po
         start = stop
 
 
-def _halved(rng: np.random.Generator, part: Polygon, largest_m2: float) -> Iterator[Polygon]:
+def _halved(rng: Rng, part: Polygon, largest_m2: float) -> Iterator[Polygon]:
     """Halve an area across its longer side until no part is larger than wanted."""
     if part.area <= largest_m2:
         yield part
@@ -163,9 +148,7 @@ def _halved(rng: np.random.Generator, part: Polygon, largest_m2: float) -> Itera
         yield from _halved(rng, piece, largest_m2)
 
 
-def _hall_and_offices(
-    rng: np.random.Generator, outline: Polygon, room_m2: float
-) -> tuple[list[Polygon], list[Polygon]]:
+def _hall_and_offices(rng: Rng, outline: Polygon, room_m2: float) -> tuple[list[Polygon], list[Polygon]]:
     """Split off a row of offices along one side of a hall, for most halls."""
     x0, y0, x1, y1 = outline.bounds
     if rng.random() < 0.3:
@@ -177,30 +160,28 @@ def _hall_and_offices(
     return parts_of(outline.difference(strip)), offices
 
 
-def _columns(rng: np.random.Generator, rooms: list[Polygon], chance: float) -> list[Polygon]:
+def _columns(rng: Rng, rooms: list[Polygon], chance: float) -> list[Polygon]:
     """Columns on a grid in the large rooms, for some buildings."""
     if rng.random() >= chance:
         return []
     large = union_of([room.buffer(-1.0) for room in rooms if room.area > _COLUMNED_ROOM_M2])
     half_m, apart_m, start_m = rng.uniform(0.12, 0.4), rng.uniform(4.0, 12.0, 2), rng.uniform(0.0, 12.0, 2)
-    x, y = np.meshgrid(
-        *(np.arange(first, side, step) for first, side, step in zip(start_m, LARGEST_M, apart_m, strict=True))
-    )
+    x, y = np.meshgrid(*map(np.arange, start_m, LARGEST_M, apart_m))
     inside = shapely.contains_xy(large, x, y)
     return list(shapely.box(x - half_m, y - half_m, x + half_m, y + half_m)[inside])
 
 
-def _machines(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
+def _machines(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
     """Machines, tanks and stacks that stand free of each other, or against the wall of a hall."""
     clear_m = rng.uniform(0.9, 2.5)
     placed: list[Polygon] = []
     x0, y0, x1, y1 = hall.bounds
-    for _ in range(rng.poisson(hall.area / _log_uniform(rng, (15.0, 300.0)))):
+    for _ in range(rng.poisson(hall.area / log_uniform(rng, (15.0, 300.0)))):
         x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
         if rng.random() < 0.15:
             thing = shapely.Point(x, y).buffer(rng.uniform(0.3, 2.0), quad_segs=4)
         else:
-            long_m, deep_m = _log_uniform(rng, (0.3, 3.5)), _log_uniform(rng, (0.3, 1.5))
+            long_m, deep_m = log_uniform(rng, (0.3, 3.5)), log_uniform(rng, (0.3, 1.5))
             thing = affinity.rotate(box(x - long_m, y - deep_m, x + long_m, y + deep_m), rng.choice([0, 90]))
         if rng.random() < 0.3:
             thing = affinity.rotate(thing, rng.uniform(0, 90))
@@ -210,7 +191,7 @@ def _machines(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
             yield thing
 
 
-def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
+def _shelves(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
     """Blocks of shelves with aisles between; of some, only the legs and what lies on the floor is as low as a robot."""
     inner = hall.buffer(-rng.uniform(1.5, 4.0), join_style="mitre")
     if inner.is_empty:
@@ -229,13 +210,19 @@ def _shelves(rng: np.random.Generator, hall: Polygon) -> Iterator[Polygon]:
                 yield from _legs(rng, block, half_leg_m) if on_legs else [block]
 
 
-def _legs(rng: np.random.Generator, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
+def _legs(rng: Rng, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
     """Legs along both sides of a shelf, and pallets below it."""
     x0, y0, x1, y1 = block.bounds
-    bay_m = 2.4
-    xs, ys = (np.linspace(low, high, max(2, round((high - low) / bay_m) + 1)) for low, high in ((x0, x1), (y0, y1)))
+    xs, ys = (np.linspace(low, high, max(2, round((high - low) / _BAY_M) + 1)) for low, high in ((x0, x1), (y0, y1)))
     for x in xs:
         for y in ys:
             yield box(x - half_leg_m, y - half_leg_m, x + half_leg_m, y + half_leg_m)
             if rng.random() < 0.4 and x < x1 and y < y1:
                 yield box(x + 0.2, y + 0.2, min(x + rng.uniform(0.8, 2.2), x1), min(y + rng.uniform(0.8, 2.2), y1))
+
+
+hall_layout = partial(_hall_layout, hall_fraction=(0.15, 3.0), fill=_machines, columned=0.7)
+"""Production hall, with machines."""
+
+warehouse_layout = partial(_hall_layout, hall_fraction=(0.5, 3.0), fill=_shelves, columned=0.4)
+"""Warehouse: aisles between shelves."""

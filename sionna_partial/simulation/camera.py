@@ -1,4 +1,4 @@
-"""The robot's camera: readings of the walls, their errors, and the map that they add up to."""
+"""The robot's camera: range readings of the walls, their errors, and the map that they add up to."""
 
 import math
 from typing import NamedTuple
@@ -15,42 +15,28 @@ MISSED_PATCH_M = 0.5
 """Edge of the squares [m] whose walls are missed together, as a pane or a mirror is."""
 
 HIT_LOG_ODDS, MISS_LOG_ODDS = 0.85, -0.4
-"""What a look adds to the log odds of a wall where it reports one, and where it reports free space [1].
-
-Those of OctoMap (Hornung et al., Autonomous Robots 34, 2013, Section 5).
-"""
+"""Change of a cell's log odds where a picture reports a wall, and free space (Hornung et al., 2013, Section 5)."""
 
 LOG_ODDS_LIMITS = (-2.0, 3.5)
-"""Least and greatest log odds of a wall [1] (OctoMap, as above), so that a map can still change."""
+"""Least and greatest log odds of a wall (as above), so that a map can still change."""
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 _NO_ECHO, _WALL_ECHO, _FAR = 0, 1, 2
 
 
 class Camera:
-    """Sees a home from where the robot is, and maps it where the robot believes to be.
+    """Sees a home (ny, nx), with unknown cells all around, from where the robot is; maps it where it believes to be.
 
-    Parameters
-    ----------
-    truth : (ny, nx) uint8 array of CellState
-        The home, with unknown cells all around.
-    resolution_m : float
-        Edge of a cell [m].
-    sensor : SensorSettings
-    rng : numpy.random.Generator
-        Draws the errors.
-
-    Attributes
-    ----------
-    seen : (ny, nx) uint8 array of CellState
-        The map.
+    The map is `seen` (ny, nx). Positions are in cells, x along columns and y along rows.
     """
 
     def __init__(
         self, truth: NDArray[np.uint8], resolution_m: float, sensor: SensorSettings, rng: np.random.Generator
     ) -> None:
         self._truth = np.ascontiguousarray(truth)
-        self._missed = _missed_walls(truth, resolution_m, sensor.missed_wall_fraction, rng)
+        rows, columns = ((np.arange(size) * resolution_m // MISSED_PATCH_M).astype(np.intp) for size in truth.shape)
+        missed = rng.random((rows[-1] + 1, columns[-1] + 1)) < sensor.missed_wall_fraction
+        self._missed = missed[np.ix_(rows, columns)]
         self._reach = sensor.range_m / resolution_m
         self._view_deg = sensor.field_of_view_deg
         self._noise = sensor.range_noise_m / resolution_m
@@ -59,18 +45,9 @@ class Camera:
         self.seen = np.full_like(self._truth, _UNKNOWN)
 
     def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: NDArray[np.intp]) -> None:
-        """Add one picture to the map.
+        """Add one picture to the map, taken at x, y but believed to be taken `shift` from there.
 
-        Parameters
-        ----------
-        x, y : float
-            Where the robot is, along columns and rows [cells].
-        heading_deg : float
-            Where it looks, from x towards y [degree].
-        shift : (float, float)
-            How far from there, along columns and rows, it believes to be [cells].
-        under : (N, 2) int array
-            Cells that it believes to stand on, which therefore are free: row and column.
+        The cells `under` the robot (N, 2), rows and columns where it believes to be, are free.
         """
         angles = _ray_angles(heading_deg, self._view_deg, self._reach)
         noise = self._noise * self._rng.standard_normal(len(angles))
@@ -93,20 +70,7 @@ class Camera:
 
 
 def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
-    """Outline what the camera has in view: as far as it reaches, and no farther than the first wall.
-
-    Parameters
-    ----------
-    home : PartialMap
-    pose : (3,) array
-        World x, y [m], and heading from x towards y [degree].
-    sensor : SensorSettings
-
-    Returns
-    -------
-    (N, 2) array
-        World x and y of the corners of a polygon [m], the first of them the camera.
-    """
+    """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
     reach = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
@@ -122,37 +86,40 @@ def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> NDArray[np
     return math.radians(heading_deg) + math.radians(view_deg) * (np.arange(rays) / (rays - 1) - 0.5)
 
 
-def _missed_walls(
-    truth: NDArray[np.uint8], resolution_m: float, share: float, rng: np.random.Generator
-) -> NDArray[np.bool_]:
-    """Draw the squares of the floor plan whose walls return nothing; return them cell by cell (ny, nx)."""
-    rows, columns = (np.arange(size) * resolution_m // MISSED_PATCH_M for size in truth.shape)
-    squares = rng.random((int(rows[-1]) + 1, int(columns[-1]) + 1)) < share
-    return squares[np.ix_(rows.astype(np.intp), columns.astype(np.intp))]
-
-
 class _Rays(NamedTuple):
-    """Rays of one look: angles [radian]; start, how far from there the robot believes to be, errors, range [cells]."""
+    """Rays of one picture: angles [radian]; start, where the robot believes to be less start, errors, range [cells]."""
 
-    place: tuple[float, float]
+    start: tuple[float, float]
     shift: tuple[float, float]
     angles: NDArray[np.float64]
     noise: NDArray[np.float64]
     reach: float
 
 
-@njit(cache=True)
-def _cast_rays(
-    truth: NDArray[np.uint8],
-    missed: NDArray[np.bool_],
-    view: NDArray[np.uint8],
-    corner: tuple[int, int],
-    rays: _Rays,
-) -> None:
-    """Write what one picture reports into `view`: free up to the reading, a wall there.
+class _Walk(NamedTuple):
+    """A ray in one of the cells along it, and where it enters and leaves the cell [cells].
 
-    The first cell of `view` is row and column `corner` of the home. Where several rays disagree about a cell, a wall
-    counts (as in OctoMap).
+    A ray through a corner crosses one of the two cells beside it, so that it never slips between two walls. It is
+    at least a billionth of a cell long in each cell, so that a distance belongs to one cell.
+    """
+
+    row: int
+    column: int
+    enters: float
+    leaves: float
+    step_x: int
+    step_y: int
+    pace_x: float
+    pace_y: float
+    next_x: float
+    next_y: float
+
+
+@njit(cache=True)
+def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-def]
+    """Write what one picture reports into `view`, whose first cell is `corner` of the home: free up to the reading.
+
+    Where rays disagree about a cell, a wall counts (as in OctoMap).
     """
     (x, y), shift, angles, noise, reach = rays
     for ray in range(len(angles)):
@@ -174,10 +141,8 @@ def _cast_rays(
 
 
 @njit(cache=True)
-def _ranges(
-    truth: NDArray[np.uint8], x: float, y: float, angles: NDArray[np.float64], reach: float
-) -> NDArray[np.float64]:
-    """Return how far each ray gets [cells]."""
+def _ranges(truth, x, y, angles, reach):  # type: ignore[no-untyped-def]
+    """Length of each ray [cells]."""
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
         ranges[ray] = _read(truth, missed, x, y, angles[ray], reach)[1]
@@ -185,10 +150,8 @@ def _ranges(
 
 
 @njit(cache=True)
-def _read(
-    truth: NDArray[np.uint8], missed: NDArray[np.bool_], x: float, y: float, angle: float, reach: float
-) -> tuple[int, float]:
-    """Return what ends a ray, and a distance within that cell: a wall that is noticed, one that is not, or nothing."""
+def _read(truth, missed, x, y, angle, reach):  # type: ignore[no-untyped-def]
+    """Return what ends a ray (a wall that is noticed, one that is not, or nothing), and a distance within that cell."""
     walk = _start(x, y, angle)
     while walk.enters <= reach:
         if truth[walk.row, walk.column] != _FREE:
@@ -198,27 +161,8 @@ def _read(
     return _FAR, reach
 
 
-class _Walk(NamedTuple):
-    """A ray in one of the cells along it, and where it enters and leaves the cell [cells].
-
-    A ray through a corner takes one of the two cells beside it, so that it never slips between two walls. Each cell
-    keeps a piece of the ray to itself, a billionth of a cell at least, so that a distance names one cell.
-    """
-
-    row: int
-    column: int
-    enters: float
-    leaves: float
-    step_x: int
-    step_y: int
-    pace_x: float
-    pace_y: float
-    next_x: float
-    next_y: float
-
-
 @njit(cache=True)
-def _start(x: float, y: float, angle: float) -> _Walk:
+def _start(x, y, angle):  # type: ignore[no-untyped-def]
     """Return a ray in the cell where it starts."""
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
@@ -231,7 +175,7 @@ def _start(x: float, y: float, angle: float) -> _Walk:
 
 
 @njit(cache=True)
-def _next(walk: _Walk) -> _Walk:
+def _next(walk):  # type: ignore[no-untyped-def]
     """Return the ray in the next cell."""
     row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
     if next_x < next_y:

@@ -1,5 +1,6 @@
 """Robot simulator: a complete home -> what a robot has seen of it after so many steps."""
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -7,31 +8,32 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.checks import are_stages, is_whole, require, settings_or_default
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.settings import SensorSettings, are_stages, is_whole, require, settings_or_default
+from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.robot import Robot
 
 MAX_STEPS = 100_000
 """Largest number of actions: many times what a large building takes."""
 
-_FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
-_MARGIN_M = 2.0
-_REPORT_STEPS = 10
-
 VAIN_STEPS = 1000
-"""Number of actions without progress after which a robot gives up to observe a fraction of the free area: errors of its
-map may close its way."""
+"""Number of actions without progress after which a robot stops trying to observe a fraction of the free area: errors of
+its map may block every route."""
 
 PROGRESS = 0.005
 """Fraction of the free area that counts as progress."""
 
+_FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
+_MARGIN_M = 2.0
+_REPORT_STEPS = 10
+
 
 @dataclass(frozen=True, eq=False)
 class Exploration:
-    """The way of a robot through a home, and what it had seen at several moments.
+    """The trajectory of a robot through a home, and what it had seen at several moments.
 
     Parameters
     ----------
@@ -83,14 +85,9 @@ class Exploration:
         remedy = f"choose from the steps that were kept: {', '.join(map(str, self.steps))}."
         require(len(steps) > 0 and set(steps) <= set(self.steps), "steps", steps, remedy)
         index = [k for k, step in enumerate(self.steps) if step in steps]
-        last = self.steps[index[-1]] + 1
-        return replace(
-            self,
-            steps=tuple(self.steps[k] for k in index),
-            states=self.states[index],
-            poses=self.poses[:last],
-            believed_poses=self.believed_poses[:last],
-        )
+        kept, last = tuple(self.steps[k] for k in index), self.steps[index[-1]] + 1
+        poses, believed = self.poses[:last], self.believed_poses[:last]
+        return replace(self, steps=kept, states=self.states[index], poses=poses, believed_poses=believed)
 
 
 def explore(
@@ -102,10 +99,10 @@ def explore(
 ) -> list[PartialMap]:
     """Send a robot through a home and return what it has seen at several moments.
 
-    The robot starts at a random free place and heading. Each step it walks towards a frontier between seen and
+    The robot starts at a random free position and heading. Each step it moves towards a frontier between seen and
     unseen cells, or turns, and then looks: rays run through the cells to the first wall. Range, position and wall
-    detection are exact, so whatever is seen is true, unless `sensor` says otherwise. When there is nothing left to
-    see, the robot stays.
+    detection are exact, so whatever is seen is true, unless `sensor` has errors. When there is nothing left to see,
+    the robot stays.
 
     Parameters
     ----------
@@ -114,7 +111,7 @@ def explore(
     steps : sequence of int or float
         Numbers of actions [1], increasing, at most `MAX_STEPS`, after which the map is returned. After 0 nothing has
         been seen. Or fractions of the free area in [0, 1), increasing: each map is the first that has so much of it,
-        or what the robot knows when it has nothing left to see, or after `VAIN_STEPS` actions without progress.
+        or the robot's map when it has nothing left to see, or after `VAIN_STEPS` actions without progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
@@ -123,8 +120,8 @@ def explore(
     Returns
     -------
     list of PartialMap
-        One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Each
-        knows all cells that the ones before it know; without errors they know the same. A mesh is cut to what is
+        One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Cells
+        that are known in one map are known in the next; without errors they are equal. A mesh is cut to what is
         known.
 
     Raises
@@ -134,6 +131,13 @@ def explore(
     SettingsError
         If `steps` are neither increasing whole numbers of 0 to `MAX_STEPS` nor increasing fractions in [0, 1), or
         `seed` is not a whole number of 0 or more, or `sensor` is of another kind.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> maps = sp.explore(sp.make_home(3, "apartment"), steps=(50, 200), seed=3)
+    >>> maps[0].observed_fraction < maps[1].observed_fraction
+    True
     """
     return explore_trajectory(home, steps, seed, sensor=sensor).maps
 
@@ -146,14 +150,14 @@ def explore_trajectory(
     sensor: SensorSettings | None = None,
     progress: Callable[[float, str], None] | None = None,
 ) -> Exploration:
-    """Explore a home as `explore` does, and return the way of the robot too.
+    """Explore a home as `explore` does, and return the trajectory of the robot too.
 
     Parameters
     ----------
     home, steps, seed, sensor
         As of `explore`.
     progress : callable or None
-        Is told the share that is done, in [0, 1], and what is being done.
+        Is called with the fraction that is done, in [0, 1], and what is being done.
 
     Returns
     -------
@@ -164,82 +168,50 @@ def explore_trajectory(
     MapError, SettingsError
         As `explore` does.
     """
-    stages = _checked_stages(steps)
-    require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
-    sensor = settings_or_default("sensor", sensor, SensorSettings)
-    require_map("home", home)
-    if not (home.state == _FREE).any():
-        raise MapError("home has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
-    around = 1 if sensor.is_exact else 1 + math.ceil(_MARGIN_M / home.resolution_m)
-    padded = np.pad(home.state, around, constant_values=_UNKNOWN)
-    free = np.argwhere(padded == _FREE)
-    (row0, column0), (row1, column1) = free.min(axis=0) - around, free.max(axis=0) + around + 1
-    robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor)
-    corner_m = np.array(home.origin_m) + (np.array([column0, row0]) - around) * home.resolution_m
-    clock = _Clock(stages, len(free))
-    states: list[NDArray[np.uint8]] = []
-    poses = [_poses(robot, corner_m, home.resolution_m)]
-    while True:
-        for _ in range(clock.due(len(poses) - 1, robot)):
-            seen = np.full_like(padded, _UNKNOWN)
-            if len(poses) > 1:
-                seen[row0:row1, column0:column1] = robot.seen
-            states.append(seen[around:-around, around:-around])
-        if progress and ((len(poses) - 1) % _REPORT_STEPS == 0 or not clock.waits):
-            progress(clock.share(len(poses) - 1), f"exploring: step {len(poses) - 1}")
-        if not clock.waits:
-            break
-        robot.act()
-        poses.append(_poses(robot, corner_m, home.resolution_m))
-    was, believed = np.array(poses).transpose(1, 0, 2)
-    return Exploration(home, sensor, tuple(clock.steps), np.array(states), was, believed)
-
-
-class _Clock:
-    """Finds when the map of a robot is wanted: after so many steps, or when it has seen such fractions of a home."""
-
-    def __init__(self, stages: list[int] | list[float], free_cells: int) -> None:
-        self._stages, self._free_cells = stages, free_cells
-        self._by_fraction = not all(map(is_whole, stages))
-        self._progress = 0, 0.0
-        self.steps: list[int] = []
-
-    @property
-    def waits(self) -> bool:
-        """Whether there are maps still to come."""
-        return len(self.steps) < len(self._stages)
-
-    def due(self, step: int, robot: Robot) -> int:
-        """Note and count the stages that are reached after a step."""
-        before = len(self.steps)
-        done, gives_up = float(step), False
-        if self._by_fraction:
-            done = int((robot.seen == _FREE).sum()) / self._free_cells if step else 0.0
-            if done > self._progress[1] + PROGRESS:
-                self._progress = step, done
-            gives_up = robot.is_finished or step >= self._progress[0] + VAIN_STEPS
-        while self.waits and (gives_up or self._stages[len(self.steps)] <= done):
-            self.steps.append(step)
-        return len(self.steps) - before
-
-    def share(self, step: int) -> float:
-        """Share of the stages that are done, or of the steps."""
-        if self._by_fraction:
-            return len(self.steps) / len(self._stages)
-        return step / max(1, self._stages[-1])
-
-
-def _poses(robot: Robot, corner_m: NDArray[np.float64], resolution_m: float) -> list[tuple[float, float, float]]:
-    """Where the robot is, and where it believes to be: world x, y [m] and heading [degree]."""
-    places = corner_m + np.array([robot.place, robot.believed_place]) * resolution_m
-    return [(float(x), float(y), robot.heading_deg) for x, y in places]
-
-
-def _checked_stages(steps: Sequence[float]) -> list[int] | list[float]:
-    """Numbers of steps, or fractions; a SettingsError for anything else."""
     remedy = (
         f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200), or increasing fractions "
         "of the free area in [0, 1), such as (0.25, 0.5, 0.75)."
     )
     require(are_stages(steps) and steps[-1] <= MAX_STEPS, "steps", steps, remedy)
-    return [int(each) for each in steps] if all(map(is_whole, steps)) else [float(each) for each in steps]
+    require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
+    sensor = settings_or_default("sensor", sensor, SensorSettings)
+    require_map("home", home)
+    if not (home.state == _FREE).any():
+        raise MapError("home has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
+    margin = 1 if sensor.is_exact else 1 + math.ceil(_MARGIN_M / home.resolution_m)
+    padded = np.pad(home.state, margin, constant_values=_UNKNOWN)
+    free = np.argwhere(padded == _FREE)
+    (row0, column0), (row1, column1) = free.min(axis=0) - margin, free.max(axis=0) + margin + 1
+    robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor)
+    corner_m = np.array(home.origin_m) + (np.array([column0, row0]) - margin) * home.resolution_m
+
+    by_fraction = not all(map(is_whole, steps))
+    best, last_progress = 0.0, 0
+    reached: list[int] = []
+    states: list[NDArray[np.uint8]] = []
+    poses: list[NDArray[np.float64]] = []
+    for step in itertools.count():
+        if step:
+            robot.act()
+        positions_m = corner_m + np.array([robot.position, robot.believed_position]) * home.resolution_m
+        poses.append(np.column_stack([positions_m, [robot.heading_deg] * 2]))
+        done, gives_up = float(step), False
+        if by_fraction:
+            done = int((robot.seen == _FREE).sum()) / len(free) if step else 0.0
+            if done > best + PROGRESS:
+                best, last_progress = done, step
+            gives_up = robot.is_finished or step >= last_progress + VAIN_STEPS
+        while len(reached) < len(steps) and (gives_up or steps[len(reached)] <= done):
+            reached.append(step)
+            state = np.full_like(padded, _UNKNOWN)
+            if step:
+                state[row0:row1, column0:column1] = robot.seen
+            states.append(state[margin:-margin, margin:-margin])
+        is_last = len(reached) == len(steps)
+        if progress and (step % _REPORT_STEPS == 0 or is_last):
+            fraction = len(reached) / len(steps) if by_fraction else step / max(1.0, float(steps[-1]))
+            progress(fraction, f"exploring: step {step}")
+        if is_last:
+            break
+    true, believed = np.array(poses).transpose(1, 0, 2)
+    return Exploration(home, sensor, tuple(reached), np.array(states), true, believed)

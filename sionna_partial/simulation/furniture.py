@@ -1,4 +1,4 @@
-"""What stands in the rooms of procedural homes: furniture and pillars that leave room to walk."""
+"""Furniture and pillars in the rooms of procedural homes, which leave room to walk; and tools for drawing plans."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -12,6 +12,8 @@ GRID_M = 1e-5
 
 NEAR_M = 0.01
 """Distance within which shapes touch [m]."""
+
+Rng = np.random.Generator
 
 _EMPTY_ROOM_M2 = 2.5
 _PILLARED_ROOM_M2 = 20.0
@@ -28,8 +30,13 @@ def parts_of(shape: shapely.Geometry) -> list[Polygon]:
     return sorted(polygons, key=lambda part: -part.area)
 
 
+def log_uniform(rng: Rng, between: tuple[float, float]) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return float(np.exp(rng.uniform(*np.log(between))))
+
+
 def furnish(
-    rng: np.random.Generator,
+    rng: Rng,
     room: Polygon,
     walls: shapely.Geometry,
     openings: list[LineString],
@@ -38,33 +45,16 @@ def furnish(
     clutter: float,
     pillars: float,
 ) -> Iterator[Polygon]:
-    """Put furniture and pillars into a room, and leave ways through it and to its openings.
+    """Yield furniture and pillars (they may overlap each other and the walls) that leave a room and its doors passable.
 
-    Parameters
-    ----------
-    rng : numpy.random.Generator
-    room : Polygon
-        Outline of the room, through the middle of its walls [m].
-    walls : Polygon or MultiPolygon
-        Walls and door leaves [m].
-    openings : list of LineString
-        Openings of the home; those of this room are found among them.
-    walk_m : float
-        Width of the ways [m].
-    clutter : float
-        Mean number of things that are tried for every 4 m2.
-    pillars : float
-        Probability that a large room has pillars.
-
-    Yields
-    ------
-    Polygon or MultiPolygon
-        Things; they may overlap each other and the walls.
+    `room` is the outline through the middle of its walls, `walls` includes door leaves; `openings` are those of the
+    whole home. `clutter` is the mean number of things that are tried for every 4 m2, `pillars` the probability that
+    a large room has some.
     """
     near = [opening for opening in openings if opening.distance(room) < NEAR_M]
     doorsteps = union_of([opening.buffer(walk_m, cap_style="flat") for opening in near])
-    ways = [opening.buffer(1.5 * walk_m, cap_style="flat") for opening in near]
-    left = MultiPolygon(parts_of(union_of([room, *ways]).difference(walls, grid_size=GRID_M)))
+    passages = [opening.buffer(1.5 * walk_m, cap_style="flat") for opening in near]
+    left = MultiPolygon(parts_of(union_of([room, *passages]).difference(walls, grid_size=GRID_M)))
     count = rng.poisson(clutter * room.area / 4) if room.area > _EMPTY_ROOM_M2 else 0
     things = [_furniture(rng, room) for _ in range(count)]
     if room.area > _PILLARED_ROOM_M2 and rng.random() < pillars:
@@ -78,14 +68,14 @@ def furnish(
             yield thing
 
 
-def _furniture(rng: np.random.Generator, room: Polygon) -> Polygon:
+def _furniture(rng: Rng, room: Polygon) -> Polygon:
     """Piece of furniture: along a wall, in a corner, or in the middle of a room."""
-    make, wall_share = _KINDS[int(rng.choice(len(_KINDS), p=_SHARES))]
+    make, at_wall = _KINDS[int(rng.choice(len(_KINDS), p=_FREQUENCIES))]
     thing = make(rng)
     if rng.random() < 0.3:
         spots = [thing.exterior.interpolate(where, normalized=True) for where in rng.random(rng.integers(2, 6))]
         thing = union_of([thing, *(spot.buffer(rng.uniform(0.12, 0.35), quad_segs=2) for spot in spots)])
-    if rng.random() >= wall_share:
+    if rng.random() >= at_wall:
         return _place(rng, room, affinity.rotate(thing, rng.choice([0, 90, rng.uniform(0, 180)], p=[0.4, 0.4, 0.2])))
     side = np.array(room.exterior.coords)[:, :2]
     lengths_m = np.linalg.norm(np.diff(side, axis=0), axis=1)
@@ -97,13 +87,13 @@ def _furniture(rng: np.random.Generator, room: Polygon) -> Polygon:
     return affinity.translate(turned, x + along_m * dx, y + along_m * dy)
 
 
-def _place(rng: np.random.Generator, room: Polygon, thing: Polygon) -> Polygon:
+def _place(rng: Rng, room: Polygon, thing: Polygon) -> Polygon:
     """Put a thing somewhere into the bounds of a room."""
     x0, y0, x1, y1 = room.bounds
     return affinity.translate(thing, rng.uniform(x0, x1), rng.uniform(y0, y1))
 
 
-def _block(rng: np.random.Generator, half_width: tuple[float, float], depth: tuple[float, float]) -> Polygon:
+def _block(rng: Rng, half_width: tuple[float, float], depth: tuple[float, float]) -> Polygon:
     """Rectangle whose middle is on a wall, deep enough on both sides of it; some have an arm."""
     half_width_m, depth_m = rng.uniform(*half_width), rng.uniform(*depth)
     thing = box(-half_width_m, -depth_m, half_width_m, depth_m)
@@ -115,12 +105,7 @@ def _block(rng: np.random.Generator, half_width: tuple[float, float], depth: tup
     return thing
 
 
-def _round(rng: np.random.Generator) -> Polygon:
-    """Ellipse."""
-    return affinity.scale(shapely.Point(0, 0).buffer(1.0, quad_segs=4), *rng.uniform(0.25, 0.8, 2))
-
-
-def _heap(rng: np.random.Generator) -> Polygon:
+def _heap(rng: Rng) -> Polygon:
     """Irregular block: a star of random radii, as scans make of plants, chairs and piles."""
     count = int(rng.integers(5, 9))
     angle = np.sort(rng.uniform(0, 1 / count, count) + np.arange(count) / count) * 2 * math.pi
@@ -128,13 +113,13 @@ def _heap(rng: np.random.Generator) -> Polygon:
     return Polygon(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
 
 
-_Maker = Callable[[np.random.Generator], Polygon]
-
-_KINDS: tuple[tuple[_Maker, float], ...] = (
+_KINDS: tuple[tuple[Callable[[Rng], Polygon], float], ...] = (
     (lambda rng: _block(rng, (0.6, 2.0), (0.35, 0.7)), 1.0),  # shelves, kitchens, wardrobes
     (lambda rng: _block(rng, (0.4, 1.0), (0.8, 2.0)), 1.0),  # beds, sofas, desks
     (lambda rng: _block(rng, (0.3, 1.0), (0.2, 0.5)), 0.2),  # tables
-    (_round, 0.3),
+    (lambda rng: affinity.scale(shapely.Point(0, 0).buffer(1.0, quad_segs=4), *rng.uniform(0.25, 0.8, 2)), 0.3),
     (_heap, 0.6),
 )
-_SHARES = (0.3, 0.25, 0.15, 0.1, 0.2)
+"""How each kind is drawn, and the probability that it stands at a wall."""
+
+_FREQUENCIES = (0.3, 0.25, 0.15, 0.1, 0.2)

@@ -1,14 +1,14 @@
 """Procedural homes: complete floor plans from a seed.
 
-A plan is drawn as polygons in metres: an outline, its division into rooms by corridors and walls, openings along a
-spanning tree of the rooms (so that every room can be reached) and a few more, then furniture where it leaves room to
-walk. Only at the end is it turned and put onto cells, where walls and furniture swell a little, evenly or in waves, as
-they do on the maps that robots and scanners make. `docs/homes.md` compares the homes with real ones.
+A plan is drawn as polygons in metres: an outline, rooms, openings along a spanning tree of the rooms (so that every
+room can be reached) and a few more, and furniture that leaves room to walk. Then it is turned and put onto cells, where
+walls and furniture swell a little, as on maps of robots and scanners. `docs/homes.md` compares them with real homes.
 """
 
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -21,11 +21,12 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
+from sionna_partial.checks import is_whole, require, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import HOME_KINDS, HomeKind, is_whole, require, require_number
+from sionna_partial.settings import HOME_KINDS, HomeKind
 from sionna_partial.simulation.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
-from sionna_partial.simulation.furniture import GRID_M, NEAR_M, furnish, parts_of, union_of
+from sionna_partial.simulation.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
 
 RESOLUTION_M = 0.05
 """Edge of a cell of the other kinds where none is given [m]."""
@@ -44,26 +45,27 @@ DOOR_M = (0.8, 1.0)
 WIDE_M = (1.2, 2.5)
 """Width of wide openings [m]."""
 
-LOCKED_SHARE = 0.25
-"""Share of the rooms at dead ends that stay locked, on average."""
+LOCKED_FRACTION = 0.25
+"""Fraction of the rooms at dead ends that stay locked, on average."""
 
-SHUT_SHARE = 0.9
-"""Share of the homes in which locked rooms are free all the same, out of reach, as on scans of real homes."""
+SHUT_FRACTION = 0.9
+"""Fraction of the homes in which locked rooms are free all the same, out of reach, as on scans of real homes."""
 
 SHUT_AREA = 0.2
-"""Largest area of all such rooms of a home, as a share of the area within reach."""
+"""Largest area of all such rooms of a home, as a fraction of the area within reach."""
 
-LEAF_SHARE = 0.2
-"""Share of the doors whose leaf stands open into a room."""
+LEAF_FRACTION = 0.2
+"""Fraction of the doors whose leaf stands open into a room."""
 
 _MARGIN_M = 0.3
 _JAMB_M = 0.05
 _CORRIDOR_SHAPE = 25
 _SLIVER_M = 0.1
-_WALKED_SHARE = 0.97
+_WALKED_FRACTION = 0.97
 _SMALLEST_ROOM_M2 = 1.0
 _SMALLEST_M2 = 3.0
 _WAVES = 12
+_AISLE_M = (1.6, 4.5)
 _WAVE_PER_M = 0.5
 
 
@@ -71,7 +73,7 @@ _WAVE_PER_M = 0.5
 class _Style:
     """Ranges and probabilities of a kind of home, or what one home has; lengths in metres, areas in square metres."""
 
-    share: float
+    frequency: float
     area: tuple[float, float]
     room_area: tuple[float, float]
     closet: float
@@ -80,7 +82,7 @@ class _Style:
     openness: float
     more_doors: float
     pillars: float
-    locked: float = LOCKED_SHARE
+    locked: float = LOCKED_FRACTION
     wall: float = 0.1
     clutter: float = 1.0
     swelling: float = 0.0
@@ -89,7 +91,7 @@ class _Style:
 
     @property
     def walk(self) -> float:
-        """Width of ways before walls and furniture swell."""
+        """Width of passages before walls and furniture swell."""
         return WALK_M + 2 * self.swelling
 
 
@@ -97,17 +99,11 @@ STYLES: dict[str, _Style] = {
     "apartment": _Style(0.5, (30, 150), (7, 20), 0.35, 0.5, (0.9, 1.4), 0.4, 0.15, 0.1),
     "house": _Style(0.35, (40, 230), (9, 26), 0.35, 0.5, (1.0, 1.6), 0.4, 0.25, 0.15),
     "office": _Style(0.15, (90, 600), (10, 40), 0.1, 0.95, (1.4, 2.4), 0.2, 0.15, 0.5, 0.1, clutter=0.5),
-    "floor": _Style(
-        0.0, (600, 6000), (30, 100), 0.0, 1.0, (1.6, 4.5), 0.1, 0.05, 0.0, 0.1, clutter=0.03, layout=floor_layout
-    ),
-    "hall": _Style(
-        0.0, (200, 6000), (12, 40), 0.0, 0.0, (1.6, 4.5), 0.2, 0.3, 0.0, 0.1, clutter=0.02, layout=hall_layout
-    ),
-    "warehouse": _Style(
-        0.0, (300, 6000), (12, 40), 0.0, 0.0, (1.6, 4.5), 0.2, 0.3, 0.0, 0.1, clutter=0.01, layout=warehouse_layout
-    ),
+    "floor": _Style(0, (600, 6000), (30, 100), 0, 1, _AISLE_M, 0.1, 0.05, 0, 0.1, 0.1, 0.03, layout=floor_layout),
+    "hall": _Style(0, (200, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.02, layout=hall_layout),
+    "warehouse": _Style(0, (300, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.01, layout=warehouse_layout),
 }
-"""The kinds of homes that can be made; areas are those of the outline. `share` is how often kind=None draws one."""
+"""The kinds of homes that can be made; areas are those of the outline. `frequency` is how often kind=None draws one."""
 
 
 def make_home(
@@ -138,28 +134,35 @@ def make_home(
     ------
     SettingsError
         For a seed, kind or resolution that is not allowed.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> home = sp.make_home(3, "apartment")
+    >>> home.is_complete, home.resolution_m
+    (True, 0.05)
     """
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
     require(kind is None or kind in STYLES, "kind", kind, f"choose one of {HOME_KINDS} or None.")
     if resolution_m is not None:
         require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)
-    style = STYLES[kind or str(rng.choice(list(STYLES), p=[each.share for each in STYLES.values()]))]
+    style = STYLES[kind or str(rng.choice(list(STYLES), p=[each.frequency for each in STYLES.values()]))]
     resolution_m = resolution_m or (LARGE_RESOLUTION_M if style.layout else RESOLUTION_M)
-    plan = _draw(rng, style, locked_rooms=locked_rooms)
-    while plan is None:
-        plan = _draw(rng, style, locked_rooms=locked_rooms)
+    while (plan := _draw(rng, style, locked_rooms=locked_rooms)) is None:
+        pass
     thickness_m = rng.choice([0.0, rng.uniform(0.13, 0.25)], p=[0.85, 0.15])
     corners = bool(thickness_m > 0 or rng.random() < 0.3)
     angle_deg = float(rng.choice([0.0, rng.uniform(-45, 45)], p=[0.3, 0.7]))
-    turned = replace(plan, **{name: affinity.rotate(getattr(plan, name), angle_deg, origin=(0, 0)) for name in _SHAPES})
-    state = _cells(turned, resolution_m, max(1, round(thickness_m / resolution_m)), corners)
+    shapes = {name: affinity.rotate(getattr(plan, name), angle_deg, (0, 0)) for name in ("free", "shut", "lines")}
+    plan = replace(plan, **shapes)
+    state = _cells(plan, resolution_m, max(1, round(thickness_m / resolution_m)), corners)
     return PartialMap(state, resolution_m, interior_cells=int((state == CellState.FREE).sum()))
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """One home: free area, locked rooms, wall lines; how far walls and furniture swell [m], its share, and waves."""
+    """One home: free area, locked rooms, wall lines; how far walls and furniture swell [m], how unevenly, and waves."""
 
     free: Polygon
     shut: shapely.GeometryCollection
@@ -169,16 +172,22 @@ class _Plan:
     waves: NDArray[np.float64]
 
 
-_SHAPES = ("free", "shut", "lines")
-
-
-def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
+def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
     """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
-    pieces, fixtures = _layout(rng, style)
+    area_m2 = log_uniform(rng, style.area)
+    fixtures: list[Polygon] = []
+    if style.layout is None:
+        pieces: Iterable[Polygon] = _rooms(rng, _outline(rng, area_m2), style)
+    else:
+        pieces, fixtures = style.layout(rng, area_m2, log_uniform(rng, style.room_area))
     rooms = [core for piece in pieces for core in _cores(piece)]
     rooms, openings, locked = _connected(rng, rooms, style)
-    leaves = [_leaf(rng, opening) for opening in openings if opening.length <= DOOR_M[1] and rng.random() < LEAF_SHARE]
+    leaves = []
+    for opening in openings:
+        if opening.length <= DOOR_M[1] and rng.random() < LEAF_FRACTION:
+            hinge = opening.coords[int(rng.integers(2))]
+            leaves.append(affinity.rotate(opening, rng.choice([-1, 1]) * rng.uniform(75, 110), origin=hinge))
     gaps = union_of([opening.buffer(0.05, cap_style="flat") for opening in openings])
     lines = union_of([room.boundary for room in rooms]).difference(gaps, grid_size=GRID_M)
     walls = lines.buffer(style.wall / 2, cap_style="flat", join_style="mitre")
@@ -192,21 +201,12 @@ def _draw(rng: np.random.Generator, kind: _Style, *, locked_rooms: bool) -> _Pla
     free = union_of([*rooms, gaps]).difference(union_of([walls, *things]), grid_size=GRID_M)
     free = free.buffer(-_SLIVER_M, join_style="mitre").buffer(_SLIVER_M, join_style="mitre")
     walked = parts_of(free.buffer(-style.walk / 2))
-    if not walked or walked[0].area < max(_SMALLEST_M2, _WALKED_SHARE * sum(part.area for part in walked)):
+    if not walked or walked[0].area < max(_SMALLEST_M2, _WALKED_FRACTION * sum(part.area for part in walked)):
         return None
     free = next(part for part in parts_of(free) if part.intersects(walked[0]))
     waves = rng.normal(size=(_WAVES, 3))
-    shut = _shut(locked if locked_rooms and rng.spawn(1)[0].random() < SHUT_SHARE else [], free, style.wall)
+    shut = _shut(locked if locked_rooms and rng.spawn(1)[0].random() < SHUT_FRACTION else [], free, style.wall)
     return _Plan(free, shut, lines, style.swelling, style.raggedness, waves)
-
-
-def _layout(rng: np.random.Generator, style: _Style) -> tuple[Iterable[Polygon], list[Polygon]]:
-    """Rooms of a home before they are checked, and what stands fixed in them."""
-    area_m2 = _log_uniform(rng, style.area)
-    if style.layout is not None:
-        layout = style.layout(rng, area_m2, _log_uniform(rng, style.room_area))
-        return layout.rooms, layout.fixtures
-    return _rooms(rng, _outline(rng, area_m2), style), []
 
 
 def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.GeometryCollection:
@@ -218,9 +218,9 @@ def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.Geomet
     return shapely.GeometryCollection([part for part, fits in zip(parts, few, strict=True) if fits])
 
 
-def _varied(rng: np.random.Generator, style: _Style) -> _Style:
-    """Style of one home: larger or smaller rooms, more open, fuller, thicker walls than its kind has on average."""
-    scale = _log_uniform(rng, (0.45, 3.5))
+def _varied(rng: Rng, style: _Style) -> _Style:
+    """Style of one home: how it differs from the mean of its kind."""
+    scale = log_uniform(rng, (0.45, 3.5))
     return replace(
         style,
         room_area=(scale * style.room_area[0], scale * style.room_area[1]),
@@ -234,11 +234,7 @@ def _varied(rng: np.random.Generator, style: _Style) -> _Style:
     )
 
 
-def _log_uniform(rng: np.random.Generator, between: tuple[float, float]) -> float:
-    return float(np.exp(rng.uniform(*np.log(between))))
-
-
-def _outline(rng: np.random.Generator, area: float) -> Polygon:
+def _outline(rng: Rng, area: float) -> Polygon:
     """Outline of a home: a rectangle with corners cut out (L, T, U, Z, chamfers), a turned wing, and bays."""
     width, height = rng.uniform(1.0, 2.0), 1.0
     outline = box(0, 0, width, height)
@@ -259,13 +255,13 @@ def _outline(rng: np.random.Generator, area: float) -> Polygon:
     outline = parts_of(outline)[0]
     outline = affinity.scale(outline, *[math.sqrt(area / outline.area)] * 2, origin=(0, 0))
     for _ in range(rng.poisson(2.0)):
-        place = outline.exterior.interpolate(rng.random(), normalized=True)
-        bay = affinity.translate(box(-0.5, -0.5, 0.5, 0.5), place.x, place.y)
+        spot = outline.exterior.interpolate(rng.random(), normalized=True)
+        bay = affinity.translate(box(-0.5, -0.5, 0.5, 0.5), spot.x, spot.y)
         outline = outline.union(affinity.scale(bay, *rng.uniform(0.9, 2.5, 2)))
     return Polygon(outline.exterior)
 
 
-def _rooms(rng: np.random.Generator, outline: Polygon, style: _Style) -> Iterator[Polygon]:
+def _rooms(rng: Rng, outline: Polygon, style: _Style) -> Iterator[Polygon]:
     """Divide the outline into rooms, often along a corridor, which comes first."""
     rest: shapely.Geometry = outline
     if rng.random() < style.corridor:
@@ -273,23 +269,21 @@ def _rooms(rng: np.random.Generator, outline: Polygon, style: _Style) -> Iterato
         x, y = np.array([x0, y0]) + rng.uniform(0.35, 0.65, 2) * (x1 - x0, y1 - y0)
         half = (rng.uniform(*style.corridor_width) + style.wall) / 2
         reach = rng.choice([1.0, rng.uniform(0.5, 0.9)])
-        strips = [
-            box(x0, y - half, x0 + reach * (x1 - x0), y + half),
-            box(x - half, y0, x + half, y0 + reach * (y1 - y0)),
-        ]
-        first = int(y1 - y0 > x1 - x0)
-        corridor = strips[first].union(strips[1 - first]) if rng.random() < 0.3 else strips[first]
+        along_x = box(x0, y - half, x0 + reach * (x1 - x0), y + half)
+        along_y = box(x - half, y0, x + half, y0 + reach * (y1 - y0))
+        strip, other = (along_y, along_x) if y1 - y0 > x1 - x0 else (along_x, along_y)
+        corridor = strip.union(other) if rng.random() < 0.3 else strip
         yield from parts_of(outline.intersection(corridor))
         rest = outline.difference(corridor)
     for part in parts_of(rest):
         yield from _divide(rng, part, style)
 
 
-def _divide(rng: np.random.Generator, part: Polygon, style: _Style) -> Iterator[Polygon]:
+def _divide(rng: Rng, part: Polygon, style: _Style) -> Iterator[Polygon]:
     """Halve an area across its longer side until its parts are of the size of rooms; carve closets from some."""
     x0, y0, x1, y1 = part.bounds
     long, short = max(x1 - x0, y1 - y0), min(x1 - x0, y1 - y0)
-    big = part.area > 1.6 * _log_uniform(rng, style.room_area) or long > 3.5 * short
+    big = part.area > 1.6 * log_uniform(rng, style.room_area) or long > 3.5 * short
     if big:
         at = rng.uniform(0.35, 0.65)
     elif part.area > 6 and rng.random() < style.closet:
@@ -315,16 +309,21 @@ def _cores(piece: Polygon) -> list[Polygon]:
     return [core for core in parts_of(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
 
 
-def _connected(
-    rng: np.random.Generator, rooms: list[Polygon], style: _Style
-) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
-    """Rooms that can be reached, their openings (those of a random spanning tree, and some more), and locked rooms."""
+def _connected(rng: Rng, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
+    """Rooms that can be reached, their openings, and locked rooms.
+
+    Openings are those of a random spanning tree, which goes through corridors where it can, and some more.
+    """
     jamb_m = _JAMB_M + style.wall / 2
     pairs = [(i, j) for i in range(len(rooms)) for j in range(i)]
     walls = [_common_wall(rooms[i], rooms[j]) for i, j in pairs]
     wide = [k for k, wall in enumerate(walls) if wall.length >= DOOR_M[0] + 2 * jamb_m]
-    tree = _tree(rng, rooms, [pairs[k] for k in wide])
-    doors = [k for k in wide if pairs[k] in tree or rng.random() < style.more_doors]
+    corridor = np.array([room.length**2 > _CORRIDOR_SHAPE * room.area for room in rooms])
+    rows, columns = np.array([pairs[k] for k in wide], dtype=int).reshape(-1, 2).T
+    weights = rng.uniform(1, 2, len(wide)) + 2.0 * ~(corridor[rows] | corridor[columns])
+    tree = minimum_spanning_tree(coo_array((weights, (rows, columns)), shape=(len(rooms),) * 2)).tocoo()
+    linked = set(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
+    doors = [k for k in wide if pairs[k] in linked or rng.random() < style.more_doors]
     degree = np.bincount([room for k in doors for room in pairs[k]], minlength=len(rooms))
     locked = (degree == 0) | ((degree == 1) & (rng.random(len(rooms)) < style.locked))
     if locked.all():
@@ -334,30 +333,17 @@ def _connected(
     return open_rooms, openings, locked_rooms
 
 
-def _tree(rng: np.random.Generator, rooms: list[Polygon], pairs: list[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Pairs of a random spanning tree of the rooms that goes through corridors where it can."""
-    corridor = np.array([room.length**2 > _CORRIDOR_SHAPE * room.area for room in rooms])
-    rows, columns = np.array(pairs, dtype=int).reshape(-1, 2).T
-    weights = rng.uniform(1, 2, len(pairs)) + 2.0 * ~(corridor[rows] | corridor[columns])
-    tree = minimum_spanning_tree(coo_array((weights, (rows, columns)), shape=(len(rooms),) * 2)).tocoo()
-    return set(zip(tree.row.tolist(), tree.col.tolist(), strict=True))
-
-
 def _common_wall(room: Polygon, other: Polygon) -> LineString:
     """Longest straight wall between two rooms; empty if there is none."""
     if room.distance(other) > NEAR_M:
         return LineString()
     shared = shapely.line_merge(room.boundary.intersection(other.buffer(NEAR_M)))
-    sides = [
-        LineString(ends)
-        for line in shapely.get_parts(shared)
-        if line.geom_type == "LineString"
-        for ends in zip(line.coords, line.coords[1:], strict=False)
-    ]
+    lines = [line.coords for line in shapely.get_parts(shared) if line.geom_type == "LineString"]
+    sides = [LineString(ends) for line in lines for ends in pairwise(line)]
     return max(sides, key=lambda side: side.length, default=LineString())
 
 
-def _opening(rng: np.random.Generator, wall: LineString, style: _Style, jamb_m: float) -> LineString:
+def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineString:
     """Part of a wall that is a door, a wide opening, or all of it."""
     room = wall.length - 2 * jamb_m
     if rng.random() < style.openness and room > WIDE_M[0]:
@@ -366,12 +352,6 @@ def _opening(rng: np.random.Generator, wall: LineString, style: _Style, jamb_m: 
         width = rng.uniform(DOOR_M[0], min(room, DOOR_M[1]))
     start = jamb_m + rng.choice([0.0, rng.random(), 1.0]) * (room - width)
     return substring(wall, start, start + width)
-
-
-def _leaf(rng: np.random.Generator, opening: LineString) -> LineString:
-    """Door leaf that stands open."""
-    hinge = opening.coords[int(rng.integers(2))]
-    return affinity.rotate(opening, rng.choice([-1, 1]) * rng.uniform(75, 110), origin=hinge)
 
 
 def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> NDArray[np.uint8]:
@@ -405,6 +385,6 @@ def _swollen(inside: NDArray[np.bool_], resolution_m: float, plan: _Plan) -> NDA
     wave = np.zeros(inside.shape)
     for per_x, per_y, turns in plan.waves:
         wave += np.sin(2 * math.pi * (_WAVE_PER_M * (per_x * x + per_y * y) + turns))
-    share = 1 - plan.raggedness * (0.5 + 0.5 * np.clip(wave / math.sqrt(2 * _WAVES), -1, 1))
+    fraction = 1 - plan.raggedness * (0.5 + 0.5 * np.clip(wave / math.sqrt(2 * _WAVES), -1, 1))
     distance_m = (ndimage.distance_transform_edt(inside) - 0.5) * resolution_m
-    return distance_m < plan.swelling_m * share
+    return distance_m < plan.swelling_m * fraction

@@ -1,4 +1,4 @@
-"""The robot: where it goes, how it gets there, and what stops it.
+"""The exploring robot: its goals, its routes, and what stops it.
 
 It is that of Active Neural SLAM (Chaplot et al., ICLR 2020): one action a step, a quarter of a metre forward or ten
 degrees of turn, and a long-term goal every 25 steps. Its learnt policies are replaced by frontiers between seen and
@@ -6,7 +6,6 @@ unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shor
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +26,8 @@ TURN_DEG = 10
 ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
 """Radii of the robot [m]: it takes the largest with which it gets around in the home."""
 
-ROAMED_SHARE = 0.95
-"""Share of the free area that the robot must be able to cover to get around."""
+ROAMED_FRACTION = 0.95
+"""Fraction of the free area that the robot must be able to cover to get around."""
 
 GOAL_RANGES = 2.0
 """Ranges of the sensor that the robot may go before it chooses its goal anew [1].
@@ -55,47 +54,27 @@ _ARRIVAL_M = 0.3
 _DECISION_STEPS = 5.0
 
 
-@dataclass
-class _Goal:
-    """A frontier cell and the way there: cells (n, 2) from the robot to it."""
-
-    path: NDArray[np.intp]
-    steps: int = 0
-
-    @property
-    def cell(self) -> tuple[int, int]:
-        return int(self.path[-1, 0]), int(self.path[-1, 1])
-
-
 class Robot:
-    """Pose, knowledge and plan of the robot.
+    """Pose, map and plan of a robot in a home (ny, nx) that has some free cells, and unknown cells all around.
 
-    Lengths are in cells; x runs along columns, y along rows. `place` is where it is. It plans where it believes to be,
-    on the map that it has made.
-
-    Parameters
-    ----------
-    truth : (ny, nx) uint8 array of CellState
-        The home, with unknown cells all around, and some free ones.
-    resolution_m : float
-        Edge of a cell [m].
-    seed : int
-        Seed of start, heading, goals and errors.
-    sensor : SensorSettings
+    Lengths are in cells; x runs along columns, y along rows. It is at `position`, and plans where it believes to be
+    (`believed_position`), on the map that it has made (`seen`).
     """
 
     def __init__(self, truth: NDArray[np.uint8], resolution_m: float, seed: int, sensor: SensorSettings) -> None:
         self._rng, errors = np.random.default_rng(seed), np.random.default_rng((seed, 1))
         self._cell_m = resolution_m
         self._radius, self._roomy = _fitting_radius(truth == _FREE, resolution_m)
-        self._footprint = _disc(self._radius)
+        rows, columns = np.mgrid[-int(self._radius) : int(self._radius) + 1, -int(self._radius) : int(self._radius) + 1]
+        self._footprint = np.argwhere(np.hypot(rows, columns) <= self._radius) - int(self._radius)
         self._goal_steps = max(1, int(GOAL_RANGES * sensor.range_m / FORWARD_M))
         self._given_up = np.zeros(truth.shape, dtype=bool)
         self._bumps = np.zeros(truth.shape, dtype=bool)
-        self._goal: _Goal | None = None
+        self._route: NDArray[np.intp] | None = None  # cells (n, 2), the last of them the goal
+        self._route_steps = 0
         self.is_finished = False
         row, column = self._rng.choice(np.argwhere(self._roomy))
-        self.place = column + 0.5, row + 0.5
+        self.position = column + 0.5, row + 0.5
         self.heading_deg = float(self._rng.integers(360 // TURN_DEG) * TURN_DEG)
         self._shift = 0.0, 0.0
         direction = errors.uniform(0.0, math.tau)
@@ -109,44 +88,45 @@ class Robot:
         return self._camera.seen
 
     @property
-    def believed_place(self) -> tuple[float, float]:
+    def believed_position(self) -> tuple[float, float]:
         """Where the robot believes to be."""
-        return self.place[0] + self._shift[0], self.place[1] + self._shift[1]
+        return self.position[0] + self._shift[0], self.position[1] + self._shift[1]
 
     def act(self) -> None:
         """Do one action towards a frontier, and look; do nothing once no frontier can be reached."""
         if self.is_finished:
             return
-        goal = self._goal
-        if goal is None or goal.steps >= self._goal_steps or self._is_done(goal.cell):
-            goal = self._goal = self._choose_goal()
-        if goal is None:
+        route = self._route
+        if route is None or self._route_steps >= self._goal_steps or self._is_done(route[-1]):
+            route = self._route = self._choose_route()
+            self._route_steps = 0
+        if route is None:
             self.is_finished = True
             return
-        goal.steps += 1
-        row, column = self._waypoint(goal)
-        error = self._turn_to((int(row), int(column)))
-        if abs(error) > TURN_DEG / 2:
-            self.heading_deg = (self.heading_deg + math.copysign(TURN_DEG, error)) % 360.0
+        self._route_steps += 1
+        ahead = int(np.argmin(self._distances_to(route))) + max(1, round(_AHEAD_M / self._cell_m))
+        error_deg = self._turn_to(route[min(ahead, len(route) - 1)])
+        if abs(error_deg) > TURN_DEG / 2:
+            self.heading_deg = (self.heading_deg + math.copysign(TURN_DEG, error_deg)) % 360.0
         elif not self._step_forward():
-            self._bump(goal)
+            self._bump(route[-1])
         self._look()
 
     def _look(self) -> None:
         under = self._footprint + self._cell()
         inside = ((under >= 0) & (under < self.seen.shape)).all(axis=1)
-        self._camera.look(*self.place, self.heading_deg, self._shift, under[inside])
+        self._camera.look(*self.position, self.heading_deg, self._shift, under[inside])
 
     def _cell(self) -> tuple[int, int]:
         """Cell of the map, row and column, where the robot believes to be."""
-        (x, y), (ny, nx) = self.believed_place, self.seen.shape
+        (x, y), (ny, nx) = self.believed_position, self.seen.shape
         return min(max(int(y), 0), ny - 1), min(max(int(x), 0), nx - 1)
 
-    def _turn_to(self, cell: tuple[int, int]) -> float:
+    def _turn_to(self, cell: NDArray[np.intp]) -> float:
         """Turn that would make the robot face a cell [degree], from -180 to 180."""
-        x, y = self.believed_place
-        bearing = math.degrees(math.atan2(cell[0] + 0.5 - y, cell[1] + 0.5 - x))
-        return (bearing - self.heading_deg + 180.0) % 360.0 - 180.0
+        x, y = self.believed_position
+        bearing_deg = math.degrees(math.atan2(int(cell[0]) + 0.5 - y, int(cell[1]) + 0.5 - x))
+        return (bearing_deg - self.heading_deg + 180.0) % 360.0 - 180.0
 
     def _frontier(self, part: tuple[slice, slice]) -> NDArray[np.bool_]:
         """Free cells of a part of the map that touch an unseen one, where the robot has not given up."""
@@ -154,49 +134,43 @@ class Robot:
         beside = ndimage.binary_dilation(seen == _UNKNOWN)
         return beside & (seen == _FREE) & ~self._given_up[part]
 
-    def _known_part(self) -> tuple[slice, slice]:
-        """Part of the map that has the robot and all known cells, and one more on each side."""
+    def _choose_route(self) -> NDArray[np.intp] | None:
+        """Draw a frontier, the likelier the more it promises for few steps; None if none can be reached."""
         known = self.seen != _UNKNOWN
         known[self._cell()] = True
         rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-        return _part((rows[0] - 1, columns[0] - 1), (rows[-1] + 2, columns[-1] + 2))
-
-    def _choose_goal(self) -> _Goal | None:
-        """Draw a frontier, the likelier the more it promises for few steps; None if none can be reached."""
-        part = self._known_part()
-        corner = part[0].start, part[1].start
+        part = _part((rows[0] - 1, columns[0] - 1), (rows[-1] + 2, columns[-1] + 2))
+        corner = np.array([part[0].start, part[1].start])
         labels, count = ndimage.label(self._frontier(part), structure=_EIGHT)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-        router = _Router(self._travel_cost(part), corner, self._cell())
+        router = _Router(self._travel_cost(part), tuple(self._cell() - corner))
         middles, promises = [], []
-        for label, place in enumerate(ndimage.find_objects(labels), start=1):
+        for label, box in enumerate(ndimage.find_objects(labels), start=1):
             if sizes[label - 1] < _SMALLEST_FRONTIER_CELLS:
                 continue
-            cells = np.argwhere(labels[place] == label) + np.add(corner, [side.start for side in place])
-            row, column = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
-            middles.append((int(row), int(column)))
-            steps = self._steps_to(middles[-1], router.cost_to(middles[-1]))
+            cells = np.argwhere(labels[box] == label) + np.add(corner, [side.start for side in box])
+            middle = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
+            turn_deg = abs(self._turn_to(middle))
+            steps = float(router.costs[tuple(middle - corner)] * self._cell_m / FORWARD_M + turn_deg / TURN_DEG)
+            middles.append(middle)
             promises.append(math.sqrt(sizes[label - 1]) / (steps + _DECISION_STEPS))
         if not any(promises):
             return None
         odds = np.array(promises) ** GOAL_SHARPNESS
-        return _Goal(router.path_to(middles[self._rng.choice(len(middles), p=odds / odds.sum())]))
+        return router.path_to(middles[self._rng.choice(len(middles), p=odds / odds.sum())] - corner) + corner
 
-    def _distance_to(self, cell: tuple[int, int]) -> float:
-        x, y = self.believed_place
-        return math.hypot(cell[0] + 0.5 - y, cell[1] + 0.5 - x)
+    def _distances_to(self, cells: NDArray[np.intp]) -> NDArray[np.float64]:
+        x, y = self.believed_position
+        distances: NDArray[np.float64] = np.hypot(cells[..., 0] + 0.5 - y, cells[..., 1] + 0.5 - x)
+        return distances
 
-    def _is_done(self, cell: tuple[int, int]) -> bool:
-        around = _part((cell[0] - 1, cell[1] - 1), (cell[0] + 2, cell[1] + 2))
-        middle = min(cell[0], 1), min(cell[1], 1)
-        return self._distance_to(cell) * self._cell_m < _ARRIVAL_M and not self._frontier(around)[middle]
-
-    def _steps_to(self, cell: tuple[int, int], cost: float) -> float:
-        """Count the actions to a cell: the way, and the turn towards it."""
-        return float(cost * self._cell_m / FORWARD_M + abs(self._turn_to(cell)) / TURN_DEG)
+    def _is_done(self, goal: NDArray[np.intp]) -> bool:
+        around = _part((goal[0] - 1, goal[1] - 1), (goal[0] + 2, goal[1] + 2))
+        middle = min(int(goal[0]), 1), min(int(goal[1]), 1)
+        return bool(self._distances_to(goal) * self._cell_m < _ARRIVAL_M and not self._frontier(around)[middle])
 
     def _travel_cost(self, part: tuple[slice, slice]) -> NDArray[np.float64]:
-        """Cost per cell of the way: 1 in the open, more beside walls, 0 (no way) where not seen free."""
+        """Cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
         seen = self.seen[part]
         distance = ndimage.distance_transform_edt(seen != _WALL) - 0.5
         nearness = np.clip(1.0 - distance * self._cell_m / _COMFORT_M, 0.0, 1.0)
@@ -205,58 +179,45 @@ class Robot:
         cost[seen != _FREE] = 0.0
         return cost
 
-    def _waypoint(self, goal: _Goal) -> NDArray[np.intp]:
-        """Cell of the path a little ahead of the robot."""
-        x, y = self.believed_place
-        away = np.hypot(goal.path[:, 0] + 0.5 - y, goal.path[:, 1] + 0.5 - x)
-        ahead = int(np.argmin(away)) + max(1, round(_AHEAD_M / self._cell_m))
-        return goal.path[min(ahead, len(goal.path) - 1)]
-
     def _step_forward(self) -> bool:
-        """Move ahead, sliding along walls; return whether at least half of the way was made."""
+        """Move ahead, sliding along walls; return whether at least half of the step was made."""
         angle, length = math.radians(self.heading_deg), FORWARD_M / self._cell_m
         parts = math.ceil(2 * length)
         along_x, along_y = math.cos(angle) * length / parts, math.sin(angle) * length / parts
-        (x, y), way = self.place, 0.0
+        (x, y), length_moved = self.position, 0.0
         for _ in range(parts):
             for move_x, move_y in ((along_x, along_y), (along_x, 0.0), (0.0, along_y)):
                 if self._has_room(x + move_x, y + move_y, (int(y), int(x))):
-                    x, y, way = x + move_x, y + move_y, way + math.hypot(move_x, move_y)
+                    x, y, length_moved = x + move_x, y + move_y, length_moved + math.hypot(move_x, move_y)
                     break
-        made = math.hypot(x - self.place[0], y - self.place[1])
-        self.place = x, y
-        self._shift = self._shift[0] + self._drift[0] * way, self._shift[1] + self._drift[1] * way
+        made = math.hypot(x - self.position[0], y - self.position[1])
+        self.position = x, y
+        self._shift = self._shift[0] + self._drift[0] * length_moved, self._shift[1] + self._drift[1] * length_moved
         return made >= length / 2
 
     def _has_room(self, x: float, y: float, cell: tuple[int, int]) -> bool:
-        """Whether the robot can be at a place, and get there from a cell: not between walls that meet at a corner."""
+        """Whether the robot fits at x, y, and gets there from a cell: not between walls that meet at a corner."""
         row, column = int(y), int(x)
         beside = self._roomy[row, cell[1]] or self._roomy[cell[0], column]
         return bool(self._roomy[row, column] and beside)
 
-    def _bump(self, goal: _Goal) -> None:
-        """Avoid what stopped the robot; give up what is too near to be approached further."""
+    def _bump(self, goal: NDArray[np.intp]) -> None:
+        """Avoid what stopped the robot; take no frontier any more at a goal that is too near to be approached."""
         reach = _BUMP_M / self._cell_m
-        angle, (x, y) = math.radians(self.heading_deg), self.believed_place
+        angle, (x, y) = math.radians(self.heading_deg), self.believed_position
         x, y = x + math.cos(angle) * reach / 2, y + math.sin(angle) * reach / 2
         rows, columns = self._cells_around(y, x, reach)
         self._bumps[rows, columns] |= np.hypot(rows + 0.5 - y, columns + 0.5 - x) < reach / 2
-        if self._distance_to(goal.cell) < 2 * reach:
-            self._give_up(goal)
-        self._goal = None
-
-    def _give_up(self, goal: _Goal) -> None:
-        """Take no frontier at a goal any more."""
-        (row, column), reach = goal.cell, _BUMP_M / self._cell_m
-        rows, columns = self._cells_around(row, column, reach)
-        self._given_up[rows, columns] |= np.hypot(rows - row, columns - column) <= reach
+        if self._distances_to(goal) < 2 * reach:
+            rows, columns = self._cells_around(int(goal[0]), int(goal[1]), reach)
+            self._given_up[rows, columns] |= np.hypot(rows - goal[0], columns - goal[1]) <= reach
+        self._route = None
 
     def _cells_around(self, row: float, column: float, reach: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
-        spans = zip((row, column), self.seen.shape, strict=True)
-        rows, columns = (
-            np.arange(max(0, int(at - reach)), max(0, min(size, int(at + reach) + 2))) for at, size in spans
-        )
+        ny, nx = self.seen.shape
+        rows = np.arange(max(0, int(row - reach)), max(0, min(ny, int(row + reach) + 2)))
+        columns = np.arange(max(0, int(column - reach)), max(0, min(nx, int(column + reach) + 2)))
         return rows[:, None], columns[None]
 
 
@@ -265,30 +226,13 @@ def _part(low: tuple[int, int], high: tuple[int, int]) -> tuple[slice, slice]:
     return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
-def _disc(radius: float) -> NDArray[np.intp]:
-    """Cells (N, 2) within a radius, relative to the one in the middle."""
-    reach = int(radius)
-    rows, columns = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    near = np.hypot(rows, columns) <= radius
-    return np.stack([rows[near], columns[near]], axis=1)
-
-
 class _Router:
-    """Shortest ways from one cell to all others, in eight directions, where a cell costs more than 0 to cross.
+    """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross.
 
-    None leads between two cells that meet at a corner and cannot be crossed.
-
-    Parameters
-    ----------
-    cost : (ny, nx) array
-        Cost of the cells of a part of a map.
-    corner : (int, int)
-        Row and column on the map of the part's first cell; `start` and all that is returned are cells of the map.
-    start : (int, int)
+    None leads between two cells that meet at a corner and cannot be crossed (skimage's MCP would take that corner).
     """
 
-    def __init__(self, cost: NDArray[np.float64], corner: tuple[int, int], start: tuple[int, int]) -> None:
-        self._corner = np.array(corner)
+    def __init__(self, cost: NDArray[np.float64], start: tuple[int, ...]) -> None:
         self._cells = np.argwhere(cost > 0)
         self._index = np.full(cost.shape, -1)
         self._index[tuple(self._cells.T)] = np.arange(len(self._cells))
@@ -301,27 +245,18 @@ class _Router:
             linked = (cost[here] > 0) & (cost[there] > 0) & beside
             ends.append([self._index[here][linked], self._index[there][linked]])
             weights.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
-        size = len(self._cells)
-        graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(size, size)).tocsr()
-        cheapest, self._before = dijkstra(
-            graph, directed=False, indices=self._index[self._of_part(start)], return_predecessors=True
-        )
-        self._costs = np.full(cost.shape, np.inf)
-        self._costs[tuple(self._cells.T)] = cheapest
+        graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(len(self._cells),) * 2)
+        options = {"directed": False, "indices": self._index[start], "return_predecessors": True}
+        cheapest, self._before = dijkstra(graph.tocsr(), **options)
+        self.costs = np.full(cost.shape, np.inf)
+        self.costs[tuple(self._cells.T)] = cheapest
 
-    def cost_to(self, cell: tuple[int, int]) -> float:
-        """Cost of the way from the start to `cell`; infinite if there is none."""
-        return float(self._costs[self._of_part(cell)])
-
-    def path_to(self, cell: tuple[int, int]) -> NDArray[np.intp]:
+    def path_to(self, cell: NDArray[np.intp]) -> NDArray[np.intp]:
         """Cells (n, 2) from the start to `cell`."""
-        way = [self._index[self._of_part(cell)]]
-        while self._before[way[-1]] >= 0:
-            way.append(self._before[way[-1]])
-        return self._cells[way[::-1]] + self._corner
-
-    def _of_part(self, cell: tuple[int, int]) -> tuple[int, int]:
-        return int(cell[0] - self._corner[0]), int(cell[1] - self._corner[1])
+        path = [self._index[tuple(cell)]]
+        while self._before[path[-1]] >= 0:
+            path.append(self._before[path[-1]])
+        return self._cells[path[::-1]]
 
 
 def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float, NDArray[np.bool_]]:
@@ -331,7 +266,7 @@ def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float
     for radius in np.array(ROBOT_RADII_M) / resolution_m:
         roomy = _largest_part(part & (distance >= radius))
         covered = part & (ndimage.distance_transform_edt(~roomy) <= radius + 1.0)
-        if roomy.any() and covered.sum() >= ROAMED_SHARE * part.sum():
+        if roomy.any() and covered.sum() >= ROAMED_FRACTION * part.sum():
             break
     return float(radius), roomy
 

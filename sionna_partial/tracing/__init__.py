@@ -1,10 +1,7 @@
-"""Map -> scene -> paths, in this order.
+"""The one door to Sionna RT: Dr.Jit and Mitsuba are imported here and nowhere else.
 
-- `scene` writes scenes.
-- What paths a floor plan may have: `plan`, `beams`, `candidates` (floor and ceiling added), `diffraction`.
-- What paths a mesh may have: `rays`, `mesh_planes`, `ray_chains`, `mesh_candidates`.
-- Sionna RT: `sionna_rt` loads it, `contract` names the internal parts that `chain` and `solver` lean on, `stock`
-  does without them, and `paths` is what either of them gives.
-- `generator` knows which scene has which candidates, `probe` whether `solver` can be trusted, and `trace` is the door
-  for everybody else. `fixed_paths` makes functions of what comes through it, and `gradients` differentiates the gain.
+- `finder` writes the scene of a map and finds its paths: exact candidates of floor plans (`plan`), or those that rays
+  find in meshes (`mesh`), which `engine` verifies on Sionna RT's internals. `stock` does without these.
+- `trace` is the door for links; `path_set` is the forward model: power and vertices of paths found once, for
+  other parameters, and their derivatives; `gradients` asks it.
 """

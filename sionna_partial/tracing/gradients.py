@@ -1,9 +1,4 @@
-"""Derivatives of the path gain: by how much it changes with the transmitter's place, the materials and the frequency.
-
-Candidates are verified first, without derivatives. Dr.Jit then differentiates the image method and the field
-calculator of Sionna RT for those alone that turned out to be paths, forward, one parameter after the other: a pass
-gives the derivatives of all paths at once.
-"""
+"""Derivatives of the path gain with respect to the transmitter's position, the materials and the frequency."""
 
 import math
 from dataclasses import dataclass
@@ -16,16 +11,16 @@ from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.fixed_paths import PARAMETERS, FixedPaths, PathScene, checked_ends, fixed_path_settings
-from sionna_partial.tracing.trace import Progress, link_summary
+from sionna_partial.tracing.path_set import PathScene, one_transmitter, path_settings
+from sionna_partial.tracing.trace import Progress, checked_positions, link_summary
 
 
 @dataclass(frozen=True)
 class GainGradients:
     """Path gain from one transmitter to N receivers, and its derivatives.
 
-    The derivatives are those of the paths that there are: they do not see paths appear or vanish. They are 0 where the
-    gain is that of an outage, -150 dB.
+    The derivatives are those of the paths that exist: they do not include paths that appear or vanish. They are 0 in
+    an outage, where the gain is -150 dB.
 
     Parameters
     ----------
@@ -75,8 +70,9 @@ def gain_gradients(
 ) -> GainGradients:
     """Differentiate the path gain from a transmitter to N receivers with Sionna RT and Dr.Jit.
 
-    The paths are those of `trace_links` with the same arguments. The power of a receiver is the sum of the powers of
-    its paths, so that phases do not count.
+    The paths are those of `trace_links` with the same arguments. The power of a link is the sum of the powers of its
+    paths, without their phases. Candidates are verified first; Dr.Jit then differentiates the image method and the
+    field calculator of Sionna RT for the paths among them, in forward mode, one parameter after the other.
 
     Parameters
     ----------
@@ -90,7 +86,7 @@ def gain_gradients(
         Refraction and diffuse reflection must be off; diffraction too on meshes.
     scene_settings : SceneSettings, optional
     progress : callable, optional
-        Called as ``progress(share_done, message)``.
+        Called as ``progress(fraction_done, message)``.
 
     Returns
     -------
@@ -104,41 +100,48 @@ def gain_gradients(
     SettingsError
         For a frequency that the material does not cover, settings of another kind, or paths that only rays find.
     BackendError
-        If LLVM or Sionna RT cannot be used, or Sionna RT is not what the fast engine was made for.
+        If LLVM or Sionna RT cannot be used, or Sionna RT is another than the fast engine was made for.
     OutputError
         If no temporary file can be written.
 
     Examples
     --------
-    In the open, the gain falls with 20 log10 of the distance, and with as much of the frequency. At 2 m it rises by
-    20 / ln(10) / 2 dB for each metre that the transmitter comes nearer:
+    In free space, the gain falls with 20 log10 of the distance and of the frequency. At 2 m it rises by 20 / ln(10) / 2
+    dB for each metre that the transmitter comes nearer:
 
     >>> import numpy as np
     >>> import sionna_partial as sp
     >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
-    >>> nothing = sp.SceneSettings(floor_extent="none")
-    >>> found = sp.gain_gradients(field, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)], scene_settings=nothing)
+    >>> no_floor = sp.SceneSettings(floor_extent="none")
+    >>> found = sp.gain_gradients(field, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)], scene_settings=no_floor)
     >>> (found.tx_db_per_m + 0.0).round(3).tolist()
     [[4.343, 0.0, 0.0]]
     >>> (found.frequency_db_per_hz * 1e9).round(4).tolist()
     [-0.3102]
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    settings, scene_settings = fixed_path_settings(partial, settings, scene_settings)
-    tx_m, rx_m = checked_ends(partial, tx, rx, settings.frequency_hz)
-    report = progress or (lambda share, message: None)
+    settings, scene_settings = path_settings(partial, settings, scene_settings)
+    tx_m, rx_m = checked_positions(partial, one_transmitter(tx), rx, settings.frequency_hz)
+    report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
-    total = _Sums(len(rx_m))
+    power, is_direct, slopes = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool), np.zeros((7, len(rx_m)))
     if len(rx_m):
         paths = PathScene(partial, settings=settings, scene_settings=scene_settings)
-        for block, share, message in paths.blocks(tx_m, rx_m):
-            total.add(block)
-            report(0.1 + 0.9 * share, message.replace("verifying", "differentiating"))
-    link_state, gain_db = link_summary(total.power, total.is_direct)
-    slopes_db = total.slopes_db()
+
+        def part(fraction: float, message: str) -> None:
+            report(0.1 + 0.9 * fraction, message.replace("verifying", "differentiating"))
+
+        for block in paths.blocks(tx_m[0], rx_m, part):
+            is_direct[block.path_rx[block.is_direct]] = True
+            columns = np.concatenate(list(block.slopes(block.base, together=True).values()), axis=1)
+            for total, values in zip((power, *slopes), (block.power, *columns.T), strict=True):
+                total += np.bincount(block.path_rx, weights=values, minlength=len(rx_m))
+    link_state, gain_db = link_summary(power, is_direct)
+    above = gain_db > GAIN_FLOOR_DB
+    slopes_db = np.where(above, 10.0 / math.log(10.0) * slopes / np.where(above, power, 1.0), 0.0)
     return GainGradients(
-        tx=tx_m,
-        rx=rx_m,
+        tx=tx_m[0].copy(),
+        rx=rx_m.copy(),
         link_state=link_state,
         gain_db=gain_db,
         tx_db_per_m=slopes_db[:3].T,
@@ -149,26 +152,3 @@ def gain_gradients(
         settings=settings,
         scene_settings=scene_settings,
     )
-
-
-class _Sums:
-    """Sums over the paths of each of N receivers."""
-
-    def __init__(self, receivers: int) -> None:
-        self.power = np.zeros(receivers)
-        self.is_direct = np.zeros(receivers, dtype=bool)
-        self.slopes = np.zeros((2 + len(PARAMETERS), receivers))
-
-    def add(self, paths: FixedPaths) -> None:
-        count, index = len(self.power), paths.rx_of_path
-        self.power += np.bincount(index, weights=paths.power, minlength=count)
-        self.is_direct[index[paths.is_direct]] = True
-        slopes = np.concatenate(list(paths.slopes(paths.base, together=True).values()), axis=1)
-        for total, slope in zip(self.slopes, slopes.T, strict=True):
-            total += np.bincount(index, weights=slope, minlength=count)
-
-    def slopes_db(self) -> NDArray[np.float64]:
-        """Turn the derivatives (7, N) into those of the gain [dB], which are 0 at its floor."""
-        _, gain_db = link_summary(self.power, self.is_direct)
-        above = gain_db > GAIN_FLOOR_DB
-        return np.where(above, 10.0 / math.log(10.0) * self.slopes / np.where(above, self.power, 1.0), 0.0)

@@ -1,4 +1,4 @@
-"""Verified paths, whichever way they were found, and how lists of them are joined."""
+"""Verified paths, however they were found, and how lists of them are joined."""
 
 import math
 from dataclasses import dataclass, fields, replace
@@ -7,6 +7,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+REFLECTION, DIFFUSE, DIFFRACTION = 1, 2, 8
+"""Sionna RT's `InteractionType` of specular and diffuse reflections and diffractions."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +71,7 @@ class SolvedPaths:
 class PathColumns:
     """All paths of a trace, in columns that grow in place: memory should not hold the millions of a dense grid twice.
 
-    Parameters
-    ----------
-    depth : int
-        Largest number of interactions of a path.
+    A path has at most `depth` interactions.
     """
 
     def __init__(self, depth: int) -> None:
@@ -83,15 +83,15 @@ class PathColumns:
     def append(self, parts: list[SolvedPaths]) -> None:
         """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
         order = _path_order(parts)
-        place, start = np.empty(len(order), np.int64), len(self._columns["a"])
-        place[order] = start + np.arange(len(order))
+        row, start = np.empty(len(order), np.int64), len(self._columns["a"])
+        row[order] = start + np.arange(len(order))
         for name, column in self._columns.items():
             column.resize((start + len(order), *column.shape[1:]), refcheck=False)
             if name == "vertices_m":
                 column[start:] = math.nan
             first = 0
             for values in (getattr(part, name) for part in parts):
-                at = place[first : first + len(values)]
+                at = row[first : first + len(values)]
                 column[at if values.shape[1:] == column.shape[1:] else (at, slice(0, values.shape[1]))] = values
                 first += len(values)
 
@@ -101,20 +101,13 @@ class PathColumns:
 
 
 class PathFiles:
-    """All paths of a trace, in a `.npy` file for each column.
-
-    Parameters
-    ----------
-    depth : int
-        Largest number of interactions of a path.
-    folder : Path
-        An existing folder.
-    """
+    """All paths of a trace, in a `.npy` file for each column, in an existing folder."""
 
     def __init__(self, depth: int, folder: Path) -> None:
         self._depth, self._folder, self._count = depth, folder, 0
         for name in _column_types(depth):
-            self._file(name).write_bytes(bytes(_HEADER_BYTES))
+            self._file(name).touch()
+        self.close()
 
     def append(self, parts: list[SolvedPaths]) -> None:
         """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
@@ -125,20 +118,14 @@ class PathFiles:
                 getattr(joined, name).tofile(stream)
 
     def close(self) -> None:
-        """Write the headers: the files can be read."""
+        """Write the headers, whose length does not depend on the number of paths: the files can be read."""
         for name, (shape, kind) in _column_types(self._depth).items():
             header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": (self._count, *shape)}
-            text = repr(header).ljust(_HEADER_BYTES - 11) + "\n"
-            size = (_HEADER_BYTES - 10).to_bytes(2, "little")
             with self._file(name).open("r+b") as stream:
-                stream.write(b"\x93NUMPY\x01\x00" + size + text.encode("latin1"))
+                np.lib.format.write_array_header_1_0(stream, header)
 
     def _file(self, name: str) -> Path:
         return self._folder / f"{name}.npy"
-
-
-_HEADER_BYTES = 192
-"""Length of the header of a `.npy` file: a multiple of 64 with room for any shape."""
 
 
 def _column_types(depth: int) -> dict[str, tuple[tuple[int, ...], type]]:

@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import require
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
-from sionna_partial.settings import require
 
 Polarisation = Literal["te", "tm"]
-"""Electric field across the plane of incidence ("te"), as that of vertical antennas at walls, or in it ("tm")."""
+"""Electric field perpendicular to the plane of incidence ("te"), as of vertical antennas at walls, or in it ("tm")."""
 
 VACUUM_F_M = 8.8541878128e-12
 """Permittivity of the vacuum [F/m]."""
@@ -24,27 +24,10 @@ def reflection_loss_db(
     angle_deg: ArrayLike,
     polarisation: Polarisation = "te",
 ) -> NDArray[np.float64]:
-    """Loss of a wave that is reflected off a slab, with all reflections inside it.
+    """Return the loss [dB] of a wave that is reflected off a slab, with all reflections inside it.
 
-    Parameters
-    ----------
-    permittivity, conductivity_s_m, thickness_m : array-like
-        Real relative permittivity, conductivity [S/m] and thickness [m].
-    frequency_hz : float
-        Carrier frequency [Hz].
-    angle_deg : array-like
-        Angle of incidence from the normal, 0 to 90 [degrees]. All arrays are broadcast together.
-    polarisation : {"te", "tm"}
-
-    Returns
-    -------
-    float64 array
-        At least 0 [dB]; infinite where nothing is reflected.
-
-    Raises
-    ------
-    SettingsError
-        For another polarisation, or an angle out of range.
+    All arrays are broadcast together; angles of incidence are from the normal, 0 to 90 degrees. The loss is at least 0
+    and infinite where nothing is reflected. Another polarisation or angle raises a SettingsError.
     """
     require(polarisation in ("te", "tm"), "polarisation", polarisation, "choose 'te' or 'tm'.")
     angle = np.asarray(angle_deg, dtype=np.float64)
@@ -63,7 +46,7 @@ def reflection_coefficients(
     frequency_hz: float,
     cosine: ArrayLike,
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the reflection coefficients of a slab, TE and TM (arguments as above, with the cosine of the angle)."""
+    """Return the reflection coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
     loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
     eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
     root = np.sqrt(eta - (1.0 - cosine**2))

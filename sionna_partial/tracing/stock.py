@@ -1,6 +1,6 @@
-"""Paths by Sionna RT's public path solver alone: slower, for every kind of path and for any version of Sionna RT.
+"""Paths that only rays find, by Sionna RT's public path solver: slower, for every kind of path and any Sionna RT.
 
-Sionna RT shoots rays, and counts the chains of surfaces that they meet in a hash table which all receivers of a call
+Sionna RT shoots rays, and counts the sequences of surfaces that they meet in a hash table which all receivers of a call
 share: a collision drops a path. Embree is told that the rays of a call are coherent, and may lose a hit that depends on
 the others. So each receiver has a call of its own, and its answer cannot depend on the others.
 """
@@ -16,55 +16,29 @@ from scipy.spatial import cKDTree
 
 from sionna_partial.errors import BackendError
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.sionna_rt import load_sionna, open_scene
+from sionna_partial.tracing.candidates import Wedges
+from sionna_partial.tracing.engine import load_sionna, open_scene
+from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION, SolvedPaths
+from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
 
 TABLE_SIZE = 3_000_000
-"""Entries of the table of chains, at least: more lose fewer paths where refraction makes many, and take more memory."""
+"""Entries of the hash table, at least: more lose fewer paths where refraction makes many, and take more memory."""
 
 SAME_POINT_M = 0.03
 """Paths of the same interactions at points closer than this are one path [m]."""
 
-_DIFFUSE = 2
+SAME_EDGE_M = 1e-3
+"""Distance from an edge within which a diffraction is at that edge [m]."""
 
 
 def stock_paths(
-    scene_xml: Path,
-    settings: TraceSettings,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    *,
-    edges: bool = True,
-) -> Iterator[tuple[SolvedPaths, float]]:
-    """Find paths of every enabled kind by shooting rays, receiver by receiver.
+    scene_xml: Path, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+) -> Iterator[SolvedPaths]:
+    """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3), receiver by receiver.
 
-    Most paths are found, not all: the more rays, the more. Sionna RT 2.2 takes paths that are reflected after a
-    diffraction, and have fewer than `max_depth` interactions, for longer than they are, and some dB too weak.
-
-    Parameters
-    ----------
-    scene_xml : pathlib.Path
-        Exported scene.
-    settings : TraceSettings
-        `diffraction` None counts as False.
-    tx_m : (3,) array
-        Transmitter, in scene coordinates [m].
-    rx_m : (N, 3) array
-        Receivers, in scene coordinates [m]; N may be 0.
-    edges : bool
-        Whether free edges of the surfaces diffract as well as wedges, where diffraction is on.
-
-    Yields
-    ------
-    SolvedPaths
-        Paths to the next receiver, in scene coordinates.
-    float
-        Share of the receivers done.
-
-    Raises
-    ------
-    BackendError
-        If LLVM or Sionna RT cannot be used.
+    Positions and paths are in scene coordinates. Most paths are found, not all: the more rays, the more. Sionna RT 2.2
+    takes paths that are reflected after a diffraction, and have fewer than `max_depth` interactions, for longer than
+    they are, and some dB too weak. Raises a BackendError if LLVM or Sionna RT cannot be used.
     """
     if len(rx_m) == 0:
         return
@@ -75,10 +49,9 @@ def stock_paths(
         scene.add(rt.Transmitter("tx", position=_point(tx_m)))
         scene.add(receiver)
         solver = rt.PathSolver(deterministic=True)
-        for index, place in enumerate(rx_m):
-            receiver.position = _point(place)
-            found = solver(scene, **_options(settings, edges=edges))
-            yield _read_paths(found, max(1, settings.max_depth), index, tx_m, rx_m), (index + 1) / len(rx_m)
+        for index, position_m in enumerate(rx_m):
+            receiver.position = _point(position_m)
+            yield _read_paths(solver(scene, **_options(settings)), max(1, settings.max_depth), index, tx_m, rx_m)
     except Exception as error:
         raise BackendError(
             f"Sionna RT {metadata.version('sionna-rt')} cannot solve the paths ({error!r}): lower samples_per_tx if "
@@ -86,14 +59,14 @@ def stock_paths(
         ) from error
 
 
-def _point(place_m: NDArray[np.float64]) -> Any:
+def _point(position_m: NDArray[np.float64]) -> Any:
     """Position as an array on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
     import mitsuba as mi
 
-    return mi.Point3f(*(mi.Float([float(value)]) for value in place_m))
+    return mi.Point3f(*(mi.Float([float(value)]) for value in position_m))
 
 
-def _options(settings: TraceSettings, *, edges: bool) -> dict[str, Any]:
+def _options(settings: TraceSettings) -> dict[str, Any]:
     """Arguments of Sionna RT's path solver."""
     diffraction, rays = settings.diffraction is True, settings.samples_per_tx
     every_ray = 1 + rays * settings.max_depth if settings.diffuse_reflection else 0
@@ -106,7 +79,7 @@ def _options(settings: TraceSettings, *, edges: bool) -> dict[str, Any]:
         "diffuse_reflection": settings.diffuse_reflection,
         "refraction": settings.refraction,
         "diffraction": diffraction,
-        "edge_diffraction": diffraction and edges,
+        "edge_diffraction": diffraction,
         "seed": settings.seed,
     }
 
@@ -132,27 +105,38 @@ def _read_paths(
 
 
 def listed_before(interactions: NDArray[np.uint8], vertices_m: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
-    """Find the paths of one receiver that repeat an earlier one: the same interactions at the same points.
+    """Find the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
 
-    Sionna RT tells chains apart by hashes of rounded planes, and rounding can give one plane two hashes. Paths with a
-    diffuse reflection are samples of a rough surface, however close, and never repeats.
-
-    Parameters
-    ----------
-    interactions : (P, D) uint8 array
-        As in `SolvedPaths`.
-    vertices_m : (P, D, 3) array
-        Places of the interactions [m]; anything where there is none.
-
-    Returns
-    -------
-    (P,) bool array
+    Sionna RT tells sequences apart by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
+    a diffuse reflection are samples of a rough surface, however close, and never repeats.
     """
     repeated = np.zeros(len(interactions), dtype=bool)
-    exact = np.flatnonzero((interactions != _DIFFUSE).all(axis=1))
+    exact = np.flatnonzero((interactions != DIFFUSE).all(axis=1))
     points = np.where(interactions[exact, :, None] > 0, vertices_m[exact], 0.0)
     tree = cKDTree(points.reshape(len(exact), 3 * interactions.shape[1]))
     pairs = tree.query_pairs(SAME_POINT_M, p=np.inf, output_type="ndarray")
     first, second = exact[pairs].T
     repeated[second[(interactions[first] == interactions[second]).all(axis=1)]] = True
     return repeated
+
+
+def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> NDArray[np.bool_]:
+    """Whether each path (P,) is diffracted as exact candidates are, if it is at all.
+
+    Sionna RT's rays are diffracted at the rims of floor and ceiling and at junctions of walls as well, and with any
+    number of reflections around it.
+    """
+    diffracted = (paths.interactions == DIFFRACTION).any(axis=1)
+    kept = ~diffracted
+    if diffracted.any() and len(wedges.edge_m):
+        which = (paths.interactions == DIFFRACTION).argmax(axis=1)
+        x, y, z = paths.vertices_m[np.arange(len(diffracted)), which][diffracted].T
+        beside = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))[0] < SAME_EDGE_M
+        reflected = paths.interactions[diffracted] == REFLECTION
+        height_m = paths.vertices_m[diffracted, :, 2]
+        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m - SAME_EDGE_M)
+        before = np.arange(reflected.shape[1]) < which[diffracted, None]
+        few = reflected.sum(axis=1) <= MAX_REFLECTIONS
+        few &= ((at_walls & before).sum(axis=1) <= walls_a_side) & ((at_walls & ~before).sum(axis=1) <= walls_a_side)
+        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
+    return kept

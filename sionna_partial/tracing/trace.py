@@ -1,35 +1,31 @@
-"""The one door to the path solver: scene + transmitter + receivers -> TracedLinks."""
+"""Scene + transmitters + receivers -> TracedLinks."""
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from functools import partial as partial_function
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import scene_settings_of
-from sionna_partial.settings import SceneSettings, TraceSettings, settings_or_default
-from sionna_partial.tracing.generator import Finder, WrittenScene, bends_at, write_scene_of
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.engine import SceneSolver, engine_fault
+from sionna_partial.tracing.finder import MeshScene, PlanScene, part_of, write_scene_of
+from sionna_partial.tracing.finder import Progress as Progress
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
-from sionna_partial.tracing.probe import fast_engine_works
-from sionna_partial.tracing.solver import SceneSolver
-from sionna_partial.tracing.stock import stock_paths
+from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 
 _log = logging.getLogger(__name__)
-
-Progress = Callable[[float, str], None]
-"""Called with the share of the work done, in [0, 1], and what is being done."""
-
 
 SHORTEST_M = 0.011
 """Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
@@ -40,10 +36,6 @@ each time."""
 
 SAMPLE = 100
 """Number of receivers from which the number of all paths is estimated."""
-
-Solve = Callable[[NDArray[np.float64], NDArray[np.float64]], Iterator[tuple[SolvedPaths, float, str]]]
-"""Solves the paths from one transmitter (3,) to receivers (N, 3), in scene coordinates, block by block: the paths of a
-block, the share of the work done, and what is being done."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +64,7 @@ class TracedLinks:
     interactions : (P, D) uint8 array
         Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
     vertices_m : (P, D, 3) float64 array
-        Places of the interactions [m]; NaN where there is none.
+        Points of interaction [m]; NaN where there is none.
     settings : TraceSettings
         With `diffraction` True or False.
     scene_settings : SceneSettings
@@ -110,11 +102,11 @@ def trace_links(
 
     On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge of the walls
     (corners, door jambs) and at most two reflections around it are complete, but for legs of 1 cm or less, which Sionna
-    RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays say which
-    chains of planes there are; line of sight and nearly all specular reflections are found. With refraction, diffuse
+    RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays determine
+    the sequences of planes; line of sight and nearly all specular reflections are found. With refraction, diffuse
     reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver shoots rays instead, receiver by
-    receiver, which is slow and finds most paths, not all. So it is where Sionna RT is another than `contract` expects.
-    The answer for a receiver does not depend on the other receivers.
+    receiver, which is slow and finds most paths, not all. It also does with another release of Sionna RT than 2.2. The
+    answer for a receiver does not depend on the other receivers.
 
     Parameters
     ----------
@@ -151,37 +143,39 @@ def trace_links(
         If LLVM or Sionna RT cannot be used.
     OutputError
         If no temporary file can be written.
+
+    Examples
+    --------
+    In free space, the gain at a distance of 2 m is 20 log10(wavelength / (4 pi 2 m)), at 28 GHz:
+
+    >>> import numpy as np
+    >>> import sionna_partial as sp
+    >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
+    >>> open_air = sp.SceneSettings(floor_extent="none")
+    >>> links = sp.trace_links(field, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)], scene_settings=open_air)
+    >>> links.gain_db.round(2).tolist()
+    [-67.41]
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
-    places, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
-    tx_m = places.reshape(np.shape(tx))
-    report, depth = progress or (lambda share, message: None), max(1, settings.max_depth)
+    tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
+    shape, report = np.shape(tx), progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
     with temporary_folder() as work:
         tracer = Tracer(partial, work, settings, scene_settings)
-        tracer.require_memory(places, rx_m, None if folder is not None else memory_gb)
+        tracer.require_memory(tx_m, rx_m, None if folder is not None else memory_gb)
         if folder is None:
-            return _traced_links(tracer, tx_m, rx_m, report)
-        with atomic_files(folder) as place:
-            columns = PathFiles(depth, place)
-            link_state, gain_db = tracer.links(tx_m, rx_m, report, columns)
+            return tracer.links(tx_m.reshape(shape), rx_m, report)
+        with atomic_files(folder) as files:
+            columns = PathFiles(max(1, settings.max_depth), files)
+            link_state, gain_db = tracer.fill(columns, tx_m.reshape(shape), rx_m, report)
             columns.close()
-            for name, values in (("tx", tx_m), ("rx", rx_m), ("link_state", link_state), ("gain_db", gain_db)):
-                np.save(place / f"{name}.npy", values)
-    stored = {field.name: np.load(Path(folder) / f"{field.name}.npy", mmap_mode="r") for field in _ARRAYS}
+            ends = ("tx", tx_m.reshape(shape)), ("rx", rx_m)
+            for name, values in (*ends, ("link_state", link_state), ("gain_db", gain_db)):
+                np.save(files / f"{name}.npy", values)
+    names = [field.name for field in fields(TracedLinks) if not field.name.endswith("settings")]
+    stored = {name: np.load(Path(folder) / f"{name}.npy", mmap_mode="r") for name in names}
     return TracedLinks(**stored, settings=settings, scene_settings=scene_settings)
-
-
-def _traced_links(
-    tracer: "Tracer", tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
-) -> TracedLinks:
-    columns = PathColumns(max(1, tracer.settings.max_depth))
-    link_state, gain_db = tracer.links(tx_m, rx_m, report, columns)
-    found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
-    return TracedLinks(
-        tx_m, rx_m, link_state, gain_db, **found, settings=tracer.settings, scene_settings=tracer.scene_settings
-    )
 
 
 def trace_each(
@@ -192,46 +186,19 @@ def trace_each(
     settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
 ) -> list[TracedLinks]:
-    """Trace every path from each of T transmitters to receivers of its own, on a scene that is built once.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    tx : sequence of T (3,) array-likes
-        Transmitter positions [m].
-    rx : sequence of T (N, 3) array-likes
-        Receiver positions of each transmitter [m]; N may differ, and be 0.
-    settings : TraceSettings, optional
-    scene_settings : SceneSettings, optional
-
-    Returns
-    -------
-    list of T TracedLinks
-        Each is what `trace_links` gives for that transmitter and its receivers, whose errors are raised here too.
-    """
+    """Trace from each of T transmitters (3,) to receivers (N, 3) of its own, in a scene that is built once."""
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
-    places = [
-        checked_positions(partial, place, receivers, settings.frequency_hz)
-        for place, receivers in zip(tx, rx, strict=True)
-    ]
+    ends = [checked_positions(partial, *each, settings.frequency_hz) for each in zip(tx, rx, strict=True)]
     with temporary_folder() as folder:
         tracer = Tracer(partial, folder, settings, scene_settings)
-        return [_traced_links(tracer, tx_m[0], rx_m, lambda share, message: None) for tx_m, rx_m in places]
-
-
-_ARRAYS = tuple(field for field in fields(TracedLinks) if not field.name.endswith("settings"))
+        return [tracer.links(tx_m[0], rx_m, lambda fraction, message: None) for tx_m, rx_m in ends]
 
 
 @dataclass(frozen=True)
 class Tracer:
-    """Finds paths on one scene, which is written to `folder` when the first are asked for.
+    """Finds paths in one scene, which is written to `folder` when the first are asked for.
 
-    Parameters
-    ----------
-    partial : PartialMap
-    folder : Path
-    settings, scene_settings : TraceSettings, SceneSettings
-        From `checked_settings`.
+    Settings come from `checked_settings`, positions [m] from `checked_positions`.
     """
 
     partial: PartialMap
@@ -240,38 +207,61 @@ class Tracer:
     scene_settings: SceneSettings
 
     @cached_property
-    def _solver(self) -> tuple[Solve, int]:
-        """How paths are found, and for how many receivers at once."""
-        return _solver(self.partial, self.folder, self.settings, self.scene_settings)
+    def _scene(self) -> PlanScene | MeshScene:
+        return write_scene_of(self.partial, self.folder, self.settings, self.scene_settings)
 
-    def links(
-        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress, columns: PathColumns | PathFiles
+    @cached_property
+    def _solver(self) -> SceneSolver | None:
+        """Solver of candidates; None if only rays find the paths, and a warning is logged."""
+        wanted = {
+            "refraction": self.settings.refraction,
+            "diffuse reflection": self.settings.diffuse_reflection,
+            "diffraction on a mesh": self.settings.diffraction and self.partial.mesh is not None,
+        }
+        names = [name for name, is_wanted in wanted.items() if is_wanted]
+        if names:
+            message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
+            _log.warning(message, " and ".join(names), self.settings.samples_per_tx)
+        return None if names or engine_fault() else SceneSolver(self._scene.xml, self._scene.shapes, self.settings)
+
+    def links(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> TracedLinks:
+        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3)."""
+        columns = PathColumns(max(1, self.settings.max_depth))
+        link_state, gain_db = self.fill(columns, tx_m, rx_m, report)
+        found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
+        return TracedLinks(
+            tx_m, rx_m, link_state, gain_db, **found, settings=self.settings, scene_settings=self.scene_settings
+        )
+
+    def fill(
+        self, columns: PathColumns | PathFiles, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
     ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3) [m] into columns of paths.
-
-        Returns their link states and path gains [dB], (N,) or (T, N).
-        """
-        places = tx_m.reshape(-1, 3)
-        shape, links = (*tx_m.shape[:-1], len(rx_m)), len(places) * len(rx_m)
-        power, is_direct = np.zeros(links), np.zeros(links, bool)
-        for block in self._blocks(places, rx_m, report):
-            columns.append(block)
-            for paths in block:
-                link = paths.path_tx.astype(np.int64) * len(rx_m) + paths.path_rx
-                np.add.at(power, link, np.abs(paths.a) ** 2)
-                is_direct[link[paths.is_direct]] = True
+        """Trace the same links into columns of paths; return their states and gains [dB], (N,) or (T, N)."""
+        at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
+        sources, count = tx_m.reshape(-1, 3), len(rx_m)
+        power, is_direct = np.zeros((len(sources), count)), np.zeros((len(sources), count), bool)
+        starts = [(tx, start) for tx in range(len(sources)) for start in range(0, count, at_once)]
+        for number, (tx, start) in enumerate(starts):
+            ends = (0.1 + 0.9 * (number + each) / len(starts) for each in (0, 1))
+            block = self.paths(sources[tx], rx_m[start : start + at_once], part_of(report, *ends))
+            parts = [paths.between(tx, start) for paths in block]
+            columns.append(parts)
+            for paths in parts:
+                np.add.at(power[tx], paths.path_rx, np.abs(paths.a) ** 2)
+                is_direct[tx, paths.path_rx[paths.is_direct]] = True
         link_state, gain_db = link_summary(power, is_direct)
+        shape = (*tx_m.shape[:-1], count)
         return link_state.reshape(shape), gain_db.reshape(shape)
 
     def require_memory(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], memory_gb: float | None) -> None:
-        """Say how much memory the paths will take, estimated from some receivers of a large job.
+        """Log how much memory the paths of a large job take, estimated from some of its receivers.
 
         Raises a MemoryLimitError if that is more than `memory_gb`.
         """
         if len(tx_m) * len(rx_m) <= RECEIVERS_OF_PLAN:
             return
         some = rx_m[np.linspace(0, len(rx_m) - 1, min(len(rx_m), SAMPLE)).astype(int)]
-        found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, lambda share, message: None))
+        found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, lambda fraction, message: None))
         count = round(found / len(some) * len(rx_m) * len(tx_m))
         size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth)) / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)
@@ -281,29 +271,28 @@ class Tracer:
                 "a folder for the paths, fewer receivers, or more memory_gb."
             )
 
-    def _blocks(
-        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
-    ) -> Iterator[list[SolvedPaths]]:
-        """Find all paths between transmitters (T, 3) and receivers (N, 3) [m], some receivers at a time."""
-        if len(rx_m) == 0:
-            return
-        at_once = self._solver[1]
-        starts = [(tx, start) for tx in range(len(tx_m)) for start in range(0, len(rx_m), at_once)]
-        for number, (tx, start) in enumerate(starts):
-
-            def within(share: float, message: str, number: int = number) -> None:
-                report(0.1 + 0.9 * (number + share) / len(starts), message)
-
-            yield [paths.between(tx, start) for paths in self.paths(tx_m[tx], rx_m[start : start + at_once], within)]
-
     def paths(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator[SolvedPaths]:
-        """Find all paths between a transmitter (3,) and receivers (N, 3) [m], some paths at a time."""
-        shift = np.array([*self.partial.origin_m, 0.0])
-        for paths, share, message in self._solver[0](tx_m - shift, rx_m - shift):
-            report(share, message)
+        """Find all paths between a transmitter (3,) and receivers (N, 3), some paths at a time."""
+        shift_m = np.array([*self.partial.origin_m, 0.0])
+        find = self._shot if self._solver is None else self._verified
+        for paths in find(tx_m - shift_m, rx_m - shift_m, report):
             if len(paths.a):
-                yield replace(paths, vertices_m=paths.vertices_m + shift)
+                yield replace(paths, vertices_m=paths.vertices_m + shift_m)
         report(1.0, "traced")
+
+    def _verified(
+        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
+    ) -> Iterator[SolvedPaths]:
+        assert self._solver is not None
+        return (found.paths for found in self._scene.paths(self._solver, tx_m, rx_m, report))
+
+    def _shot(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator[SolvedPaths]:
+        for number, paths in enumerate(stock_paths(self._scene.xml, self.settings, tx_m, rx_m), start=1):
+            report(number / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
+            if isinstance(self._scene, PlanScene):
+                yield paths.take(diffracted_as_exact(self._scene.wedges, paths, self.settings.diffraction_walls))
+            else:
+                yield paths
 
 
 def checked_settings(
@@ -339,8 +328,8 @@ def checked_positions(
     if rx_m.ndim != 2:
         raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
     tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
-    for place in tx_m:
-        distance_m = np.linalg.norm(rx_m - place, axis=1)
+    for source_m in tx_m:
+        distance_m = np.linalg.norm(rx_m - source_m, axis=1)
         if distance_m.min(initial=math.inf) < limit_m:
             index = int(distance_m.argmin())
             raise PositionError(
@@ -350,62 +339,8 @@ def checked_positions(
     return tx_m, rx_m
 
 
-def _solver(
-    partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings
-) -> tuple[Solve, int]:
-    """Write the scene, and choose how its paths are found, and for how many receivers at once."""
-    scene = write_scene_of(partial, folder, settings, scene_settings)
-    if _shoots(settings, scene) or not fast_engine_works():
-        solve = partial_function(_shoot, scene, settings)
-    else:
-        solve = partial_function(_verify, scene.paths, SceneSolver(scene.xml, scene.shapes, settings))
-    return solve, RECEIVERS_OF_PLAN if scene.is_plan else RECEIVERS_OF_MESH
-
-
-def _shoots(settings: TraceSettings, scene: WrittenScene) -> bool:
-    """Whether the settings ask for paths that only rays find; a warning says so."""
-    wanted = {
-        "refraction": settings.refraction,
-        "diffuse reflection": settings.diffuse_reflection,
-        "diffraction on a mesh": settings.diffraction and not scene.is_plan,
-    }
-    names = [name for name, is_wanted in wanted.items() if is_wanted]
-    if names:
-        message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
-        _log.warning(message, " and ".join(names), settings.samples_per_tx)
-    return bool(names)
-
-
-def _verify(
-    find: Finder, solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> Iterator[tuple[SolvedPaths, float, str]]:
-    """Verify the candidates of the scene."""
-    for _, paths, share, message in find(solver, tx_m, rx_m):
-        yield paths, share, message
-
-
-def _shoot(
-    scene: WrittenScene, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> Iterator[tuple[SolvedPaths, float, str]]:
-    """Let Sionna RT's public path solver shoot rays."""
-    for paths, share in stock_paths(scene.xml, settings, tx_m, rx_m):
-        kept = paths if scene.wedges is None else paths.take(bends_at(scene.wedges, paths, settings.diffraction_walls))
-        yield kept, share, f"shooting rays to {len(rx_m)} receivers"
-
-
 def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Omnidirectional path gain of links (paper, eq. 5).
-
-    Parameters
-    ----------
-    power : (N,) float64 array
-        Sum of |a|^2 over the paths of each link.
-
-    Returns
-    -------
-    (N,) float64 array
-        At least -150 [dB].
-    """
+    """Omnidirectional path gain [dB], at least -150, of links whose paths have |a|^2 in sum (paper, eq. 5)."""
     with np.errstate(divide="ignore"):
         return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
 
@@ -413,15 +348,7 @@ def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:
 def link_summary(
     power: NDArray[np.float64], is_direct: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Link state and omnidirectional path gain [dB] of links (paper, eq. 5).
-
-    Parameters
-    ----------
-    power : (N,) float64 array
-        Sum of |a|^2 over the paths of each link.
-    is_direct : (N,) bool array
-        Whether one of them has no interaction.
-    """
+    """Link state and path gain [dB] of links, from the sum of |a|^2 and whether one path has no interaction."""
     gain_db = path_gain_db(power)
     link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
     link_state[is_direct] = LinkState.LOS

@@ -1,7 +1,7 @@
 """SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and what has been observed of it."""
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
-from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, row_runs
 from sionna_partial.planar import span_in_strip
 
 DEFAULT_BAND_M = (1.0, 1.8)
@@ -23,7 +23,6 @@ DEFAULT_BAND_M = (1.0, 1.8)
 
 DEFAULT_RESOLUTION_M = 0.05
 """Edge of the cells of a mesh's map [m], as robots have them."""
-
 
 RIM_M = 0.3
 """Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
@@ -43,87 +42,47 @@ class MeshReading:
             raise MapError(f'up = {self.up!r} is not allowed: choose "z" or "y".')
 
     def require_unused(self, path: Path, what: str) -> None:
-        """Raise a MapError if anything has been given, for a file that is no mesh.
-
-        Parameters
-        ----------
-        path : pathlib.Path
-        what : str
-            What the file is.
-        """
-        for field in fields(self):
-            if getattr(self, field.name) is not None:
-                raise MapError(f"{field.name} is for meshes alone, but path = '{path}' is {what}: leave it out.")
+        """Raise a MapError if anything has been given, for a file that is no mesh but `what`."""
+        for name, value in vars(self).items():
+            if value is not None:
+                raise MapError(f"{name} is for meshes alone, but path = '{path}' is {what}: leave it out.")
 
 
-def mesh_map(mesh: SceneMesh, reading: MeshReading, wall_height_m: float | None = None) -> PartialMap:
-    """Turn a mesh into a map.
+def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
+    """Turn a mesh into a map that carries the mesh, cut to its known cells.
 
-    Parameters
-    ----------
-    mesh : SceneMesh
-    reading : MeshReading
-    wall_height_m : float or None
-        Height above the lowest point of the mesh up to which radios may be [m], in place of its highest point.
-
-    Returns
-    -------
-    PartialMap
-        With the mesh cut to its known cells.
-
-    Raises
-    ------
-    MapError
-        For an argument out of range.
+    Known cells with a surface in the height band are walls. Walls that run along lattice lines are in the cells above
+    or to the right of them, or on the other side if those are unknown.
     """
     empty = _fitted_grid(mesh, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
-    low, high = _band(mesh, reading.height_band_m)
-    everything = -math.inf, math.inf
+    band_m = _band(mesh, reading.height_band_m)
     if reading.observed is None:
-        known = _cells_with_surfaces(mesh, empty, everything, upper=True)
+        known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
     else:
         known = _observed_cells(empty, reading.observed)
-    state = np.full(empty.shape, CellState.UNKNOWN, dtype=np.uint8)
-    state[known] = CellState.FREE
-    state[_walls(mesh, empty, (low, high), known)] = CellState.WALL
+    upper = _cells_with_surfaces(mesh, empty, band_m, upper=True)
+    lower = _cells_with_surfaces(mesh, empty, band_m, upper=False)
+    lost = np.pad(upper & ~known, ((0, 1), (0, 1)))
+    state = np.where(known, CellState.FREE, CellState.UNKNOWN).astype(np.uint8)
+    state[known & (upper | (lower & (lost[1:, :-1] | lost[:-1, 1:] | lost[1:, 1:])))] = CellState.WALL
     state[_rims(state, empty.resolution_m)] = CellState.UNKNOWN
     partial = replace(empty, state=state, mesh=mesh)
-    if wall_height_m is not None:
-        partial = raised(replace(partial, wall_height_m=wall_height_m))
     return partial if reading.observed is None else cut_to_known(partial)
 
 
-def raised(partial: PartialMap) -> PartialMap:
-    """Let radios be as high above the lowest point of a map's mesh, if it has one, as the map's walls are.
-
-    Parameters
-    ----------
-    partial : PartialMap
-
-    Returns
-    -------
-    PartialMap
-    """
-    if partial.mesh is None:
-        return partial
-    low, _ = partial.height_range_m
-    return replace(partial, mesh=replace(partial.mesh, height_range_m=(low, low + partial.wall_height_m)))
-
-
 def cut_to_known(partial: PartialMap) -> PartialMap:
-    """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left.
-
-    Parameters
-    ----------
-    partial : PartialMap
-
-    Returns
-    -------
-    PartialMap
-    """
+    """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left."""
     if partial.mesh is None:
         return partial
-    return replace(partial, mesh=partial.mesh.within(_known_area(partial)))
+    row, start, end = row_runs(partial.state != CellState.UNKNOWN)
+    cells = shapely.union_all(shapely.box(start, row, end, row + 1))
+    # The lattice lines are multiples of the resolution, so that walls on them are on the border exactly.
+    first = np.rint(np.array(partial.origin_m) / partial.resolution_m)
+    if np.allclose(first * partial.resolution_m, partial.origin_m, rtol=0, atol=1e-9):
+        area = shapely.transform(cells, lambda corners: (corners + first) * partial.resolution_m)
+    else:
+        area = shapely.transform(cells, lambda corners: corners * partial.resolution_m + partial.origin_m)
+    return replace(partial, mesh=partial.mesh.within(area))
 
 
 def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
@@ -136,18 +95,6 @@ def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
     beside[area[ndimage.binary_dilation(np.pad(state == CellState.UNKNOWN, 1))]] = True
     rims: NDArray[np.bool_] = (free & ((widest_m < RIM_M) & beside)[area])[1:-1, 1:-1]
     return rims
-
-
-def _known_area(partial: PartialMap) -> Any:
-    """Known cells as a shapely geometry in world x and y [m]."""
-    step = np.diff(np.pad(partial.state != CellState.UNKNOWN, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    (row, start), (_, end) = np.nonzero(step == 1), np.nonzero(step == -1)
-    cells = shapely.union_all(shapely.box(start, row, end, row + 1))
-    # The lattice lines are multiples of the resolution, so that walls on them are on the border exactly.
-    first = np.rint(np.array(partial.origin_m) / partial.resolution_m)
-    if np.allclose(first * partial.resolution_m, partial.origin_m, rtol=0, atol=1e-9):
-        return shapely.transform(cells, lambda corners: (corners + first) * partial.resolution_m)
-    return shapely.transform(cells, lambda corners: corners * partial.resolution_m + partial.origin_m)
 
 
 def _fitted_grid(mesh: SceneMesh, resolution_m: float) -> PartialMap:
@@ -169,12 +116,7 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
     if given is None:
         lowest = float(mesh.bounds_m[0, 2])
         return lowest + DEFAULT_BAND_M[0], lowest + DEFAULT_BAND_M[1]
-    try:
-        low, high = (float(value) for value in given)
-    except (TypeError, ValueError):
-        low, high = math.nan, math.nan
-    if not -math.inf < low < high < math.inf:
-        raise MapError(f"height_band_m = {given!r} is not allowed: give (low, high), z in metres, low < high.")
+    low, high = height_pair("height_band_m", given)
     lowest, highest = (float(value) for value in mesh.bounds_m[:, 2])
     if high < lowest or low > highest:
         raise MapError(f"height_band_m = {given!r} is outside the mesh, which spans z {lowest:g} to {highest:g} m.")
@@ -218,25 +160,7 @@ def _polygon(observed: ArrayLike) -> Any:
     return polygon
 
 
-def _walls(
-    mesh: SceneMesh, empty: PartialMap, band_m: tuple[float, float], known: NDArray[np.bool_]
-) -> NDArray[np.bool_]:
-    """Known cells (ny, nx) with a surface in the band.
-
-    Walls that run along lattice lines are in the cells above or to the right of them, or on the other side if those
-    are unknown.
-    """
-    upper = _cells_with_surfaces(mesh, empty, band_m, upper=True)
-    lower = _cells_with_surfaces(mesh, empty, band_m, upper=False)
-    lost = np.pad(upper & ~known, ((0, 1), (0, 1)))
-    beside = lost[1:, :-1] | lost[:-1, 1:] | lost[1:, 1:]
-    walls: NDArray[np.bool_] = known & (upper | (lower & beside))
-    return walls
-
-
-def _cells_with_surfaces(
-    mesh: SceneMesh, empty: PartialMap, band_m: tuple[float, float], *, upper: bool
-) -> NDArray[np.bool_]:
+def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> NDArray[np.bool_]:
     """Cells (ny, nx) in which the mesh has a surface between two heights; touching borders does not count."""
     corners = mesh.corners_m
     z = corners[..., 2]
@@ -251,19 +175,16 @@ def _cells_with_surfaces(
 
 
 @njit(cache=True)
-def _mark_cells(
-    polygons: NDArray[np.float64], sizes: NDArray[np.int64], cells: NDArray[np.bool_], margin: float, upper: bool
-) -> None:  # pragma: no cover - compiled
+def _mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
     """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
 
     What runs along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
     """
     ny, nx = cells.shape
     for index in range(len(polygons)):
-        size = sizes[index]
-        if size == 0:
+        if sizes[index] == 0:
             continue
-        corners = polygons[index, :size]
+        corners = polygons[index, : sizes[index]]
         first, last = _reached(corners[:, 1].min(), corners[:, 1].max(), margin, upper)
         for row in range(max(first, 0), min(last, ny - 1) + 1):
             low = -np.inf if row == first else float(row)
@@ -277,7 +198,7 @@ def _mark_cells(
 
 
 @njit(cache=True)
-def _reached(low: float, high: float, margin: float, upper: bool) -> tuple[int, int]:  # pragma: no cover - compiled
+def _reached(low, high, margin, upper):  # type: ignore[no-untyped-def]
     first, last = int(np.floor(low + margin)), int(np.ceil(high - margin)) - 1
     if last < first:
         return (first, first) if upper else (last, last)

@@ -27,25 +27,16 @@ SEAM_M = 1e-4
 Triangles = NDArray[np.float64]
 """Corners (F, 3, 3) of triangles [m]."""
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
-def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], Triangles, NDArray[np.intp]]:
-    """Cut triangles at the border of an area seen from above.
 
-    Parameters
-    ----------
-    corners_m : (F, 3, 3) float64 array
-        Corners of the triangles [m].
-    area : shapely Polygon or MultiPolygon
-        What stays, as world x and y [m]. What lies on its border (within `BORDER_M`) stays.
+def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], Triangles, Ints]:
+    """Cut triangles at the border of an area (shapely, world x and y [m]) seen from above.
 
-    Returns
-    -------
-    whole : (F,) bool array
-        Triangles that lie in the area.
-    pieces_m : (P, 3, 3) float64 array
-        What is in the area of triangles that lie across its border, with their winding.
-    source : (P,) int array
-        Triangle that each piece comes from, in rising order.
+    Returns a mask (F,) of the triangles that lie in the area or on its border (within `BORDER_M`), the pieces in the
+    area of those that lie across its border (P, 3, 3) [m], with their winding, and the triangle that each piece
+    comes from (P,), in rising order.
     """
     whole = np.zeros(len(corners_m), dtype=bool)
     if not len(corners_m) or area.is_empty:
@@ -69,26 +60,10 @@ def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], T
 
 
 @njit(cache=True)
-def clip_slab(
-    corners_m: Triangles, values: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # pragma: no cover - compiled
-    """Clip triangles to where a linear function of theirs lies between two limits.
+def clip_slab(corners_m, values, low, high):  # type: ignore[no-untyped-def]
+    """Clip triangles to where a linear function with `values` (F, 3) at their corners lies between two limits (F,).
 
-    Parameters
-    ----------
-    corners_m : (F, 3, 3) float64 array
-        Corners of the triangles [m].
-    values : (F, 3) float64 array
-        The function at the corners.
-    low, high : (F,) float64 arrays
-        Limits.
-
-    Returns
-    -------
-    polygons_m : (F, 5, 3) float64 array
-        Corners of what is left [m], with the winding of the triangle.
-    sizes : (F,) int64 array
-        Number of corners of each polygon; 0 where nothing is left.
+    Returns polygons (F, 5, 3) [m] with the winding of the triangles, and their numbers of corners (F,), 0 for none.
     """
     polygons, sizes = np.zeros((len(corners_m), 5, 3)), np.zeros(len(corners_m), dtype=np.int64)
     for index in range(len(corners_m)):
@@ -103,61 +78,36 @@ def clip_slab(
             below, above = (here, there) if start < end else (there, here)  # neighbours get the same point
             for limit in (first, second):
                 if min(start, end) < limit < max(start, end):
-                    share = (limit - values[index, below]) / (values[index, above] - values[index, below])
-                    way = corners_m[index, above] - corners_m[index, below]
-                    polygons[index, size] = corners_m[index, below] + share * way
+                    fraction = (limit - values[index, below]) / (values[index, above] - values[index, below])
+                    along = corners_m[index, above] - corners_m[index, below]
+                    polygons[index, size] = corners_m[index, below] + fraction * along
                     size += 1
         sizes[index] = size
     return polygons, sizes
 
 
-def merge_points(points_m: NDArray[np.float64], distance_m: float = MERGE_M) -> NDArray[np.intp]:
-    """Find points that are one.
-
-    Parameters
-    ----------
-    points_m : (V, 3) float64 array
-        Points [m].
-    distance_m : float
-        Largest distance between two that are one [m].
-
-    Returns
-    -------
-    (V,) int array
-        Index of the first point that each is one with, its own where there is none before it.
-    """
+def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Ints:
+    """Index (V,) of the first point that each point is one with: its own where there is none before it."""
     unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
-    pairs = cKDTree(unique).query_pairs(distance_m, output_type="ndarray") if len(unique) else np.zeros((0, 2), np.intp)
+    if not len(unique):
+        return np.zeros(0, np.intp)
+    pairs = cKDTree(unique).query_pairs(distance_m, output_type="ndarray")
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(unique), len(unique)))
-    count, labels = connected_components(graph, directed=False) if len(unique) else (0, np.zeros(0, np.intp))
+    count, labels = connected_components(graph, directed=False)
     lowest = np.full(count, len(points_m), dtype=np.intp)
     np.minimum.at(lowest, labels, first)
     return lowest[labels][inverse.ravel()]
 
 
-def close_seams(
-    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64], first_new: int
-) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Split triangles at the new vertices that lie on their open edges, so that neighbours share whole edges.
+def close_seams(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[Ints, Ints]:
+    """Split triangles at the vertices from `first_new` on that lie on their open edges, so that neighbours share edges.
 
-    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts.
-
-    Parameters
-    ----------
-    vertices_m : (V, 3) float64 array
-    triangles : (F, 3) int64 array
-    first_new : int
-        Vertices from this one on are new.
-
-    Returns
-    -------
-    triangles : (G, 3) int64 array
-    source : (G,) int array
-        Triangle that each one comes from, in rising order.
+    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns the
+    triangles (G, 3), and the triangle that each comes from (G,), in rising order.
     """
     source = np.arange(len(triangles))
     while True:
-        triangle, corner, point, share = _points_on_edges(vertices_m, triangles, first_new)
+        triangle, corner, point, fraction = _points_on_edges(vertices_m, triangles, first_new)
         if not len(triangle):
             return triangles, source
         split, first = np.unique(triangle, return_index=True)
@@ -167,8 +117,7 @@ def close_seams(
         start, end, apex = (triangles[split, (edge[split] + step) % 3] for step in (0, 1, 2))
         node = np.concatenate([start, point[ours], end])
         owner = np.concatenate([split, triangle[ours], split])
-        place = np.concatenate([np.zeros(len(split)), share[ours], np.ones(len(split))])
-        order = np.lexsort((place, owner))
+        order = np.lexsort((np.concatenate([np.zeros(len(split)), fraction[ours], np.ones(len(split))]), owner))
         node, owner = node[order], owner[order]
         within = np.nonzero(np.diff(owner) == 0)[0]
         across = apex[np.searchsorted(split, owner[within])]
@@ -179,10 +128,8 @@ def close_seams(
         triangles, source = np.concatenate([triangles[kept], parts])[order], source[origin[order]]
 
 
-def _points_on_edges(
-    vertices_m: NDArray[np.float64], triangles: NDArray[np.int64], first_new: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.int64], NDArray[np.float64]]:
-    """Triangle, corner at which its edge starts, new vertex on that open edge, and where on it (share of length)."""
+def _points_on_edges(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[Ints, Ints, Ints, Floats]:
+    """Triangle, corner at which its open edge starts, new vertex on that edge, and where on it (fraction of length)."""
     edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     _, index, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     open_edges = np.nonzero((counts[index.ravel()] == 1) & (edges[:, 0] != edges[:, 1]))[0]
@@ -191,19 +138,19 @@ def _points_on_edges(
     ends = vertices_m[edges[open_edges]]
     tree = shapely.STRtree(shapely.linestrings(ends[..., :2]))
     which, hit = tree.query(shapely.points(vertices_m[points, :2]), predicate="dwithin", distance=SEAM_M)
-    point, way = points[which], ends[hit, 1] - ends[hit, 0]
+    point, along = points[which], ends[hit, 1] - ends[hit, 0]
     offset = vertices_m[point] - ends[hit, 0]
-    lengths = np.linalg.norm(way, axis=1)
-    share = (offset * way).sum(axis=1) / lengths**2
-    on_edge = np.linalg.norm(offset - share[:, None] * way, axis=1) <= SEAM_M
-    on_edge &= (share * lengths > SEAM_M) & ((1.0 - share) * lengths > SEAM_M)
-    edge = open_edges[hit[on_edge]]
-    order = np.lexsort((share[on_edge], edge))
-    edge = edge[order]
-    return edge // 3, edge % 3, point[on_edge][order], share[on_edge][order]
+    lengths = np.linalg.norm(along, axis=1)
+    fraction = (offset * along).sum(axis=1) / lengths**2
+    on_edge = np.linalg.norm(offset - fraction[:, None] * along, axis=1) <= SEAM_M
+    on_edge &= (fraction * lengths > SEAM_M) & ((1.0 - fraction) * lengths > SEAM_M)
+    order = np.nonzero(on_edge)[0]
+    order = order[np.lexsort((fraction[order], open_edges[hit[order]]))]
+    edge = open_edges[hit[order]]
+    return edge // 3, edge % 3, point[order], fraction[order]
 
 
-def _seen_from_above(flat_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _seen_from_above(flat_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Longest edge (F, 2, 2) of triangles (F, 3, 2), and whether they are upright."""
     edges = np.stack([flat_m, np.roll(flat_m, -1, axis=1)], axis=2)
     lengths = np.linalg.norm(edges[:, :, 1] - edges[:, :, 0], axis=2)
@@ -212,11 +159,11 @@ def _seen_from_above(flat_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     return edges[rows, longest], np.abs(_doubled_area(flat_m)) <= UPRIGHT_M * lengths[rows, longest]
 
 
-def _doubled_area(flat_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _doubled_area(flat_m: Floats) -> Floats:
     return cross(flat_m[:, 1] - flat_m[:, 0], flat_m[:, 2] - flat_m[:, 0])
 
 
-def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
+def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Ints]:
     """Cut triangles that have a width seen from above; the height of new corners is that of the triangle's plane."""
     parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
     wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
@@ -234,32 +181,30 @@ def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Tr
     return cut, source
 
 
-def _cut_upright(corners_m: Triangles, ends_m: NDArray[np.float64], area: Any) -> tuple[Triangles, NDArray[np.intp]]:
+def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Triangles, Ints]:
     """Cut triangles that are lines seen from above, where these lines leave the area."""
     source, low, high = _spans_inside(ends_m, area)
-    start, way = ends_m[source, 0], ends_m[source, 1] - ends_m[source, 0]
+    start, along = ends_m[source, 0], ends_m[source, 1] - ends_m[source, 0]
     offset = corners_m[source][..., :2] - start[:, None]
-    share = (offset * way[:, None]).sum(axis=2) / (way**2).sum(axis=1)[:, None]
-    polygons, sizes = clip_slab(corners_m[source], share, low, high)
+    fraction = (offset * along[:, None]).sum(axis=2) / (along**2).sum(axis=1)[:, None]
+    polygons, sizes = clip_slab(corners_m[source], fraction, low, high)
     fans = [(np.nonzero(sizes > last)[0], last) for last in (2, 3, 4)]
     pieces = np.concatenate([polygons[rows][:, [0, last - 1, last]] for rows, last in fans])
     return pieces, np.concatenate([source[rows] for rows, _ in fans])
 
 
-def _spans_inside(
-    ends_m: NDArray[np.float64], area: Any
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """Line, start and end (shares of its length) of every stretch of lines (L, 2, 2) in an area or on its border."""
+def _spans_inside(ends_m: Floats, area: Any) -> tuple[Ints, Floats, Floats]:
+    """Line, start and end (fractions of its length) of every stretch of lines (L, 2, 2) in an area or on its border."""
     lengths = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
-    line, share = _border_stops(ends_m, area)
+    line, fraction = _border_stops(ends_m, area)
     line = np.concatenate([np.repeat(np.arange(len(ends_m)), 2), line])
-    share = np.concatenate([np.tile([0.0, 1.0], len(ends_m)), share])
-    order = np.lexsort((share, line))
-    line, share = line[order], share[order]
-    apart = (np.diff(line, prepend=-1) != 0) | (np.diff(share, prepend=0.0) * lengths[line] > MERGE_M)
-    line, share = line[apart], share[apart]
+    fraction = np.concatenate([np.tile([0.0, 1.0], len(ends_m)), fraction])
+    order = np.lexsort((fraction, line))
+    line, fraction = line[order], fraction[order]
+    apart = (np.diff(line, prepend=-1) != 0) | (np.diff(fraction, prepend=0.0) * lengths[line] > MERGE_M)
+    line, fraction = line[apart], fraction[apart]
     spans = np.nonzero(np.diff(line) == 0)[0]
-    line, low, high = line[spans], share[spans], share[spans + 1]
+    line, low, high = line[spans], fraction[spans], fraction[spans + 1]
     middle = ends_m[line, 0] + ((low + high) / 2)[:, None] * (ends_m[line, 1] - ends_m[line, 0])
     shapely.prepare(area)
     inside = shapely.dwithin(area, shapely.points(middle), BORDER_M)
@@ -270,26 +215,26 @@ def _spans_inside(
     return line[first], low[first], high[last]
 
 
-def _border_stops(ends_m: NDArray[np.float64], area: Any) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Line, and share of its length, where lines (L, 2, 2) cross the border of an area or its corners lie on them."""
+def _border_stops(ends_m: Floats, area: Any) -> tuple[Ints, Floats]:
+    """Line, and fraction of its length, where lines (L, 2, 2) cross the border of an area or touch its corners."""
     rings, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
     edges = np.stack([rings[:-1], rings[1:]], axis=1)[ring[:-1] == ring[1:]]
     tree = shapely.STRtree(shapely.linestrings(edges))
     line, edge = tree.query(shapely.linestrings(ends_m), predicate="dwithin", distance=BORDER_M)
-    start, way = ends_m[line, 0], ends_m[line, 1] - ends_m[line, 0]
+    start, along = ends_m[line, 0], ends_m[line, 1] - ends_m[line, 0]
     border = edges[edge, 1] - edges[edge, 0]
     offset = edges[edge, 0] - start
-    doubled = cross(way, border)
-    lengths = np.linalg.norm(way, axis=1)
+    doubled = cross(along, border)
+    lengths = np.linalg.norm(along, axis=1)
     slanted = np.abs(doubled) > 1e-9 * lengths * np.linalg.norm(border, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        crossing, along = cross(offset, border) / doubled, cross(offset, way) / doubled
-    crossed = slanted & (along >= 0) & (along <= 1)
-    lines, shares = [line[crossed]], [crossing[crossed]]
+        crossing, on_border = cross(offset, border) / doubled, cross(offset, along) / doubled
+    crossed = slanted & (on_border >= 0) & (on_border <= 1)
+    lines, fractions = [line[crossed]], [crossing[crossed]]
     for corner in (offset, offset + border):
-        close = np.abs(cross(way, corner)) <= BORDER_M * lengths
+        close = np.abs(cross(along, corner)) <= BORDER_M * lengths
         lines.append(line[close])
-        shares.append((way * corner).sum(axis=1)[close] / lengths[close] ** 2)
-    line, share = np.concatenate(lines), np.concatenate(shares)
-    between = (share > 0) & (share < 1)
-    return line[between], share[between]
+        fractions.append((along * corner).sum(axis=1)[close] / lengths[close] ** 2)
+    line, fraction = np.concatenate(lines), np.concatenate(fractions)
+    between = (fraction > 0) & (fraction < 1)
+    return line[between], fraction[between]

@@ -1,19 +1,29 @@
-"""Scanned and modelled meshes, read through trimesh."""
+"""Scanned and modelled meshes: mesh files through trimesh, and Mitsuba scene files, read without Mitsuba.
+
+Mitsuba would follow includes and paths out of the scene's folder, aborts on indices out of range, and is imported in
+`tracing` alone: an XML of others is parsed here (defusedxml), and its meshes are checked before Mitsuba sees them.
+"""
 
 import json
+import math
 import os
 import warnings
-from collections.abc import Iterator
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import defusedxml.ElementTree
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from trimesh.transformations import rotation_matrix, translation_matrix
 
-from sionna_partial.errors import MapError
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, merged_mesh
-from sionna_partial.maps.ros_map import MapWarning
+from sionna_partial.maps.partial_map import MapWarning
+from sionna_partial.settings import Material
 
 MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
 """File formats of meshes."""
@@ -21,8 +31,28 @@ MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
 MAX_MESH_BYTES = 2_000_000_000
 """Largest mesh file that is read [bytes]: more should be cut or simplified first."""
 
+MAX_XML_BYTES = 100_000_000
+"""Largest scene file that is read [bytes]."""
+
 LOWEST_CEILING_M = 2.2
 """Height of the lowest rooms [m]: what is lower along y does not stand on its side."""
+
+DEFAULT_THICKNESS_M = 0.1
+"""Thickness of a radio material where none is given [m] (Sionna RT)."""
+
+SHAPE_TYPES = ("ply", "obj", "rectangle", "cube")
+"""Types of shapes of a Mitsuba scene that are read."""
+
+_CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
+_SIDES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
+_SHAPES = {
+    "rectangle": (_CORNERS[[0, 1, 3, 2]] * (1.0, 1.0, 0.0), np.array([[0, 1, 2], [0, 2, 3]])),
+    "cube": (_CORNERS, _SIDES[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)),
+}
+"""Corners and triangles of the shapes that need no file, as Mitsuba has them."""
+
+Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
+"""Vertices (V, 3) [m], and triangles (F, 3) of indices into them."""
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
@@ -34,128 +64,30 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
 
 
 def read_mesh(path: Path, up: str | None = None) -> SceneMesh:
-    """Read a mesh file. Its looks (colours, textures) are ignored.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        A PLY, GLB, GLTF, OBJ or STL file in metres. The nodes of a scene are placed by their transforms.
-    up : {"z", "y"} or None
-        Axis of the file that points up. None is z, with a warning if that looks wrong.
-
-    Returns
-    -------
-    SceneMesh
-        With z up, and one material, None.
-
-    Raises
-    ------
-    MapError
-        If the file is damaged, empty, too large, or asks for files outside its folder.
-    """
-    vertices, triangles = read_triangles(path, path.suffix.lower().removeprefix("."))
+    """Read a mesh file in metres, without colours and textures. `up` is the axis of the file that points up."""
+    vertices, triangles = _read_triangles(path, path.suffix.lower().removeprefix("."))
     if up is None and _looks_y_up(vertices, triangles):
         message = f'path = \'{path}\' looks as if y pointed up: give up="y" to turn it, or up="z" to read it as it is.'
-        warnings.warn(message, MapWarning, stacklevel=4)
+        warnings.warn(message, MapWarning, stacklevel=3)
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    return checked_mesh(path, vertices, triangles, np.zeros(len(triangles), dtype=np.intp), (None,))
+    return _joined(path, [(vertices, triangles)], [0], (None,))
 
 
-def read_triangles(path: Path, kind: str) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Read the triangles of a mesh file as they are.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-    kind : {"ply", "glb", "gltf", "obj", "stl"}
-
-    Returns
-    -------
-    vertices_m : (V, 3) float64 array
-        In the axes of the file [m].
-    triangles : (F, 3) int64 array
-        Indices into `vertices_m`, in range.
-
-    Raises
-    ------
-    MapError
-        As `read_mesh` does.
-    """
+def read_bytes(path: Path, most: int, remedy: str) -> bytes:
+    """Return the content of a file of at most so many bytes."""
     try:
-        size = path.stat().st_size
-        if size > MAX_MESH_BYTES:
-            raise MapError(f"path = '{path}' has more than {MAX_MESH_BYTES:,} bytes: cut or simplify the mesh.")
-        if kind == "gltf":
-            json.loads(path.read_bytes())  # trimesh would look for another file
-        with path.open("rb") as stream, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a damaged file the error tells
-            scene = trimesh.load_scene(
-                stream, file_type=kind, resolver=_Neighbours(os.fspath(path)), process=False, skip_materials=True
-            )
-            parts = [*_placed_parts(path, scene)]
-    except MapError:
-        raise
-    except Exception as error:  # decoders fail in many ways on damaged files
-        raise MapError(
-            f"path = '{path}' is damaged or no {kind.upper()} mesh ({error}): export the mesh again."
-        ) from error
-    if not any(len(triangles) for _, triangles in parts):
-        raise MapError(f"path = '{path}' holds 0 triangles: give a mesh with surfaces, not points or lines alone.")
-    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    triangles = np.concatenate([triangles + start for (_, triangles), start in zip(parts, starts, strict=False)])
-    if len(triangles) > MAX_TRIANGLES:
-        raise MapError(
-            f"path = '{path}' holds {len(triangles):,} triangles, more than {MAX_TRIANGLES:,}: cut or simplify it."
-        )
-    return np.concatenate([vertices for vertices, _ in parts]), triangles
-
-
-def checked_mesh(
-    path: Path,
-    vertices_m: NDArray[np.float64],
-    triangles: NDArray[np.int64],
-    material: NDArray[np.intp],
-    materials: tuple[Any, ...],
-) -> SceneMesh:
-    """Build a mesh of a file, its vertices merged, or raise a MapError that names the file.
-
-    Parameters
-    ----------
-    path : pathlib.Path
-        The file, for messages.
-    vertices_m, triangles, material, materials
-        As in SceneMesh.
-
-    Returns
-    -------
-    SceneMesh
-        With at least one triangle.
-    """
-    try:
-        mesh = merged_mesh(vertices_m, triangles, material, materials)
-    except MapError as error:
-        raise MapError(f"path = '{path}': {error}") from error
-    if not len(mesh.triangles):
-        raise MapError(f"path = '{path}' holds degenerate triangles alone: give a mesh with surfaces, in metres.")
-    return mesh
+        with path.open("rb") as stream:
+            content = stream.read(most + 1)
+    except OSError as error:
+        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
+    if len(content) > most:
+        raise MapError(f"path = '{path}' has more than {most:,} bytes: {remedy}")
+    return content
 
 
 def confined_path(folder: Path, name: str, what: str) -> Path:
-    """Return the path of a file that another file names, or raise a MapError unless it lies in the folder.
-
-    Parameters
-    ----------
-    folder : pathlib.Path
-    name : str
-        What the other file says.
-    what : str
-        Subject of the message.
-
-    Returns
-    -------
-    pathlib.Path
-    """
+    """Return the path of a file that another one names, or raise a MapError (`what` ...) if it is not in the folder."""
     inside = bool(name) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts
     if not inside or not (folder / name).resolve().is_relative_to(folder.resolve()):
         raise MapError(f"{what} {name!r}, which is not allowed: put it into '{folder}' and give its relative path.")
@@ -164,8 +96,33 @@ def confined_path(folder: Path, name: str, what: str) -> Path:
     return folder / name
 
 
-def _placed_parts(path: Path, scene: Any) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
-    """Vertices and triangles of every node of a trimesh scene, in the axes of the scene."""
+def _read_triangles(path: Path, kind: str) -> Triangles:
+    """Read the triangles of a mesh file in the axes of the file; nodes of a scene are placed by their transforms."""
+    try:
+        if path.stat().st_size > MAX_MESH_BYTES:
+            raise MapError(f"path = '{path}' has more than {MAX_MESH_BYTES:,} bytes: cut or simplify the mesh.")
+        if kind == "gltf":
+            json.loads(path.read_bytes())  # trimesh would look for another file
+        with path.open("rb") as stream, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # damage ends in the error below
+            resolver = _Neighbours(os.fspath(path))
+            scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, skip_materials=True)
+            parts = [*_placed_parts(path, scene)]
+    except MapError:
+        raise
+    except Exception as error:  # decoders fail in many ways on damaged files
+        raise MapError(f"path = '{path}' is damaged or no {kind.upper()} mesh ({error}): export it again.") from error
+    if not any(len(triangles) for _, triangles in parts):
+        raise MapError(f"path = '{path}' holds 0 triangles: give a mesh with surfaces, not points or lines alone.")
+    vertices, triangles = _concatenated(parts)
+    if len(triangles) > MAX_TRIANGLES:
+        count = f"{len(triangles):,} triangles, more than {MAX_TRIANGLES:,}"
+        raise MapError(f"path = '{path}' holds {count}: cut or simplify it.")
+    return vertices, triangles
+
+
+def _placed_parts(path: Path, scene: Any) -> Iterator[Triangles]:
+    """Yield the triangles of every node of a trimesh scene, in the axes of the scene."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
@@ -174,11 +131,27 @@ def _placed_parts(path: Path, scene: Any) -> Iterator[tuple[NDArray[np.float64],
         vertices, triangles = np.asarray(part.vertices, dtype=np.float64), np.asarray(part.faces, dtype=np.int64)
         wrong = (triangles < 0) | (triangles >= len(vertices))
         if wrong.any():
-            raise MapError(
-                f"path = '{path}' has a triangle with vertex {triangles[wrong][0]}, but {len(vertices)} vertices: "
-                "export the mesh again."
-            )
+            count = f"vertex {triangles[wrong][0]}, but {len(vertices)} vertices"
+            raise MapError(f"path = '{path}' has a triangle with {count}: export the mesh again.")
         yield vertices @ transform[:3, :3].T + transform[:3, 3], triangles
+
+
+def _concatenated(parts: list[Triangles]) -> Triangles:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    triangles = [triangles + start for (_, triangles), start in zip(parts, starts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
+
+
+def _joined(path: Path, parts: list[Triangles], index: list[int], materials: tuple[Material | None, ...]) -> SceneMesh:
+    """Build the mesh of a file of parts with an index into the materials each; raise a MapError that names the file."""
+    material = np.repeat(index, [len(triangles) for _, triangles in parts])
+    try:
+        mesh = merged_mesh(*_concatenated(parts), material, materials)
+    except MapError as error:
+        raise MapError(f"path = '{path}': {error}") from error
+    if not len(mesh.triangles):
+        raise MapError(f"path = '{path}' holds degenerate triangles alone: give a mesh with surfaces, in metres.")
+    return mesh
 
 
 def _looks_y_up(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> bool:
@@ -190,3 +163,146 @@ def _looks_y_up(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -
     area = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = np.bincount(np.argmax(area, axis=1), weights=np.linalg.norm(area, axis=1), minlength=3)
     return bool(LOWEST_CEILING_M <= extent[1] < min(extent[0], extent[2]) and facing[1] > facing[2])
+
+
+def read_mitsuba_scene(path: Path) -> SceneMesh:
+    """Read the meshes of a Mitsuba scene file, which lie in its folder or below, with their radio materials.
+
+    Materials are those that Sionna RT takes (`radio-material`, `itu-radio-material`, and names such as
+    `mat-itu_concrete`); any other is None, with a warning.
+    """
+    root, shapes = _read_shapes(path)
+    if not shapes:
+        raise MapError(f"path = '{path}' holds no shape: give a Mitsuba scene with meshes.")
+    named = {bsdf.get("id"): _material(path, bsdf) for bsdf in root.findall("./bsdf")}
+    used = [_material_of(path, element, named) for element, _ in shapes]
+    materials = tuple(dict.fromkeys(used))
+    return _joined(path, [triangles for _, triangles in shapes], [*map(materials.index, used)], materials)
+
+
+def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object) -> SceneMesh:
+    """Read the mesh of an exported scene: `record` and `offset_m` are the "mesh" and "scene_offset" of its map.yaml.
+
+    The shape `part0` of the scene has the triangles of the first material of the record, and so on.
+    """
+    path = folder / "scene.xml"
+    try:
+        materials = tuple(None if each is None else Material(**each) for each in record["materials"])
+        low, high = (float(value) for value in record["height_range"])
+        shift = np.array(offset_m, dtype=np.float64).reshape(3)
+    except (KeyError, TypeError, ValueError) as error:
+        sheet = folder / "map.yaml"
+        raise MapError(f"path = '{sheet}' has a damaged mesh entry ({error}): export it again.") from error
+    _, shapes = _read_shapes(path)
+    names = [_name(element) for element, _ in shapes]
+    index = {f"part{number}": number for number in range(len(materials))}
+    for name in names:
+        if name not in index:
+            raise MapError(f"path = '{path}' has a shape {name!r} that was not exported: export the scene again.")
+    if not shapes:
+        return SceneMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0, np.uint8), materials, (low, high))
+    parts = [(vertices + shift, triangles) for _, (vertices, triangles) in shapes]
+    return replace(_joined(path, parts, [index[name] for name in names], materials), height_range_m=(low, high))
+
+
+def _read_shapes(path: Path) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
+    """Read a scene file and its shapes; a document type, which entities need, and other files are refused."""
+    content = read_bytes(path, MAX_XML_BYTES, "split the scene.")
+    try:
+        root: ET.Element = defusedxml.ElementTree.fromstring(content, forbid_dtd=True)
+    except defusedxml.DefusedXmlException as error:
+        raise MapError(f"path = '{path}' has a DOCTYPE, which is not followed: remove it from the file.") from error
+    except (ET.ParseError, LookupError, ValueError) as error:
+        raise MapError(f"path = '{path}' is not valid XML ({error}): give a Mitsuba scene file.") from error
+    if root.tag != "scene":
+        raise MapError(f"path = '{path}' has the root <{root.tag}>: give a Mitsuba scene file, with <scene>.")
+    for tag in ("include", "path"):
+        if root.find(f".//{tag}") is not None:
+            raise MapError(f"path = '{path}' has an <{tag}>, which is not followed: put everything into one file.")
+    elements = root.findall("./shape")
+    others = sorted({str(element.get("type")) for element in elements} - {*SHAPE_TYPES})
+    if others:
+        remedy = f"give {', '.join(SHAPE_TYPES)}; Mitsuba writes other meshes as PLY (mesh.write_ply)."
+        raise MapError(f"path = '{path}' has shapes of type {', '.join(others)}: {remedy}")
+    return root, [(element, _shape_triangles(path, element)) for element in elements]
+
+
+def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
+    """Triangles of a shape, with its to_world: each step of that acts on the outcome of those before it."""
+    kind, matrix = str(shape.get("type")), np.eye(4)
+    if kind in _SHAPES:
+        vertices, triangles = _SHAPES[kind]
+    else:
+        what = f"path = '{path}': shape {_name(shape)!r} has the filename"
+        file = confined_path(path.parent, _property(shape, "filename") or "", what)
+        vertices, triangles = _read_triangles(file, kind)
+    for step in (step for node in shape.findall("transform[@name='to_world']") for step in node):
+        try:
+            matrix = _step(step) @ matrix
+        except (KeyError, ValueError) as error:
+            what = f"shape {_name(shape)!r} has a to_world with <{step.tag} {step.attrib}>"
+            remedy = "give matrix, translate, scale or rotate."
+            raise MapError(f"path = '{path}': {what}, which cannot be read: {remedy}") from error
+    return vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles
+
+
+def _step(step: ET.Element) -> NDArray[np.float64]:
+    """Matrix (4, 4) of one step of a to_world."""
+    value = np.array([float(word) for word in step.get("value", "").replace(",", " ").split()])
+    if step.tag == "matrix":
+        return value.reshape(4, 4)
+    missing = 1.0 if step.tag == "scale" else 0.0
+    vector = np.broadcast_to(value, 3) if "value" in step.attrib else [float(step.get(axis, missing)) for axis in "xyz"]
+    if step.tag == "translate":
+        return np.asarray(translation_matrix(vector))
+    if step.tag == "scale":
+        return np.diag([*vector, 1.0])
+    if step.tag == "rotate" and np.any(vector):
+        return np.asarray(rotation_matrix(math.radians(float(step.attrib["angle"])), vector))
+    raise ValueError(step.tag)
+
+
+def _name(element: ET.Element) -> str:
+    return element.get("id") or element.get("name") or element.get("type") or element.tag
+
+
+def _property(element: ET.Element, name: str) -> str | None:
+    found = element.find(f"*[@name='{name}'][@value]")
+    return None if found is None else found.get("value")
+
+
+def _material_of(path: Path, shape: ET.Element, named: Mapping[str | None, Material | None]) -> Material | None:
+    """Material of a shape: its own bsdf, or a named one of the scene."""
+    for bsdf in shape.findall("bsdf"):
+        return _material(path, bsdf)
+    for ref in shape.findall("ref"):
+        if ref.get("id") not in named:
+            what = f"shape {_name(shape)!r} refers to {ref.get('id')!r}, which is no bsdf of the scene"
+            raise MapError(f"path = '{path}': {what}: add it, or correct the id.")
+        return named[ref.get("id")]
+    _warn(path, f"shape {_name(shape)!r} has no bsdf")
+    return None
+
+
+def _material(path: Path, bsdf: ET.Element) -> Material | None:
+    """Radio material of a bsdf, as Sionna RT understands it (scene_utils.process_xml)."""
+    name = str(bsdf.get("id", "")).removeprefix("mat-")
+    kind, itu = bsdf.get("type"), _property(bsdf, "type")
+    if name.startswith(("itu_", "itu-")):
+        kind, itu = "itu-radio-material", itu or name[4:]
+    try:
+        thickness_m = float(_property(bsdf, "thickness") or DEFAULT_THICKNESS_M)
+        if kind == "itu-radio-material":
+            return Material(itu=itu or "", thickness_m=thickness_m)
+        if kind == "radio-material":
+            permittivity = float(_property(bsdf, "relative_permittivity") or 1.0)
+            return Material(permittivity, float(_property(bsdf, "conductivity") or 0.0), thickness_m)
+    except (SettingsError, ValueError) as error:
+        raise MapError(f"path = '{path}': bsdf {_name(bsdf)!r} is no radio material ({error}): correct it.") from error
+    _warn(path, f"bsdf {_name(bsdf)!r} of type {bsdf.get('type')!r} is no radio material")
+    return None
+
+
+def _warn(path: Path, what: str) -> None:
+    message = f"path = '{path}': {what}; the material of SceneSettings takes its place."
+    warnings.warn(message, MapWarning, stacklevel=2)

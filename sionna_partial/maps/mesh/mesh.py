@@ -1,8 +1,6 @@
 """SceneMesh: the triangles of a scanned or modelled building, and what they are made of."""
 
-import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -66,9 +64,8 @@ class SceneMesh:
         vertices = _vertices(self.vertices_m)
         triangles = _indices("triangles", self.triangles, (3,), len(vertices), "vertices_m")
         if len(triangles) > MAX_TRIANGLES:
-            raise MapError(
-                f"triangles has {len(triangles):,} rows, more than {MAX_TRIANGLES:,}: cut or simplify the mesh."
-            )
+            rows = f"{len(triangles):,} rows, more than {MAX_TRIANGLES:,}"
+            raise MapError(f"triangles has {rows}: cut or simplify the mesh.")
         materials = _materials(self.materials)
         material = _indices("material", self.material, (), len(materials), "materials")
         if len(material) != len(triangles):
@@ -91,13 +88,7 @@ class SceneMesh:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, SceneMesh):
             return NotImplemented
-        return (
-            np.array_equal(self.vertices_m, other.vertices_m)
-            and np.array_equal(self.triangles, other.triangles)
-            and np.array_equal(self.material, other.material)
-            and self.materials == other.materials
-            and self.height_range_m == other.height_range_m
-        )
+        return equal_fields(self, other)
 
     @property
     def bounds_m(self) -> NDArray[np.float64]:
@@ -116,21 +107,11 @@ class SceneMesh:
         return {self.materials[index] or default for index in np.unique(self.material)}
 
     def within(self, area: Any) -> "SceneMesh":
-        """Cut the mesh at the border of an area seen from above.
+        """Cut the mesh at the border of an area (shapely, world x and y [m]) seen from above.
 
-        Triangles in the area stay as they are, those across its border are cut there, and the others go. Walls on the
-        border stay. Triangles that shared edges still do; where a neighbour is cut in the middle of an edge, its edge
-        gets that vertex too. Cut points within `SEAM_M` of one another, or of a vertex, are one.
-
-        Parameters
-        ----------
-        area : shapely Polygon or MultiPolygon
-            World x and y [m].
-
-        Returns
-        -------
-        SceneMesh
-            Without triangles, where none reaches the area.
+        Triangles in the area, and walls on its border, stay as they are; those across its border are cut there.
+        Triangles that shared edges still do; where a neighbour is cut in the middle of an edge, its edge gets that
+        vertex too. Cut points within `SEAM_M` of one another, or of a vertex, are one. There may be no triangle left.
         """
         whole, pieces, source = cut_triangles(self.corners_m, area)
         count = len(self.vertices_m)
@@ -150,101 +131,19 @@ def merged_mesh(
     material: NDArray[np.integer],
     materials: tuple[Material | None, ...],
 ) -> SceneMesh:
-    """Build a mesh whose triangles share the vertices that they have in common.
-
-    Parameters
-    ----------
-    vertices_m : (V, 3) float64 array
-    triangles : (F, 3) int64 array
-    material : (F,) integer array
-    materials : tuple of Material or None
-        As in SceneMesh.
-
-    Returns
-    -------
-    SceneMesh
-
-    Raises
-    ------
-    MapError
-        As SceneMesh does.
-    """
+    """Build a mesh whose triangles share the vertices that they have in common."""
     mesh = SceneMesh(vertices_m, triangles, material.astype(np.uint8), materials)
     return replace(mesh, triangles=merge_points(mesh.vertices_m)[mesh.triangles].astype(np.int64))
 
 
 def material_records(mesh: SceneMesh) -> list[dict[str, Any] | None]:
-    """Make plain data of the materials of a mesh.
-
-    Parameters
-    ----------
-    mesh : SceneMesh
-
-    Returns
-    -------
-    list of dict or None
-        For `materials_of_records`.
-    """
+    """Return the materials of a mesh as plain data, for files."""
     return [None if material is None else asdict(material) for material in mesh.materials]
 
 
-def materials_of_records(records: Iterable[Mapping[str, Any] | None]) -> tuple[Material | None, ...]:
-    """Make materials of what `material_records` gave.
-
-    Parameters
-    ----------
-    records : iterable of mapping or None
-
-    Returns
-    -------
-    tuple of Material or None
-    """
-    return tuple(None if record is None else Material(**record) for record in records)
-
-
-def mesh_arrays(mesh: SceneMesh) -> dict[str, Any]:
-    """Make named arrays of a mesh, to save them.
-
-    Parameters
-    ----------
-    mesh : SceneMesh
-
-    Returns
-    -------
-    dict
-        For `mesh_of_arrays`.
-    """
-    return {
-        "mesh_vertices_m": mesh.vertices_m,
-        "mesh_triangles": mesh.triangles,
-        "mesh_material": mesh.material,
-        "mesh_materials": json.dumps(material_records(mesh)),
-        "mesh_height_range_m": mesh.height_range_m,
-    }
-
-
-def mesh_of_arrays(content: Mapping[str, NDArray[Any]]) -> SceneMesh | None:
-    """Make a mesh of what `mesh_arrays` gave.
-
-    Parameters
-    ----------
-    content : mapping of str to array
-
-    Returns
-    -------
-    SceneMesh or None
-        None if the arrays hold no mesh.
-    """
-    if "mesh_triangles" not in content:
-        return None
-    low, high = content["mesh_height_range_m"].tolist()
-    return SceneMesh(
-        vertices_m=content["mesh_vertices_m"],
-        triangles=content["mesh_triangles"],
-        material=content["mesh_material"],
-        materials=materials_of_records(json.loads(str(content["mesh_materials"]))),
-        height_range_m=(low, high),
-    )
+def equal_fields(one: Any, other: Any) -> bool:
+    """Whether two objects of one dataclass, which may hold arrays, are equal."""
+    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
 
 
 def _vertices(values: ArrayLike) -> NDArray[np.float64]:
@@ -257,10 +156,9 @@ def _vertices(values: ArrayLike) -> NDArray[np.float64]:
     wrong = ~(np.abs(vertices) <= MAX_COORDINATE_M).all(axis=1)
     if wrong.any():
         index = int(np.argmax(wrong))
-        place = tuple(float(value) for value in vertices[index])
         raise MapError(
-            f"vertices_m[{index}] = {place} is not allowed: give finite numbers of metres, at most "
-            f"{MAX_COORDINATE_M:g}; repair the mesh."
+            f"vertices_m[{index}] = {tuple(vertices[index].tolist())} is not allowed: give finite numbers of metres, "
+            f"at most {MAX_COORDINATE_M:g}; repair the mesh."
         )
     return vertices
 
@@ -304,10 +202,15 @@ def _height_range(given: tuple[float, float] | None, vertices_m: NDArray[np.floa
         z = vertices_m[:, 2] if len(vertices_m) else np.zeros(1)
         low, high = float(z.min()), float(z.max())
         return low, high if high - low >= FLAT_M else low + DEFAULT_WALL_HEIGHT_M
+    return height_pair("height_range_m", given)
+
+
+def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
+    """Return two heights as numbers, or raise a MapError."""
     try:
         low, high = (float(value) for value in given)
     except (TypeError, ValueError):
         low, high = np.nan, np.nan
     if not -MAX_COORDINATE_M <= low < high <= MAX_COORDINATE_M:
-        raise MapError(f"height_range_m = {given!r} is not allowed: give (low, high) in metres, low < high.")
+        raise MapError(f"{name} = {given!r} is not allowed: give (low, high), z in metres, low < high.")
     return low, high

@@ -1,8 +1,8 @@
-"""Candidates of the path solver in any mesh: chains of planes that rays have met, and the receivers they can reach.
+"""Candidates of meshes: sequences of planes that rays have met, and the receivers that each can reach.
 
-A specular path is a straight line from an image of the transmitter, reflected in the planes of its chain. Rays say
-which chains there are, and, seen from the image, in which directions their last leg goes and how far. A receiver that
-lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of every plane of the chain.
+A specular path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays
+determine which sequences there are, and, seen from the image, in which directions their last leg goes and how far. A
+receiver that lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of each plane.
 """
 
 from collections.abc import Iterable, Iterator
@@ -13,31 +13,22 @@ from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.scene.floor_plan import grow
+from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.planes import face_at, group_planes
-from sionna_partial.tracing.mesh.rays import Rays
-from sionna_partial.tracing.mesh.sequences import collect_chains, view_chains
-from sionna_partial.tracing.plan.candidates import Candidates
+from sionna_partial.tracing.mesh.sequences import Rays, collect_sequences, view_sequences
 
 _REACH, _REACH_M = 1.1, 0.3
-"""Factor and length [m] by which receivers may lie farther than the chain's rays went."""
+"""Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
 
 _LEAF = 8
 """Largest number of receivers in a box that is not divided further."""
 
 
 class _Boxes(NamedTuple):
-    """Receivers in a tree of boxes; box 0 holds all.
+    """N receivers in a tree of K boxes; box 0 holds all.
 
-    Parameters
-    ----------
-    order : (N,) int64 array
-        Receivers in the order of their boxes.
-    start, stop : (K,) int64 arrays
-        Part of `order` that each box holds.
-    child : (K,) int64 array
-        First of the two boxes in it, or -1.
-    low_m, high_m : (K, 3) float64 arrays
-        Corners of the boxes [m].
+    Box k holds the part `start` to `stop` of the receivers in `order` (N,), and `child` is the first of the two boxes
+    in it, or -1. `low_m`, `high_m` (K, 3) are the corners of the boxes.
     """
 
     order: NDArray[np.int64]
@@ -46,6 +37,24 @@ class _Boxes(NamedTuple):
     child: NDArray[np.int64]
     low_m: NDArray[np.float64]
     high_m: NDArray[np.float64]
+
+
+class _View(NamedTuple):
+    """Where receivers of one sequence are: image (3,), box of directions, width by which it is enlarged, and reach."""
+
+    source: NDArray[np.float64]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    margin: float
+    reach: float
+
+
+class _Found(NamedTuple):
+    """Columns of candidates, as in `Candidates`."""
+
+    rx: NDArray[np.int32]
+    face: NDArray[np.int32]
+    points: NDArray[np.float64]
 
 
 def mesh_candidates(
@@ -58,44 +67,23 @@ def mesh_candidates(
     max_depth: int,
     candidates_per_block: int = 200_000,
 ) -> Iterator[tuple[Candidates, float]]:
-    """Find the paths that can exist, block by block: line of sight to every receiver, then chain after chain.
+    """Yield the paths that can exist, and the fraction of the work done: direct paths, then sequence after sequence.
 
-    Parameters
-    ----------
-    vertices_m : (V, 3) array
-        Vertices of the mesh [m].
-    triangles : (F, 3) array
-        Faces, as indices into `vertices_m`, in the order in which `rays` counts them.
-    rays : iterable of Rays
-        Rays in all directions from the transmitter, from `shoot_rays` with the same `max_depth`.
-    tx_m, rx_m : (3,) and (N, 3) arrays
-        Transmitter and receivers [m].
-    max_depth : int
-        Largest number of reflections of a path.
-    candidates_per_block : int
-        Number of candidates in a block, which bounds the memory. The line of sight to all receivers is one block.
-
-    Yields
-    ------
-    Candidates
-    float
-        Share of the work done with this block.
+    `rays` come from `shoot_rays`, with the same transmitter (3,) and `max_depth`, and count the faces like `triangles`.
     """
     if len(rx_m) == 0:
         return
-    none = np.zeros(0, np.int32)
     size = max(1, max_depth)
     direct = np.arange(len(rx_m), dtype=np.int32)
-    yield Candidates(direct, np.full((len(rx_m), size), -1, np.int32), np.zeros((len(rx_m), size, 3)), none), 0.0
+    yield Candidates(direct, np.full((len(rx_m), size), -1, np.int32), np.zeros((len(rx_m), size, 3))), 0.0
     planes = group_planes(vertices_m, triangles)
-    chains = collect_chains(rays, planes)
-    views = view_chains(chains, planes, np.asarray(tx_m, np.float64))
+    sequences = collect_sequences(rays, planes)
+    views = view_sequences(sequences, planes, np.asarray(tx_m, np.float64))
     rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
-    boxes = _divide(rx_m)
-    done = 0
-    while done < chains.size:
-        rx, face, points_m, done = _next_block(done, chains, views, planes, boxes, rx_m, size, candidates_per_block)
-        yield Candidates(rx, face, points_m, none), done / chains.size
+    boxes, done = _divide(rx_m), 0
+    while done < sequences.size:
+        *columns, done = _next_block(done, sequences, views, planes, boxes, rx_m, size, candidates_per_block)
+        yield Candidates(*columns), done / sequences.size
 
 
 @njit(cache=True)
@@ -124,27 +112,29 @@ def _divide(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_block(first, chains, views, planes, boxes, rx, depth_size, block):  # type: ignore[no-untyped-def]
-    """Candidates of the chains from place `first` in the order on, until a block is full; and where to go on."""
-    out_rx, count, done = np.empty(1024, np.int32), 0, first
-    face, points = np.empty((1024, depth_size), np.int32), np.empty((1024, depth_size, 3))
-    found, stack, bounds = np.empty(len(rx), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+def _next_block(first, sequences, views, planes, boxes, rx_m, depth, block):  # type: ignore[no-untyped-def]
+    """Candidates of the sequences from number `first` in the order on, until a block is full; and where to go on."""
+    out = _Found(np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3)))
+    seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    count, done = 0, first
     while done < len(views.order) and count < block:
         node = views.order[done]
-        seen = _receivers_in_view(node, chains, views, planes, boxes, rx, found, stack, bounds)
-        out_rx, face, points = grow(out_rx, count + seen), grow(face, count + seen), grow(points, count + seen)
-        count = _fold(node, found[:seen], rx, chains, views, planes, out_rx, face, points, count)
+        reach = _REACH * sequences.reach_m[node] + _REACH_M
+        view = _View(views.source_m[node], sequences.low[node], sequences.high[node], views.margin[node], reach)
+        _bound_view(view, _farthest(view.source, boxes), planes, sequences.plane[node], bounds)
+        number = _receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
+        if number > 0:
+            size = count + number
+            out = _Found(grow(out.rx, size), grow(out.face, size), grow(out.points, size))
+            count = _fold(node, seen[:number], sequences, views, planes, rx_m, out, count)
         done += 1
-    return out_rx[:count].copy(), face[:count].copy(), points[:count].copy(), done
+    return out.rx[:count].copy(), out.face[:count].copy(), out.points[:count].copy(), done
 
 
 @njit(cache=True)
-def _receivers_in_view(node, chains, views, planes, boxes, rx, found, stack, bounds):  # type: ignore[no-untyped-def]
-    """Write the receivers in view of a chain's image to `found` and count them."""
-    source, margin = views.source_m[node], views.margin[node]
-    low, high = chains.low[node], chains.high[node]
-    reach = _REACH * chains.reach_m[node] + _REACH_M
-    _bound_view(source, low, high, margin, min(reach, _farthest(source, boxes)), planes, chains.plane[node], bounds)
+def _receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no-untyped-def]
+    """Write the receivers in view of a sequence's image to `found` and count them."""
+    source, low, high, margin, reach = view
     count, stack[0], top = 0, 0, 1
     while top > 0:
         top -= 1
@@ -180,13 +170,15 @@ def _farthest(source, boxes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _bound_view(source, low, high, margin, reach, planes, p, bounds):  # type: ignore[no-untyped-def]
-    """Write what bounds the points in view of an image and beyond its last plane.
+def _bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-def]
+    """Write what bounds the points in view of an image and beyond its last plane, no receiver being farther away.
 
     Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
     the largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from
     the image lies within r times that distance of r times the middle.
     """
+    source, low, high, margin, reach = view
+    reach = min(reach, farthest)
     width, away, slope = 0.0, -planes.offset_m[p], 0.0
     for axis in range(3):
         width += (0.5 * (high[axis] - low[axis]) + margin) ** 2
@@ -221,15 +213,17 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fold(node, found, rx, chains, views, planes, out_rx, face, points, count):  # type: ignore[no-untyped-def]
-    """Append the candidates among the receivers found for a chain, and return the new number of candidates.
+def _fold(node, found, sequences, views, planes, rx_m, out, count):  # type: ignore[no-untyped-def]
+    """Append the candidates among the receivers found for a sequence, and return the new number of candidates.
 
-    The line from the image to a candidate, folded back at every plane of the chain, meets a face of each.
+    The line from the image to a candidate, folded back at every plane of the sequence, meets a face of each.
     """
-    parent, plane, sources = chains.parent, chains.plane, views.source_m
-    normals, offsets, bins = planes.normal, planes.offset_m, planes[5:]
+    parent, plane, sources, depth = sequences.parent, sequences.plane, views.source_m, views.depth[node]
+    normals, offsets, bins = planes.normal, planes.offset_m, planes.bins
+    rx, face, points = out
     for target in found:
-        x, y, z, at, k = rx[target, 0], rx[target, 1], rx[target, 2], node, views.depth[node] - 1
+        x, y, z = rx_m[target, 0], rx_m[target, 1], rx_m[target, 2]
+        at, k = node, depth - 1
         while k >= 0:
             p = plane[at]
             nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
@@ -237,16 +231,16 @@ def _fold(node, found, rx, chains, views, planes, out_rx, face, points, count): 
             behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
             if behind * before >= 0.0:
                 break
-            share = behind / (behind - before)
-            x, y, z = sx + share * (x - sx), sy + share * (y - sy), sz + share * (z - sz)
+            fraction = behind / (behind - before)
+            x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
             points[count, k, 0], points[count, k, 1], points[count, k, 2] = x, y, z
             face[count, k] = face_at(bins, p, x, y, z)
             if face[count, k] < 0:
                 break
             at, k = parent[at], k - 1
         if k < 0:
-            out_rx[count] = target
-            face[count, views.depth[node] :] = -1
-            points[count, views.depth[node] :] = 0.0
+            rx[count] = target
+            face[count, depth:] = -1
+            points[count, depth:] = 0.0
             count += 1
     return count

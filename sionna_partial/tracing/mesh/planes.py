@@ -1,7 +1,7 @@
 """The planes that the faces of a mesh lie on, and which face of a plane is where.
 
-Faces in one plane reflect to one image, so chains of reflections are told apart by planes, not by faces. In a scanned
-mesh nearly every face is a plane of its own.
+Faces in one plane reflect to one image, so sequences of reflections are told apart by planes, not by faces. In a
+scanned mesh nearly every face is a plane of its own.
 """
 
 from typing import NamedTuple
@@ -22,36 +22,15 @@ _FACE_TOLERANCE_M = 1e-3
 """Distance beyond a face [m] up to which a point counts as on it."""
 
 
-class MeshPlanes(NamedTuple):
-    """Faces of a mesh, grouped by plane, with the faces of each plane sorted into square bins.
+class FaceBins(NamedTuple):
+    """F faces of P planes, sorted into B square bins of each plane.
 
-    A point lies in a plane where ``normal @ point == offset_m``. A face without area has a plane of its own.
-
-    Parameters
-    ----------
-    plane : (F,) int32 array
-        Plane of every face.
-    normal, offset_m : (P, 3) and (P,) float64 arrays
-        Unit normals and their products with a point of the plane [m].
-    centre_m, radius_m : (P, 3) and (P,) float64 arrays
-        Balls that hold the faces of each plane [m].
-    axes : (P, 2) int64 array
-        The two coordinates in which the faces of a plane are told apart.
-    low_m, edge_m : (P, 2) and (P,) float64 arrays
-        Corner and edge of the bins of a plane, in these coordinates [m].
-    columns, first_bin : (P,) and (P + 1,) int64 arrays
-        Number of bins in a row, and the first bin, of each plane.
-    start, face : (B + 1,) int64 and (K,) int32 arrays
-        Faces that reach into each bin, one bin after the other.
-    corner_m : (F, 3, 2) float64 array
-        Corners of the faces in the coordinates of their planes [m].
+    `axes` (P, 2) are the two coordinates in which the faces of a plane are told apart, in which `low_m` (P, 2) is the
+    corner of its bins and `edge_m` (P,) their size; `columns` (P,) is their number in a row, and `first_bin` (P + 1,)
+    the first bin. `start` (B + 1,) and `face` are the faces that reach into each bin, one bin after the other, and
+    `corner_m` (F, 3, 2) the corners of the faces in the coordinates of their planes.
     """
 
-    plane: NDArray[np.int32]
-    normal: NDArray[np.float64]
-    offset_m: NDArray[np.float64]
-    centre_m: NDArray[np.float64]
-    radius_m: NDArray[np.float64]
     axes: NDArray[np.int64]
     low_m: NDArray[np.float64]
     edge_m: NDArray[np.float64]
@@ -62,16 +41,23 @@ class MeshPlanes(NamedTuple):
     corner_m: NDArray[np.float64]
 
 
-def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> MeshPlanes:
-    """Find the planes of a mesh and sort the faces of each.
+class MeshPlanes(NamedTuple):
+    """F faces of a mesh, grouped by P planes.
 
-    Parameters
-    ----------
-    vertices_m : (V, 3) array
-        Vertices [m].
-    triangles : (F, 3) array
-        Faces, as indices into `vertices_m`. Which way they face does not matter.
+    `plane` (F,) is that of every face; one without area has a plane of its own. A point lies in a plane where
+    ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold the faces of each plane.
     """
+
+    plane: NDArray[np.int32]
+    normal: NDArray[np.float64]
+    offset_m: NDArray[np.float64]
+    centre_m: NDArray[np.float64]
+    radius_m: NDArray[np.float64]
+    bins: FaceBins
+
+
+def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> MeshPlanes:
+    """Find the planes of a mesh of vertices (V, 3) [m] and triangles (F, 3), and sort the faces of each."""
     corner_m = np.ascontiguousarray(vertices_m[triangles], dtype=np.float64)
     across = np.cross(corner_m[:, 1] - corner_m[:, 0], corner_m[:, 2] - corner_m[:, 0])
     area = np.linalg.norm(across, axis=1)
@@ -92,21 +78,9 @@ def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) 
     first_bin = np.concatenate([[0], np.cumsum(columns * rows)])
     flat_m = np.take_along_axis(corner_m, axes[plane][:, None], 2)
     start, face = _fill_bins(plane, flat_m, low_m, edge_m, columns, first_bin)
-    return MeshPlanes(
-        plane=plane,
-        normal=normal,
-        offset_m=offset_m,
-        centre_m=0.5 * (low + high),
-        radius_m=0.5 * np.linalg.norm(high - low, axis=1),
-        axes=axes,
-        low_m=low_m,
-        edge_m=edge_m,
-        columns=columns,
-        first_bin=first_bin,
-        start=start,
-        face=face,
-        corner_m=flat_m,
-    )
+    bins = FaceBins(axes, low_m, edge_m, columns, first_bin, start, face, flat_m)
+    radius_m = 0.5 * np.linalg.norm(high - low, axis=1)
+    return MeshPlanes(plane, normal, offset_m, 0.5 * (low + high), radius_m, bins)
 
 
 @njit(cache=True)
@@ -132,9 +106,9 @@ def _plane_ids(order, normal, offset, corner):  # type: ignore[no-untyped-def]
     mask, cell = np.uint64(size - 1), np.empty((4, 2), np.int64)
     for f in order:
         for k in range(4):
-            place = abs(normal[f, k]) / 0.02 if k < 3 else abs(offset[f]) / 0.1
-            cell[k, 0] = np.int64(np.floor(place))
-            cell[k, 1] = cell[k, 0] + (1 if place - np.floor(place) > 0.5 else -1)
+            at = abs(normal[f, k]) / 0.02 if k < 3 else abs(offset[f]) / 0.1
+            cell[k, 0] = np.int64(np.floor(at))
+            cell[k, 1] = cell[k, 0] + (1 if at - np.floor(at) > 0.5 else -1)
         found = -1
         for m in range(16):
             key = mix(mix(cell[0, m & 1], cell[1, (m >> 1) & 1]), mix(cell[2, (m >> 2) & 1], cell[3, m >> 3])) & mask
@@ -178,7 +152,7 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
         if stored:
             total = np.cumsum(start)
             start[1:], start[0] = total[:-1], 0
-            items, place = np.empty(total[-1], np.int32), start.copy()
+            items, following = np.empty(total[-1], np.int32), start.copy()
         for f in range(len(plane)):
             p, margin = plane[f], 2.0 * _FACE_TOLERANCE_M
             flat = corner[f] - low[p]
@@ -190,8 +164,8 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
                 for column in range(max(0, begin), min(columns[p] - 1, end) + 1):
                     b = first_bin[p] + row * columns[p] + column
                     if stored:
-                        items[place[b]] = f
-                        place[b] += 1
+                        items[following[b]] = f
+                        following[b] += 1
                     else:
                         start[b] += 1
     return start, items
@@ -199,7 +173,7 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
 
 @njit(cache=True)
 def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
-    """Face of plane p at a point of it, or -1; `bins` are the last fields of `MeshPlanes`."""
+    """Face of plane p at a point of it, or -1."""
     axes, low, edge, columns, first_bin, start, face, corner = bins
     u, v = axes[p, 0], axes[p, 1]
     x, y = (x if u == 0 else y if u == 1 else z), (x if v == 0 else y if v == 1 else z)

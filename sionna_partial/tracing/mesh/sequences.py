@@ -1,7 +1,7 @@
-"""Every chain of planes that rays have met, and what the rays say of where its paths can go."""
+"""Rays from a transmitter, and the sequences of planes that they meet."""
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -9,29 +9,101 @@ from numpy.typing import NDArray
 
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.mesh.planes import MeshPlanes, mix
-from sionna_partial.tracing.mesh.rays import Rays
 
 MARGIN = 8.0
-"""Distance in direction from a chain's rays up to which its receivers are looked for, in spacings of the rays."""
+"""Distance in direction from a sequence's rays up to which its receivers are looked for, in spacings of the rays."""
+
+_RAYS_PER_CHUNK = 250_000
 
 
-class Chains(NamedTuple):
-    """Every chain of planes that rays met, as a tree; the first `size` rows of the arrays are used.
+class Rays(NamedTuple):
+    """R rays that were reflected like light, up to D times.
 
-    Parameters
-    ----------
-    parent, plane : (M,) int32 arrays
-        The chain without its last plane (-1 for none), and that plane.
-    low, high : (M, 3) float32 arrays
-        Boxes that hold the unit directions in which rays left the last plane.
-    reach_m : (M,) float32 array
-        Unfolded length of the longest of these rays, to where it met the next face [m].
-    table : (T,) int32 array
-        Hash table of the chains; -1 where it is empty.
-    size : int
-        Number of chains.
-    rays : int
-        Number of rays.
+    `face` (R, D) are the faces that each met, counted through the shapes, -1 once it has escaped; `leg_m` (R, D + 1)
+    the lengths between them, inf where nothing was met; `direction` (R, D + 1, 3) the unit directions of the legs.
+    """
+
+    face: NDArray[np.int32]
+    leg_m: NDArray[np.float32]
+    direction: NDArray[np.float32]
+
+
+def shoot_rays(
+    mi_scene: Any, shapes: Sequence[Any], tx_m: NDArray[np.float64], count: int, max_depth: int
+) -> Iterator[Rays]:
+    """Shoot `count` rays from a transmitter (3,) in all directions, and reflect each up to `max_depth` times.
+
+    Directions form the Fibonacci lattice that Sionna RT's own rays form. `shapes` are all shapes of the scene, in the
+    order in which their faces are counted. Rays come part by part, always in the same order.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    first_face = _first_faces(shapes)
+    origin = mi.Point3f(*(float(value) for value in tx_m))
+    dr.make_opaque(origin)  # one compiled kernel serves every transmitter
+    pending: Any = None
+    for start in range(0, count, _RAYS_PER_CHUNK):
+        direction = _directions(np.arange(start, min(start + _RAYS_PER_CHUNK, count)), count)
+        launched = _launch(mi_scene, first_face, mi.Ray3f(origin, mi.Vector3f(direction.T)), max_depth)
+        if pending is not None:
+            yield _collect(pending, max_depth)
+        pending = launched  # Dr.Jit traces this part while the caller works on the one before
+    if pending is not None:
+        yield _collect(pending, max_depth)
+
+
+def _first_faces(shapes: Sequence[Any]) -> Any:
+    """Tabulate the first face of each shape by the shape's number in Dr.Jit's registry."""
+    import drjit as dr
+    import mitsuba as mi
+
+    pointers: Any = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)) for shape in shapes]
+    numbers = [int(pointer.numpy()[0]) for pointer in pointers]
+    table = np.zeros(max(numbers, default=0) + 1, np.uint32)
+    table[numbers] = np.cumsum([0, *(shape.face_count() for shape in shapes)])[:-1]
+    return mi.UInt32(table)
+
+
+def _directions(number: NDArray[np.int64], count: int) -> NDArray[np.float32]:
+    """Return the unit vectors with the given numbers in the lattice of `count` directions."""
+    turn = 2.0 * np.pi * np.modf(number / ((1.0 + np.sqrt(5.0)) / 2.0))[0]
+    z = 1.0 - 2.0 * number / max(1, count - 1)
+    across = np.sqrt(np.maximum(0.0, 1.0 - z * z))
+    return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1).astype(np.float32)
+
+
+def _launch(mi_scene: Any, first_face: Any, rays: Any, max_depth: int) -> list[tuple[Any, Any, Any]]:
+    """Start tracing: face, length and direction of each leg, which Dr.Jit computes in the background."""
+    import drjit as dr
+    import mitsuba as mi
+
+    legs, active = [], mi.Bool(True)
+    for _ in range(max_depth + 1):
+        # coherent rays decide in packets what is hit, and lose hits
+        met = mi_scene.ray_intersect(rays, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
+        active &= met.is_valid()
+        shape: Any = dr.reinterpret_array(mi.UInt32, met.shape)
+        face = mi.Int32(dr.gather(mi.UInt32, first_face, shape, active) + met.prim_index)
+        legs.append((dr.select(active, face, -1), dr.select(active, met.t, dr.inf), rays.d))
+        rays = met.spawn_ray(rays.d - 2.0 * dr.dot(rays.d, met.n) * met.n)
+        dr.eval(legs[-1], rays, active)
+    return legs
+
+
+def _collect(legs: list[tuple[Any, Any, Any]], max_depth: int) -> Rays:
+    """Copy traced rays out of Dr.Jit."""
+    face = np.stack([leg[0].numpy() for leg in legs], axis=1)[:, :max_depth]
+    leg_m = np.stack([leg[1].numpy() for leg in legs], axis=1)
+    return Rays(face, leg_m, np.stack([leg[2].numpy().T for leg in legs], axis=1))
+
+
+class Sequences(NamedTuple):
+    """Every sequence of planes that rays met, as a tree; the first `size` rows of the arrays are used.
+
+    `parent` (M,) is the sequence without its last plane (-1 for none), `plane` (M,) that plane. Boxes `low`, `high`
+    (M, 3) hold the unit directions in which rays left it, and `reach_m` (M,) is the unfolded length of the longest of
+    these rays, to where it met the next face. `table` is a hash table of the sequences, -1 where it is empty.
     """
 
     parent: NDArray[np.int32]
@@ -45,18 +117,10 @@ class Chains(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Where receivers of each chain are looked for.
+    """Where receivers of each of M sequences are looked for.
 
-    Parameters
-    ----------
-    order : (M,) int32 array
-        The chains, each after its parent and with all that begin like it behind it.
-    depth : (M,) int32 array
-        Number of planes.
-    source_m : (M, 3) float64 array
-        Images of the transmitter [m].
-    margin : (M,) float64 array
-        Width by which the box of directions is enlarged.
+    `order` has each sequence after its parent, with all that begin like it behind it; `depth` is the number of planes,
+    `source_m` (M, 3) the image of the transmitter, and `margin` the width by which the box of directions is enlarged.
     """
 
     order: NDArray[np.int32]
@@ -65,9 +129,9 @@ class Views(NamedTuple):
     margin: NDArray[np.float64]
 
 
-def collect_chains(rays: Iterable[Rays], planes: MeshPlanes) -> Chains:
-    """Make the tree of all chains of planes that rays have met."""
-    chains = Chains(
+def collect_sequences(rays: Iterable[Rays], planes: MeshPlanes) -> Sequences:
+    """Make the tree of all sequences of planes that rays have met."""
+    sequences = Sequences(
         parent=np.empty(1024, np.int32),
         plane=np.empty(1024, np.int32),
         low=np.empty((1024, 3), np.float32),
@@ -78,14 +142,14 @@ def collect_chains(rays: Iterable[Rays], planes: MeshPlanes) -> Chains:
         rays=0,
     )
     for part in rays:
-        chains = _add_rays(chains, part.face, part.leg_m, part.direction, planes.plane)
-    return chains
+        sequences = _add_rays(sequences, part.face, part.leg_m, part.direction, planes.plane)
+    return sequences
 
 
 @njit(cache=True)
-def _add_rays(chains, face, leg, direction, plane_of):  # type: ignore[no-untyped-def]
-    """Add the chains of some rays to the tree."""
-    parent, plane, low, high, reach, table, count, rays = chains
+def _add_rays(sequences, face, leg, direction, plane_of):  # type: ignore[no-untyped-def]
+    """Add the sequences of some rays to the tree."""
+    parent, plane, low, high, reach, table, count, rays = sequences
     for i in range(face.shape[0]):
         room = count + face.shape[1]
         if room > len(parent):
@@ -98,29 +162,29 @@ def _add_rays(chains, face, leg, direction, plane_of):  # type: ignore[no-untype
             if face[i, k] < 0:
                 break
             length += leg[i, k + 1]
-            place = _find(table, parent, plane, above, plane_of[face[i, k]])
-            node = table[place]
+            slot = _find(table, parent, plane, above, plane_of[face[i, k]])
+            node = table[slot]
             if node < 0:
                 parent[count], plane[count], reach[count] = above, plane_of[face[i, k]], length
                 low[count], high[count] = direction[i, k + 1], direction[i, k + 1]
-                table[place] = node = count
+                table[slot] = node = count
                 count += 1
             reach[node] = max(reach[node], length)
             for axis in range(3):
                 low[node, axis] = min(low[node, axis], direction[i, k + 1, axis])
                 high[node, axis] = max(high[node, axis], direction[i, k + 1, axis])
             above = node
-    return Chains(parent, plane, low, high, reach, table, count, rays + len(face))
+    return Sequences(parent, plane, low, high, reach, table, count, rays + len(face))
 
 
 @njit(cache=True)
 def _find(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
-    """Place in the hash table of the chain that adds the plane `last` to the chain `node`, or where it belongs."""
+    """Slot in the hash table of the sequence that adds the plane `last` to the sequence `node`, or where it belongs."""
     mask = np.uint64(len(table) - 1)
-    place = mix(node + 1, last) & mask
-    while table[place] >= 0 and (parent[table[place]] != node or plane[table[place]] != last):
-        place = (place + np.uint64(1)) & mask
-    return place
+    slot = mix(node + 1, last) & mask
+    while table[slot] >= 0 and (parent[table[slot]] != node or plane[table[slot]] != last):
+        slot = (slot + np.uint64(1)) & mask
+    return slot
 
 
 @njit(cache=True)
@@ -132,16 +196,16 @@ def _rehash(parent, plane, count, size):  # type: ignore[no-untyped-def]
     return table
 
 
-def view_chains(chains: Chains, planes: MeshPlanes, tx_m: NDArray[np.float64]) -> Views:
-    """Find the image, the margin and the place in the order of every chain."""
-    parent, plane = chains.parent[: chains.size], chains.plane[: chains.size]
-    margin = MARGIN * np.sqrt(4.0 * np.pi / max(1, chains.rays))
+def view_sequences(sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.float64]) -> Views:
+    """Find the image, the margin and the order of all sequences."""
+    parent, plane = sequences.parent[: sequences.size], sequences.plane[: sequences.size]
+    margin = MARGIN * np.sqrt(4.0 * np.pi / max(1, sequences.rays))
     return Views(_depth_first(parent), *_images(parent, plane, planes, tx_m, margin))
 
 
 @njit(cache=True)
 def _images(parent, plane, planes, tx, margin):  # type: ignore[no-untyped-def]
-    """Depth, image of the transmitter and margin of every chain: a small plane bounds the directions."""
+    """Depth, image of the transmitter and margin of every sequence: a small plane bounds the directions."""
     depth, source, margins = np.empty(len(parent), np.int32), np.empty((len(parent), 3)), np.empty(len(parent))
     for node in range(len(parent)):
         p, above = plane[node], parent[node]
@@ -163,7 +227,7 @@ def _images(parent, plane, planes, tx, margin):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _depth_first(parent):  # type: ignore[no-untyped-def]
-    """Order of the chains in which those that begin alike are together."""
+    """Order of the sequences in which those that begin alike are together."""
     child, beside = np.full(len(parent) + 1, -1, np.int32), np.empty(len(parent), np.int32)
     for node in range(len(parent) - 1, -1, -1):
         beside[node], child[parent[node] + 1] = child[parent[node] + 1], node

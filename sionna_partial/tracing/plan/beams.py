@@ -1,9 +1,8 @@
-"""Which chains of walls can join two points of an extruded floor plan, by exact beam tracing in the plan.
+"""Which sequences of walls can join two points of an extruded floor plan, by exact beam tracing in the plan.
 
-A wall of full height reflects a path in the plan just as a line does, so which chains of walls can join a transmitter
-to a receiver is a question in two dimensions. From the image of the transmitter, the visible walls split the view
-into beams; each beam reflects about its wall, and the receivers inside a beam are the only ones that its chain of
-walls can reach.
+A wall of full height reflects a path in the plan just as a line does, so which walls can join a transmitter to a
+receiver is a question in two dimensions. From the image of the transmitter, the visible walls split the view into
+beams; each beam reflects about its wall, and the receivers inside a beam are the only ones that its walls can reach.
 
 Coordinates inside a beam: with the image source S and the window from A to B, a point is S + r ((1 - t)(A - S) +
 t (B - S)). The window is r = 1, t runs over the beam from 0 to 1, and on any line 1 / r is linear in t, so the nearest
@@ -35,19 +34,12 @@ _ROOT_ANGLE_RAD = 0.1234567
 
 
 class Beams(NamedTuple):
-    """All (chain of walls, receiver) pairs that a specular path can join.
+    """All (sequence of walls, receiver) pairs that a specular path can join.
 
-    Nodes form trees: a node is one beam, its chain the walls from the root down to it. Nodes 4 k to 4 k + 3 are the
-    roots of source k, one for each quadrant of its view.
-
-    Parameters
-    ----------
-    parent, segment : (M,) int32 arrays
-        Parent node (-1 at the roots) and the wall segment that reflected the beam.
-    source : (M, 2) float64 array
-        Image of the transmitter [m].
-    pair_node, pair_rx : (K,) int32 arrays
-        The pairs, ordered by chain and then by receiver, each chain of wall lines once for a receiver.
+    M nodes form trees: a node is one beam, its walls those from the root down to it. Nodes 4 k to 4 k + 3 are the roots
+    of source k, one for each quadrant of its view. `parent` is -1 at the roots; `segment` (M,) is the wall that
+    reflected the beam, `source` (M, 2) the image of the transmitter [m]. The K pairs are ordered by sequence and then
+    by receiver, each sequence of wall lines once for a receiver.
     """
 
     parent: NDArray[np.int32]
@@ -58,18 +50,7 @@ class Beams(NamedTuple):
 
 
 def trace_beams(plan: Plan, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], max_depth: int) -> Beams:
-    """Find every chain of at most `max_depth` walls and the receivers it can reach, seen from above.
-
-    Parameters
-    ----------
-    plan : Plan
-    tx_m : (2,) array
-        Transmitter [m].
-    rx_m : (N, 2) array
-        Receivers [m].
-    max_depth : int
-        Largest number of wall reflections.
-    """
+    """Find every sequence of at most `max_depth` walls from a transmitter (2,), and receivers (N, 2) it can reach."""
     return trace_beams_in(plan, bin_points(rx_m), tx_m[None], np.array([max_depth]))
 
 
@@ -80,24 +61,24 @@ def trace_beams_in(
     beam, node, pair = _trace_beams(plan, _root_beams(sources_m), max_depth, receivers)
     parent, piece, depth = node[:, :3].T.copy()
     pair_node, pair_rx = pair.T.copy()
-    chain = _chain_ids(parent, np.append(plan.line, -1)[piece], depth)
+    sequence = _sequence_ids(parent, np.append(plan.line, -1)[piece], depth)
     pair_rx = receivers.order[pair_rx].astype(np.int32)
-    _, first = np.unique(chain[pair_node] * max(1, len(receivers.order)) + pair_rx, return_index=True)
+    _, first = np.unique(sequence[pair_node] * max(1, len(receivers.order)) + pair_rx, return_index=True)
     segment = np.append(plan.owner, -1)[piece].astype(np.int32)
     return Beams(parent, segment, beam[:, :2].copy(), pair_node[first], pair_rx[first])
 
 
-def _chain_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Give chains of wall lines numbers, so that beams split by a gap in one line share a number."""
-    chain = np.arange(len(parent)) // 4
+def _sequence_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Give sequences of wall lines numbers (M,), so that beams split by a gap in one line share a number."""
+    sequence = np.arange(len(parent)) // 4
     lines = int(line.max(initial=0)) + 1
     used = int((depth == 0).sum()) // 4
     for level in range(1, int(depth.max(initial=0)) + 1):
         nodes = np.flatnonzero(depth == level)
-        _, number = np.unique(chain[parent[nodes]] * lines + line[nodes], return_inverse=True)
-        chain[nodes] = used + number
+        _, number = np.unique(sequence[parent[nodes]] * lines + line[nodes], return_inverse=True)
+        sequence[nodes] = used + number
         used += int(number.max(initial=-1)) + 1
-    return chain
+    return sequence
 
 
 def _root_beams(sources: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -107,7 +88,7 @@ def _root_beams(sources: NDArray[np.float64]) -> NDArray[np.float64]:
     return (np.tile(sources, 3)[:, None] + np.array(window)).reshape(-1, 6)
 
 
-class _Room(NamedTuple):
+class _Scratch(NamedTuple):
     """Arrays that one beam after the other is worked out in; `visit` ends with the number of the present beam."""
 
     found: NDArray[np.float64]
@@ -132,7 +113,7 @@ def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
         node[root, 0], node[root, 1], node[root, 2], node[root, 3] = -1, -1, 0, left[root // 4]
     pair = np.empty((4096, 2), np.int32)
     size = len(walls)
-    room = _Room(
+    scratch = _Scratch(
         np.empty((size, 4)),
         np.empty(size, np.int32),
         np.empty(size, np.int32),
@@ -145,13 +126,13 @@ def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
     k = pairs = np.int64(0)  # numba would compile a function that is called with the literal 0 twice
     while k < count:
         own = node[k, 1]
-        for i in range(_visible_pieces(plan, beam[k], own, room)):
-            pair, pairs = _add_points(beam[k], own >= 0, room.piece[i], receivers, k, pair, pairs)
-            wall = room.piece_wall[i]
+        for i in range(_visible_pieces(plan, beam[k], own, scratch)):
+            pair, pairs = _add_points(beam[k], own >= 0, scratch.piece[i], receivers, k, pair, pairs)
+            wall = scratch.piece_wall[i]
             if wall < 0 or node[k, 3] == 0:
                 continue
             beam, node = grow(beam, count + 1), grow(node, count + 1)
-            if _reflect(beam[k], room.piece[i], walls[wall], beam[count]):
+            if _reflect(beam[k], scratch.piece[i], walls[wall], beam[count]):
                 node[count, 0], node[count, 1] = k, wall
                 node[count, 2], node[count, 3] = node[k, 2] + 1, node[k, 3] - 1
                 count += 1
@@ -193,13 +174,13 @@ def _clip(beam, wall, reflected):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _visible_pieces(plan, beam, own, room):  # type: ignore[no-untyped-def]
+def _visible_pieces(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
     """Split a beam by the nearest wall: pieces (t0, w0, t1, w1), w = 0 where nothing is hit, and their walls.
 
-    They are written to `room`; returns their number.
+    They are written to `scratch`; returns their number.
     """
-    count = _walls_in(plan, beam, own, room)
-    line, found, index, edge = plan.line, room.found, room.wall, room.edge
+    count = _walls_in(plan, beam, own, scratch)
+    line, found, index, edge = plan.line, scratch.found, scratch.wall, scratch.edge
     edge[0], edge[1] = 0.0, 1.0
     for i in range(count):
         edge[2 * i + 2], edge[2 * i + 3] = min(max(found[i, 0], 0.0), 1.0), min(max(found[i, 2], 0.0), 1.0)
@@ -210,28 +191,30 @@ def _visible_pieces(plan, beam, own, room):  # type: ignore[no-untyped-def]
         if t1 - t0 < 1e-12:
             continue
         middle = 0.5 * (t0 + t1)
-        while begun < count and found[room.order[begun], 0] <= middle:
-            room.active[active] = room.order[begun]
+        while begun < count and found[scratch.order[begun], 0] <= middle:
+            scratch.active[active] = scratch.order[begun]
             begun, active = begun + 1, active + 1
-        active = _without_ended(found, room.active, active, middle)
-        best, w0, w1 = _nearest(found, room.active[:active], t0, t1)
+        active = _without_ended(found, scratch.active, active, middle)
+        best, w0, w1 = _nearest(found, scratch.active[:active], t0, t1)
         wall = index[best] if best >= 0 else -1
         same = pieces > 0 and (
-            room.piece_wall[pieces - 1] == wall
-            or (wall >= 0 and room.piece_wall[pieces - 1] >= 0 and line[room.piece_wall[pieces - 1]] == line[wall])
+            scratch.piece_wall[pieces - 1] == wall
+            or (
+                wall >= 0 and scratch.piece_wall[pieces - 1] >= 0 and line[scratch.piece_wall[pieces - 1]] == line[wall]
+            )
         )
         if same:
-            room.piece[pieces - 1, 2], room.piece[pieces - 1, 3] = t1, w1
+            scratch.piece[pieces - 1, 2], scratch.piece[pieces - 1, 3] = t1, w1
         else:
-            room.piece[pieces, 0], room.piece[pieces, 1] = t0, w0
-            room.piece[pieces, 2], room.piece[pieces, 3] = t1, w1
-            room.piece_wall[pieces] = wall
+            scratch.piece[pieces, 0], scratch.piece[pieces, 1] = t0, w0
+            scratch.piece[pieces, 2], scratch.piece[pieces, 3] = t1, w1
+            scratch.piece_wall[pieces] = wall
             pieces += 1
     return pieces
 
 
 @njit(cache=True)
-def _walls_in(plan, beam, own, room):  # type: ignore[no-untyped-def]
+def _walls_in(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
     """Clip the walls in a beam, from its window outwards, until nothing beyond them can be seen; their number.
 
     Cells of the index are visited in strips across the beam. What has not been visited lies beyond all strips, so that
@@ -244,15 +227,15 @@ def _walls_in(plan, beam, own, room):  # type: ignore[no-untyped-def]
     length, width = 0.5 * (np.hypot(ax, ay) + np.hypot(bx, by)), np.hypot(ax - bx, ay - by)
     corner = np.empty((4, 2))
     near, count = 1.0 if own >= 0 else 0.0, 0
-    room.visit[-1] += 1
+    scratch.visit[-1] += 1
     while True:
         far = near + max(_STRIP_CELLS * edge, near * width) / length
         for k, (r, dx, dy) in enumerate(((near, ax, ay), (near, bx, by), (far, bx, by), (far, ax, ay))):
             corner[k, 0], corner[k, 1] = sx + r * dx, sy + r * dy
         if _leaves(corner, x0 - edge, x1 + edge, 0, ax, bx) or _leaves(corner, y0 - edge, y1 + edge, 1, ay, by):
             return count
-        count = _clip_cells(plan, beam, own, corner, count, room)
-        if _is_filled(room, count, far):
+        count = _clip_cells(plan, beam, own, corner, count, scratch)
+        if _is_filled(scratch, count, far):
             return count
         near = far
 
@@ -266,52 +249,64 @@ def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def _clip_cells(plan, beam, own, corner, count, room):  # type: ignore[no-untyped-def]
+def _clip_cells(plan, beam, own, corner, count, scratch):  # type: ignore[no-untyped-def]
     """Clip the walls in the cells of a strip which were not clipped before, and give their number with the others."""
-    x0, y0, edge, columns, rows = plan.cells.grid
-    columns, rows, visit = int(columns), int(rows), room.visit[-1]
-    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
-    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
-    first, last = max(0, int(np.floor((low - y0) / edge))), min(rows - 1, int(np.floor((high - y0) / edge)))
-    for row in range(first, last + 1):
-        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
-        if left > right:
-            continue
-        start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
-        stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
-        if start > stop:
-            continue
-        for entry in range(plan.cells.start[row * columns + start], plan.cells.start[row * columns + stop + 1]):
+    visit = scratch.visit[-1]
+    first, last = _rows(corner, plan.cells)
+    for row in range(first, last):
+        begin, end = _entries(corner, plan.cells, row)
+        for entry in range(begin, end):
             wall = plan.cells.piece[entry]
-            if room.visit[wall] == visit:
+            if scratch.visit[wall] == visit:
                 continue
-            room.visit[wall] = visit
+            scratch.visit[wall] = visit
             if own >= 0 and plan.line[wall] == plan.line[own]:
                 continue
             t0, w0, t1, w1 = _clip(beam, plan.pieces_m[wall], own >= 0)
             if t1 - t0 > 1e-12:
-                room.found[count, 0], room.found[count, 1] = t0, w0
-                room.found[count, 2], room.found[count, 3] = t1, w1
-                room.wall[count] = wall
+                scratch.found[count, 0], scratch.found[count, 1] = t0, w0
+                scratch.found[count, 2], scratch.found[count, 3] = t1, w1
+                scratch.wall[count] = wall
                 k = count
-                while k > 0 and room.found[room.order[k - 1], 0] > t0:
-                    room.order[k] = room.order[k - 1]
+                while k > 0 and scratch.found[scratch.order[k - 1], 0] > t0:
+                    scratch.order[k] = scratch.order[k - 1]
                     k -= 1
-                room.order[k] = count
+                scratch.order[k] = count
                 count += 1
     return count
 
 
 @njit(cache=True)
-def _is_filled(room, count, far):  # type: ignore[no-untyped-def]
+def _rows(corner, bins):  # type: ignore[no-untyped-def]
+    """First row of square bins that a quadrilateral reaches, and the one after the last."""
+    y0, edge, rows = bins.grid[1], bins.grid[2], (len(bins.start) - 1) // int(bins.grid[3])
+    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
+    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
+    return max(0, int(np.floor((low - y0) / edge))), min(rows, int(np.floor((high - y0) / edge)) + 1)
+
+
+@njit(cache=True)
+def _entries(corner, bins, row):  # type: ignore[no-untyped-def]
+    """First entry of the bins of a row that a convex quadrilateral reaches, and the one after the last."""
+    x0, y0, edge, columns = bins.grid[0], bins.grid[1], bins.grid[2], int(bins.grid[3])
+    left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
+    if left > right:
+        return 0, 0
+    start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
+    stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
+    return (bins.start[row * columns + start], bins.start[row * columns + stop + 1]) if start <= stop else (0, 0)
+
+
+@njit(cache=True)
+def _is_filled(scratch, count, far):  # type: ignore[no-untyped-def]
     """Whether walls no farther than `far` fill the whole view."""
     reach = 1e-12
     for k in range(count):
-        i = room.order[k]
-        if room.found[i, 0] > reach:
+        i = scratch.order[k]
+        if scratch.found[i, 0] > reach:
             return False
-        if min(room.found[i, 1], room.found[i, 3]) * far >= 1.0:
-            reach = max(reach, room.found[i, 2] + 1e-12)
+        if min(scratch.found[i, 1], scratch.found[i, 3]) * far >= 1.0:
+            reach = max(reach, scratch.found[i, 2] + 1e-12)
             if reach >= 1.0:
                 return True
     return False
@@ -334,11 +329,11 @@ def _sort(values, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _without_ended(found, active, count, place):  # type: ignore[no-untyped-def]
-    """Leave out the clipped walls that end before a place; the number of the others."""
+def _without_ended(found, active, count, t):  # type: ignore[no-untyped-def]
+    """Leave out the clipped walls that end before t; the number of the others."""
     kept = 0
     for k in range(count):
-        if found[active[k], 2] >= place:
+        if found[active[k], 2] >= t:
             active[kept] = active[k]
             kept += 1
     return kept
@@ -379,22 +374,12 @@ def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _add_points(beam, reflected, piece, receivers, node, pair, pairs):  # type: ignore[no-untyped-def]
     """Pair a node with the points between the window of its beam and one piece of its view."""
-    points, bins, grid = receivers.points_m, receivers.start, receivers.grid
-    x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
-    rows = (len(bins) - 1) // columns
-    corner = _corners(beam, reflected, piece)
+    points, corner = receivers.points_m, _corners(beam, reflected, piece)
     normal, offset = _inward_edges(corner)
-    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
-    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
-    first = max(0, int(np.floor((low - y0) / edge)))
-    last = min(rows - 1, int(np.floor((high - y0) / edge)))
-    for row in range(first, last + 1):
-        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
-        start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
-        stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
-        if start > stop:
-            continue
-        for i in range(bins[row * columns + start], bins[row * columns + stop + 1]):
+    first, last = _rows(corner, receivers)
+    for row in range(first, last):
+        begin, end = _entries(corner, receivers, row)
+        for i in range(begin, end):
             inside = True
             for k in range(4):
                 side = normal[k, 0] * points[i, 0] + normal[k, 1] * points[i, 1] - offset[k]

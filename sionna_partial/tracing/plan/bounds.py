@@ -21,23 +21,15 @@ any of the others."""
 
 _LEVEL_DB, _STRONGEST_DB = 1.5, -40.0
 _ANGLES, _MARGIN = 1024, 1.02
-_DIFFRACTED_SHARE = 0.5
+_DIFFRACTED_FRACTION = 0.5
 
 
 class Strengths(NamedTuple):
     """Upper bounds of interactions, and the levels of the candidates that are asked for.
 
-    Parameters
-    ----------
-    wavelength_m : float
-    reflection : (K,) float64 array
-        Largest |R|^2 where the cosine of the angle of incidence is k / K to (k + 1) / K.
-    first, last : (N,) int64 arrays
-        Candidates of each receiver are written whose level is at least `first` and below `last`.
-    power : (N, LEVELS) float64 array
-        To which the bounds of candidates are added, level by level.
-    reflected : (N,) float64 array
-        To which the bounds of those are added that are reflected at walls alone.
+    `reflection` (K,) is the largest |R|^2 where the cosine of the angle of incidence is k / K to (k + 1) / K.
+    Candidates of each receiver are written whose level is at least `first` (N,) and below `last` (N,). The bounds of
+    all candidates are added to `power` (N, LEVELS), those of paths that are reflected at walls alone to `reflected`.
     """
 
     wavelength_m: float
@@ -49,16 +41,7 @@ class Strengths(NamedTuple):
 
 
 def strengths_of(material: NDArray[np.float64], frequency_hz: float, receivers: int) -> Strengths:
-    """Prepare the bounds for one material and N receivers, of which all candidates are asked for.
-
-    Parameters
-    ----------
-    material : (3,) float64 array
-        Relative permittivity, conductivity [S/m] and thickness [m] of all surfaces.
-    frequency_hz : float
-        Carrier frequency [Hz].
-    receivers : int
-    """
+    """Prepare the bounds for one material, (3,) permittivity, conductivity and thickness, asking for all candidates."""
     cosine = np.linspace(0.0, 1.0, 8 * _ANGLES + 1)
     permittivity, conductivity_s_m, thickness_m = material.tolist()
     te, tm = reflection_coefficients(permittivity, conductivity_s_m, thickness_m, frequency_hz, cosine)
@@ -75,29 +58,14 @@ def strengths_of(material: NDArray[np.float64], frequency_hz: float, receivers: 
 
 
 def levels_needed(power: NDArray[np.float64], allowed: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return up to which level (N,) candidates are needed, if those beyond may add up to `allowed` (N,) at most.
-
-    Parameters
-    ----------
-    power : (N, LEVELS) float64 array
-        Sums of the bounds.
-    allowed : (N,) float64 array
-    """
+    """Return up to which level (N,) candidates are needed, if those beyond may add up to `allowed` (N,) at most."""
     beyond = np.cumsum(power[:, ::-1], axis=1)[:, ::-1]
     return 1 + np.sum(beyond[:, 1:] > allowed[:, None], axis=1)
 
 
 def expected_power(power: NDArray[np.float64], reflected: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Guess the power (N,) of the indirect paths from bounds: reflections reach theirs, diffractions fall short.
-
-    Parameters
-    ----------
-    power : (N, LEVELS) float64 array
-        Sums of the bounds of all candidates.
-    reflected : (N,) float64 array
-        Of those that are reflected at walls alone.
-    """
-    return reflected + _DIFFRACTED_SHARE * np.maximum(power[:, 1:].sum(axis=1) - reflected, 0.0)
+    """Guess the power (N,) of the indirect paths from sums of bounds: reflections reach theirs, diffractions do not."""
+    return reflected + _DIFFRACTED_FRACTION * np.maximum(power[:, 1:].sum(axis=1) - reflected, 0.0)
 
 
 def dropped_power(found: NDArray[np.float64], tolerance_db: float) -> NDArray[np.float64]:
@@ -105,8 +73,8 @@ def dropped_power(found: NDArray[np.float64], tolerance_db: float) -> NDArray[np
 
     It changes that power by `tolerance_db` at most; a link without any may lack what no receiver could notice.
     """
-    share = 10.0 ** (tolerance_db / 10.0) - 1.0
-    return np.maximum(share * found, 10.0 ** (GAIN_FLOOR_DB / 10.0) - found)
+    fraction = 10.0 ** (tolerance_db / 10.0) - 1.0
+    return np.maximum(fraction * found, 10.0 ** (GAIN_FLOOR_DB / 10.0) - found)
 
 
 @njit(cache=True)

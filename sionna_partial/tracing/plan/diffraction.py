@@ -1,7 +1,7 @@
-"""Exact candidates of paths that bend once around a vertical edge, with few reflections before and after.
+"""Candidates of floor plans that are diffracted once at a vertical edge, with few reflections before and after.
 
 An edge is a point in the plan. Beams from the transmitter reach edges, beams from an edge reach receivers, and a path
-joins one of each. On a vertical edge Keller's cone keeps the slope of a path, so heights unfold along the whole way in
+joins one of each. On a vertical edge Keller's cone keeps the slope of a path, so heights unfold along the whole path in
 the plan as they do without the edge.
 """
 
@@ -15,22 +15,21 @@ from numpy.typing import NDArray
 from sionna_partial.cores import in_order
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
 from sionna_partial.tracing.plan.bounds import LEVELS, Strengths, level_of, reflected_power, utd_terms
-from sionna_partial.tracing.plan.candidates import (
-    BEND,
+from sionna_partial.tracing.plan.specular import (
     CEILING,
+    DIFFRACTED,
     FLOOR,
-    Candidates,
     Room,
-    Wedges,
     can_bounce,
     clear,
-    climb,
     faces_of,
     incidence,
     merge_heights,
     unfold,
+    unfolded_height,
 )
 
 MAX_REFLECTIONS = 2
@@ -40,7 +39,7 @@ _EXTERIOR_M = 1e-5
 """Distance from the plane of a face [m] at which the path solver counts a point as outside a wedge."""
 
 _NEAR_M = 1e-3
-"""Shortest leg in the plan next to an edge [m]: walls that meet there do not mirror it."""
+"""Shortest leg in the plan next to an edge [m]: walls that meet there do not reflect it."""
 
 _FLAT_RAD = 1e-3
 """Walls that meet at less than this angle from a straight line form no edge [rad]."""
@@ -51,19 +50,19 @@ the candidates."""
 
 
 class _Arrivals(NamedTuple):
-    """Ways from the transmitter to edges, ordered by edge.
+    """J paths from the transmitter to edges, ordered by edge.
 
     `start` (E + 1,) gives the first of each edge, `reflections` (J,) their number, `length_m` (J,) the length in
-    the plan, `wall` (J, R) and `place` (J, R, 3) the reflections as `unfold` gives them, `cosine` (J, R) of the angles
-    of incidence there, `angle_rad` (J,) the direction of arrival, counted from the 0-face, and `lit` (J,) whether that
-    face is lit.
+    the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them, `cosine` (J, R) of the
+    angles of incidence there, `angle_rad` (J,) the direction of arrival, counted from the 0-face, and `lit` (J,)
+    whether that face is lit.
     """
 
     start: NDArray[np.int64]
     reflections: NDArray[np.int64]
     length_m: NDArray[np.float64]
-    wall: NDArray[np.int64]
-    place: NDArray[np.float64]
+    walls: NDArray[np.int64]
+    points: NDArray[np.float64]
     cosine: NDArray[np.float64]
     angle_rad: NDArray[np.float64]
     lit: NDArray[np.bool_]
@@ -72,21 +71,14 @@ class _Arrivals(NamedTuple):
 class _Edges(NamedTuple):
     """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4)."""
 
-    place: NDArray[np.float64]
+    position_m: NDArray[np.float64]
     face_rad: NDArray[np.float64]
     exterior_rad: NDArray[np.float64]
     normals: NDArray[np.float64]
 
 
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
-    """Find the vertical edges of the walls that diffract.
-
-    Parameters
-    ----------
-    geometry : SceneGeometry
-    open_ends : bool
-        Whether walls that end because observation did diffract there.
-    """
+    """Find the vertical edges of the walls that diffract, with or without those where observation ended."""
     vertex = geometry.segments.ravel()
     away = geometry.vertices_m[geometry.segments[:, ::-1].ravel()] - geometry.vertices_m[vertex]
     angle = np.arctan2(away[:, 1], away[:, 0])
@@ -111,20 +103,9 @@ def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
 
 
 class DiffractionCandidates:
-    """Every way from a transmitter to receivers over one vertical edge, with at most two reflections.
+    """All paths over one vertical edge, with at most two reflections, and `walls_a_side` of them at walls on each side.
 
     The beams from the edges are traced once, on all cores, when they are first asked for.
-
-    Parameters
-    ----------
-    geometry : SceneGeometry
-    wedges : Wedges
-    room : Room
-        Of `geometry`; transmitter and receivers are between floor (z = 0) and ceiling.
-    max_depth : int
-        Largest number of interactions of a path, the diffraction included.
-    walls_a_side : int
-        Largest number of walls that mirror a path before its diffraction, and after it.
     """
 
     def __init__(
@@ -139,19 +120,7 @@ class DiffractionCandidates:
             self._arrivals = _arrivals(geometry.plan, self._edges, room, self._walls_a_side)
 
     def blocks(self, strengths: Strengths) -> Iterator[tuple[Candidates, float]]:
-        """List candidates, some edges at a time.
-
-        Parameters
-        ----------
-        strengths : Strengths
-            Which candidates are asked for; the bounds of all are added to its `power`.
-
-        Yields
-        ------
-        Candidates
-        float
-            Fraction of all edges done with this block.
-        """
+        """Yield the candidates that are asked for, and the fraction of the work done; add up the bounds of all."""
         if self._reflections < 0 or not len(self._wedges.edge_m):
             return
         receivers, geometry = bin_points(self._room.rx_m[:, :2]), self._geometry
@@ -190,36 +159,36 @@ def _edges_of(wedges: Wedges) -> _Edges:
 
 
 def _arrivals(plan: Plan, edges: _Edges, room: Room, reflections: int) -> _Arrivals:
-    """Find the ways of at most `reflections` walls from the transmitter to each edge."""
-    beams = trace_beams_in(plan, bin_points(edges.place), room.tx_m[None, :2], np.array([reflections]))
+    """Find the paths of at most `reflections` walls from the transmitter to each edge."""
+    beams = trace_beams_in(plan, bin_points(edges.position_m), room.tx_m[None, :2], np.array([reflections]))
     order = np.argsort(beams.pair_rx, kind="stable")
     node, edge = beams.pair_node[order], beams.pair_rx[order]
     good, *columns = _unfold_all(beams, node, edge, edges, room, max(1, reflections))
-    start = np.searchsorted(edge[good], np.arange(len(edges.place) + 1))
+    start = np.searchsorted(edge[good], np.arange(len(edges.position_m) + 1))
     return _Arrivals(start, *(column[good] for column in columns))
 
 
 @njit(cache=True)
 def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no-untyped-def]
-    """Whether each way to an edge comes from outside its wedge, and not from the edge itself; then `_Arrivals`."""
+    """Whether each path to an edge comes from outside its wedge, and not from the edge itself; then `_Arrivals`."""
     good, count = np.empty(len(node), np.bool_), np.empty(len(node), np.int64)
-    length, wall = np.empty(len(node)), np.empty((len(node), reflections), np.int64)
-    place, cosine = np.empty((len(node), reflections, 3)), np.empty((len(node), reflections))
+    length, walls = np.empty(len(node)), np.empty((len(node), reflections), np.int64)
+    points, cosine = np.empty((len(node), reflections, 3)), np.empty((len(node), reflections))
     angle, lit = np.empty(len(node)), np.empty(len(node), np.bool_)
     for i in range(len(node)):
-        target = edges.place[edge[i]]
-        count[i], length[i], good[i] = unfold(beams, node[i], room.walls_m, target, wall[i], place[i])
+        target = edges.position_m[edge[i]]
+        count[i], length[i], good[i] = unfold(beams, node[i], room.walls_m, target, walls[i], points[i])
         if not good[i]:
             continue
         x, y = room.tx_m[0], room.tx_m[1]
         if count[i] > 0:
-            x, y = place[i, count[i] - 1, 0], place[i, count[i] - 1, 1]
-            incidence(room.walls_m, room.tx_m, target, wall[i, : count[i]], place[i], cosine[i])
+            x, y = points[i, count[i] - 1, 0], points[i, count[i] - 1, 1]
+            incidence(room.walls_m, room.tx_m, target, walls[i, : count[i]], points[i], cosine[i])
         x, y = x - target[0], y - target[1]
         lit[i], outside = _outside(edges.normals[edge[i]], x, y)
         good[i] = outside and np.hypot(x, y) > _NEAR_M
         angle[i] = _angle_rad(edges, edge[i], x, y)
-    return good, count, length, wall, place, cosine, angle, lit
+    return good, count, length, walls, points, cosine, angle, lit
 
 
 @njit(cache=True)
@@ -247,24 +216,24 @@ def _angle_rad(edges, edge, x, y):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):  # type: ignore[no-untyped-def]
     """Join arrivals at edges and departures from them: receivers, wedges, surfaces and vertices of candidates."""
-    size, walls = reflections + 1, room.walls_m
+    size = reflections + 1
     rx, wedge = np.empty(1024, np.int32), np.empty(1024, np.int32)
     surface, vertices, used = np.empty((1024, size), np.int32), np.empty((1024, size, 3)), np.int64(0)
-    chain, way, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
-    whole, place, terms, flat = np.empty(size, np.int64), np.empty((size, 3)), np.empty(4), np.empty(2)
+    walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
+    all_walls, all_points, terms, flat = np.empty(size, np.int64), np.empty((size, 3)), np.empty(4), np.empty(2)
     for i in range(len(beams.pair_node)):
         here = beams.pair_rx[i]
         if best[i] >= strengths.last[here]:
             continue
         best[i] = LEVELS
         edge = group[_root(beams.parent, beams.pair_node[i]) // 4]
-        target, origin = room.rx_m[here], edges.place[edge]
-        after, onward, good = unfold(beams, beams.pair_node[i], walls, target, chain, way)
-        ox, oy = (way[0, 0], way[0, 1]) if after > 0 else (target[0], target[1])
+        target, origin = room.rx_m[here], edges.position_m[edge]
+        after, onward, good = unfold(beams, beams.pair_node[i], room.walls_m, target, walls, points)
+        ox, oy = (points[0, 0], points[0, 1]) if after > 0 else (target[0], target[1])
         ox, oy = ox - origin[0], oy - origin[1]
         if not good or np.hypot(ox, oy) < _NEAR_M or not _outside(edges.normals[edge], ox, oy)[1]:
             continue
-        incidence(walls, origin, target, chain[:after], way, cosine)
+        incidence(room.walls_m, origin, target, walls[:after], points, cosine)
         departure = _angle_rad(edges, edge, ox, oy)
         for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
             before = arrivals.reflections[j]
@@ -277,9 +246,9 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
                 for first in (FLOOR, CEILING):
                     if not can_bounce(bounces, first, room):
                         continue
-                    climbed = climb(room, target, bounces, first)
-                    power = _diffracted_power(strengths, terms, flat, length, onward, climbed, bounces)
-                    sine = (length + onward) / np.hypot(length + onward, climbed)
+                    height = unfolded_height(room, target, bounces, first)
+                    power = _diffracted_power(strengths, terms, flat, length, onward, height, bounces)
+                    sine = (length + onward) / np.hypot(length + onward, height)
                     for k in range(before):
                         power *= reflected_power(strengths, arrivals.cosine[j, k] * sine)
                     for k in range(after):
@@ -292,20 +261,18 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
                         continue
                     rx, wedge = grow(rx, used + 1), grow(wedge, used + 1)
                     surface, vertices = grow(surface, used + 1), grow(vertices, used + 1)
-                    rx[used], wedge[used] = here, edge if arrivals.lit[j] else edge + len(edges.place)
+                    rx[used], wedge[used] = here, edge if arrivals.lit[j] else edge + len(edges.position_m)
                     clear(surface[used], vertices[used])
-                    _join(arrivals, j, origin, chain, way, after, onward, whole, place)
-                    count = before + 1 + after
-                    merge_heights(
-                        whole[:count], place[:count], room, target, bounces, first, surface[used], vertices[used]
-                    )
+                    count = _join(arrivals, j, origin, walls[:after], points, onward, all_walls, all_points)
+                    whole = all_walls[:count], all_points[:count]
+                    merge_heights(*whole, room, target, bounces, first, surface[used], vertices[used])
                     used += 1
     return rx[:used].copy(), wedge[:used].copy(), surface[:used].copy(), vertices[:used].copy()
 
 
 @njit(cache=True)
 def _diffract(strengths, exterior, arrivals, j, departure, onward, terms, flat):  # type: ignore[no-untyped-def]
-    """Write the UTD terms of a way over an edge, and the cosines of incidence at its two faces.
+    """Write the UTD terms of a path over an edge, and the cosines of incidence at its two faces.
 
     Angles count from the face that is lit.
     """
@@ -321,30 +288,32 @@ def _diffract(strengths, exterior, arrivals, j, departure, onward, terms, flat):
 
 
 @njit(cache=True)
-def _diffracted_power(strengths, terms, flat, length, onward, climbed, bounces):  # type: ignore[no-untyped-def]
+def _diffracted_power(strengths, terms, flat, length, onward, height, bounces):  # type: ignore[no-untyped-def]
     """Upper bound of the power over an edge, without the reflections at walls."""
-    way = np.hypot(length + onward, climbed)
-    sine = (length + onward) / way
+    total = np.hypot(length + onward, height)
+    sine = (length + onward) / total
     first = np.sqrt(reflected_power(strengths, flat[0] * sine))
     last = 1.0 if flat[1] > 1.0 else np.sqrt(reflected_power(strengths, flat[1] * sine))
     field = (first * (terms[0] + terms[3]) + last * (terms[1] + terms[2])) / sine
     wavelength = strengths.wavelength_m
-    spread = sine * sine / (length * onward * way)  # 1 / (s s' (s + s'))
+    spread = sine * sine / (length * onward * total)  # 1 / (s s' (s + s'))
     power = (wavelength / (4.0 * np.pi)) ** 2 * spread * field**2 * wavelength / (4.0 * np.pi**2)
-    return power * reflected_power(strengths, climbed / way) ** bounces if bounces > 0 else power
+    return power * reflected_power(strengths, height / total) ** bounces if bounces > 0 else power
 
 
 @njit(cache=True)
-def _join(arrivals, j, origin, chain, way, after, onward, whole, place):  # type: ignore[no-untyped-def]
-    """Write the chain of a whole way over an edge, and where it meets it, as `unfold` does."""
+def _join(arrivals, j, origin, walls, points, onward, all_walls, all_points):  # type: ignore[no-untyped-def]
+    """Write the walls and the edge that a whole path meets, and where, as `unfold` does; return their number."""
     before, length = arrivals.reflections[j], arrivals.length_m[j]
     total = length + onward
     for n in range(before):
-        whole[n] = arrivals.wall[j, n]
-        place[n, 0], place[n, 1] = arrivals.place[j, n, 0], arrivals.place[j, n, 1]
-        place[n, 2] = arrivals.place[j, n, 2] * length / total
-    whole[before], place[before, 0], place[before, 1], place[before, 2] = BEND, origin[0], origin[1], length / total
-    for n in range(after):
-        whole[before + 1 + n] = chain[n]
-        place[before + 1 + n, 0], place[before + 1 + n, 1] = way[n, 0], way[n, 1]
-        place[before + 1 + n, 2] = (length + onward * way[n, 2]) / total
+        all_walls[n] = arrivals.walls[j, n]
+        all_points[n, 0], all_points[n, 1] = arrivals.points[j, n, 0], arrivals.points[j, n, 1]
+        all_points[n, 2] = arrivals.points[j, n, 2] * length / total
+    all_walls[before] = DIFFRACTED
+    all_points[before, 0], all_points[before, 1], all_points[before, 2] = origin[0], origin[1], length / total
+    for n in range(len(walls)):
+        all_walls[before + 1 + n] = walls[n]
+        all_points[before + 1 + n, 0], all_points[before + 1 + n, 1] = points[n, 0], points[n, 1]
+        all_points[before + 1 + n, 2] = (length + onward * points[n, 2]) / total
+    return before + 1 + len(walls)

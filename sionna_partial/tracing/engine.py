@@ -1,0 +1,466 @@
+"""Everything that leans on Sionna RT's internals: candidates in, verified paths out.
+
+Sionna RT's `PathSolver` runs a candidate generator, `ImageMethod` and `FieldCalculator`. Here the latter two run on our
+candidates: `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go in as plain
+arrays: `Scene.targets()`, which compiles a kernel for each receiver, is left out.
+
+Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a verification with each kind.
+"""
+
+import functools
+import gc
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from copy import copy
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.errors import BackendError
+from sionna_partial.llvm import load_llvm
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges
+from sionna_partial.tracing.paths import SolvedPaths, join_paths
+
+MITSUBA_VARIANT = "llvm_ad_mono_polarized"
+"""Mitsuba variant of Sionna RT on a CPU."""
+
+TESTED_VERSION = "2.2"
+"""Release of Sionna RT whose internals this module leans on."""
+
+REMEDY = f"""run pip install "sionna-rt=={TESTED_VERSION}.*" to have the fast engine back."""
+
+_BUFFER_FIELDS = {
+    *("_vertices_x", "_vertices_y", "_vertices_z", "_shapes", "_primitives", "_interaction_types"),
+    *("_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"),
+}
+"""Private fields of Sionna RT's `PathsBuffer` that are filled here."""
+
+_log = logging.getLogger(__name__)
+
+
+def load_sionna() -> ModuleType:
+    """Import Sionna RT on the CPU, with a working LLVM; raise a BackendError that says what to do if that fails."""
+    load_llvm()
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        mi.set_variant(MITSUBA_VARIANT)
+    if mi.variant() != MITSUBA_VARIANT:
+        raise BackendError(
+            f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
+            "before the first trace, or import sionna_partial in a process of its own."
+        )
+    import sionna.rt
+
+    return sionna.rt
+
+
+@functools.cache
+def engine_fault() -> str:
+    """Return why this module cannot run on the installed Sionna RT, "" if it can; a fault is logged once."""
+    rt, version = load_sionna(), metadata.version("sionna-rt")
+    missing = _BUFFER_FIELDS - vars(rt.path_solvers.paths_buffer.PathsBuffer(1, 1, True)).keys()
+    if missing:
+        fault = f"sionna-rt {version} has no PathsBuffer.{min(missing)}, which the fast engine fills"
+    elif not version.startswith(f"{TESTED_VERSION}."):
+        fault = f"sionna-rt {version} is not of the release {TESTED_VERSION}, for which the fast engine was made"
+    else:
+        return ""
+    message = "%s. Its public path solver is used, which finds most paths and takes seconds for each receiver: %s"
+    _log.warning(message, fault, REMEDY)
+    return fault
+
+
+def open_scene(scene_xml: Path, frequency_hz: float) -> Any:
+    """Load a scene into Sionna RT, its shapes kept apart, with isotropic, vertically polarised antennas."""
+    rt = load_sionna()
+    scene = rt.load_scene(str(scene_xml), merge_shapes=False)
+    scene.frequency = frequency_hz
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
+    )
+    return scene
+
+
+class _IncoherentScene:
+    """A Mitsuba scene that traces every ray for itself.
+
+    `ImageMethod` tells Embree that its rays are coherent. Neighbours in a packet then decide whether a wall is hit: one
+    path in 600 was lost, and which ones depended on the other receivers.
+    """
+
+    def __init__(self, scene: Any) -> None:
+        self._scene = scene
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._scene, name)
+
+    def ray_intersect(self, ray: Any, **options: Any) -> Any:
+        return self._scene.ray_intersect(ray, **{**options, "coherent": False})
+
+
+class _Verification:
+    """Sionna RT's image method and field calculator, with loops of one kind."""
+
+    def __init__(self, loop_mode: str) -> None:
+        solvers = load_sionna().path_solvers
+        self._image_method = solvers.image_method.ImageMethod()
+        self._field_calculator = solvers.field_calculator.FieldCalculator()
+        self._image_method.loop_mode = self._field_calculator.loop_mode = loop_mode
+
+    def verify(self, scene: Any, buffer: Any, source: Any, targets: Any, diffraction: bool) -> Any:
+        """Verify the candidates in a buffer, and return it with their vertices."""
+        buffer = self._image_method(
+            scene=_IncoherentScene(scene.mi_scene),
+            paths=buffer,
+            src_positions=source,
+            tgt_positions=targets,
+            diffraction=diffraction,
+            diffraction_lit_region=True,
+        )
+        if diffraction:
+            _end_at_targets(buffer, targets)
+        return buffer
+
+    def evaluate(
+        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
+    ) -> Any:
+        """Return a buffer of verified candidates with their coefficients."""
+        import drjit as dr
+        import mitsuba as mi
+
+        still = dr.zeros(mi.Point3f, dr.width(source)), dr.zeros(mi.Point3f, dr.width(targets))
+        dr.make_opaque(*still)
+        patterns = scene.tx_array.antenna_pattern.patterns
+        return self._field_calculator(
+            wavelength=scene.wavelength,
+            paths=buffer,
+            samples_per_src=samples_per_tx,
+            diffraction=diffraction,
+            src_positions=source,
+            tgt_positions=targets,
+            src_orientations=still[0],
+            tgt_orientations=still[1],
+            src_antenna_patterns=patterns,
+            tgt_antenna_patterns=patterns,
+        )
+
+
+def _end_at_targets(buffer: Any, targets: Any) -> None:
+    """Put the receiver where a path has no more interactions.
+
+    There `ImageMethod` leaves images of the edge, and `FieldCalculator` 2.2 takes the first of them for a point of the
+    path after the edge: a path with fewer interactions than others in its buffer came out longer, and some dB weaker.
+    """
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.constants import InteractionType
+
+    kind = buffer.interaction_types
+    target = dr.gather(mi.Point3f, targets, dr.repeat(buffer.target_indices, kind.shape[1]))
+    for name, position in zip(("_vertices_x", "_vertices_y", "_vertices_z"), target, strict=True):
+        beyond = dr.select(kind.array == InteractionType.NONE, position, getattr(buffer, name).array)
+        setattr(buffer, name, type(getattr(buffer, name))(beyond, kind.shape))
+
+
+_ALIGNMENT_BYTES = 64
+"""Alignment of Dr.Jit's own arrays [bytes]."""
+
+
+def _to_device(kind: Any, values: NDArray[Any]) -> Any:
+    """Hand an array over to Dr.Jit, aligned as its own arrays are: for other mixtures it compiles kernels anew."""
+    count = values.size * values.itemsize
+    room = np.empty(count + _ALIGNMENT_BYTES, np.uint8)
+    skip = -room.ctypes.data % _ALIGNMENT_BYTES
+    aligned = room[skip : skip + count].view(values.dtype).reshape(values.shape)
+    aligned[...] = values
+    return kind(aligned)
+
+
+@dataclass(frozen=True)
+class Variables:
+    """What the power of paths depends on, as `mitsuba.Float`, to which derivatives lead back.
+
+    Parameters
+    ----------
+    shift_m : tuple of 3
+        Added to the x, y, z of the transmitters, each with 1 or T entries [m].
+    relative_permittivity, conductivity_s_m, thickness_m : tuples
+        Of each of `SceneSolver.materials`; [S/m] and [m]. What an ITU material gains with the frequency comes on top.
+        They are values, not additions, which would drown in the conductivity of a metal.
+    frequency_hz
+        Added to the carrier frequency [Hz].
+    """
+
+    shift_m: tuple[Any, ...]
+    relative_permittivity: tuple[Any, ...]
+    conductivity_s_m: tuple[Any, ...]
+    thickness_m: tuple[Any, ...]
+    frequency_hz: Any
+
+
+@dataclass(frozen=True)
+class HeldPaths:
+    """Paths that stay where they are: functions that give their power (C,).
+
+    `evaluate` runs one of the chains. `repeat` has no derivatives, and replays the kernels that Dr.Jit has recorded:
+    the tracing in Python takes most of the time.
+    """
+
+    evaluate: Callable[[_Verification], Any]
+    repeat: Callable[[], Any]
+
+
+class SceneSolver:
+    """Verifies candidates in one exported scene.
+
+    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none.
+    """
+
+    def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
+        load_sionna()
+        from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
+
+        self._settings = settings
+        self._scene = open_scene(scene_xml, settings.frequency_hz)
+        objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
+        self.shapes = [shape.mi_mesh for shape in objects]
+        faces = [mesh.face_count() for mesh in self.shapes]
+        shape = np.repeat(np.array([shape.object_id for shape in objects], np.uint32), faces)
+        self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last stands for no face, -1
+        primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
+        self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
+        self._symbolic, self._evaluated = _Verification("symbolic"), _Verification("evaluated")
+
+    @property
+    def materials(self) -> dict[str, NDArray[np.float64]]:
+        """Relative permittivity, conductivity [S/m] and thickness [m] (3,) of each material, by name."""
+        constants = ("relative_permittivity", "conductivity", "thickness")
+        return {
+            name: np.ravel([getattr(each, constant) for constant in constants]).astype(np.float64)
+            for name, each in self._scene.radio_materials.items()
+        }
+
+    @property
+    def mi_scene(self) -> Any:
+        """The Mitsuba scene."""
+        return self._scene.mi_scene
+
+    def verify(
+        self, candidates: Candidates, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+    ) -> tuple[SolvedPaths, NDArray[np.intp]]:
+        """Verify candidates and compute their coefficients: the paths, and the candidate (P,) that each was.
+
+        The transmitter (3,) and the receivers (N, 3) are in scene coordinates [m].
+        """
+        if len(candidates.rx) == 0:
+            return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
+        buffer = self._solve(self._symbolic, candidates, _points(tx_m[None]), _points(rx_m))
+        return _read_buffer(buffer, tx_m, rx_m)
+
+    def moved(
+        self,
+        candidates: Candidates,
+        tx_index: NDArray[np.int32],
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+        variables: Variables,
+        *,
+        differentiable: bool,
+    ) -> tuple[Any, Any]:
+        """Verify candidates from T transmitters to N receivers, in scene coordinates, for other variables.
+
+        Returns their power (C,), 0 where there is no path, and vertices (C D,) [m]. Derivatives need slower loops.
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        ends = _points(tx_m) + mi.Point3f(*variables.shift_m), _points(rx_m)
+        verification = self._evaluated if differentiable else self._symbolic
+        # Dr.Jit cannot pass forward through a symbolic call of a material twice
+        with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+            buffer = self._verified(verification, candidates, tx_index, ends)
+            power = self._power(verification, buffer, ends, candidates.wedges is not None)
+            return power, mi.Point3f(buffer.vertices_x.array, buffer.vertices_y.array, buffer.vertices_z.array)
+
+    def held(
+        self,
+        candidates: Candidates,
+        tx_index: NDArray[np.int32],
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+    ) -> HeldPaths:
+        """Verify candidates once, for `power`."""
+        import drjit as dr
+
+        ends, diffraction = (_points(tx_m), _points(rx_m)), candidates.wedges is not None
+        buffer = self._verified(self._symbolic, candidates, tx_index, ends)
+        buffer.schedule()
+        dr.eval(buffer.valid)
+
+        def evaluate(verification: _Verification) -> Any:
+            again = copy(buffer)
+            again.valid = dr.copy(buffer.valid)
+            return self._power(verification, again, ends, diffraction)
+
+        def state() -> Any:
+            return self.mi_scene, [*self._scene.radio_materials.values()], self._scene.frequency, vars(buffer), ends
+
+        return HeldPaths(evaluate, dr.freeze(lambda: evaluate(self._symbolic), state_fn=state))
+
+    def power(self, paths: HeldPaths, variables: Variables, *, differentiable: bool) -> Any:
+        """Power (C,) of paths that stay where they are for other materials and another frequency."""
+        import drjit as dr
+
+        with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
+            if differentiable or not self._scene.radio_materials:  # without any, Dr.Jit has nothing to record
+                return paths.evaluate(self._evaluated if differentiable else self._symbolic)
+            collects = gc.isenabled()
+            gc.disable()  # Dr.Jit aborts where a scene is collected while it records
+            try:
+                return paths.repeat()
+            finally:
+                if collects:
+                    gc.enable()
+
+    def _verified(
+        self, verification: _Verification, candidates: Candidates, tx_index: NDArray[np.int32], ends: tuple[Any, Any]
+    ) -> Any:
+        import mitsuba as mi
+
+        buffer = self._buffer(candidates)
+        buffer._src_indices = _to_device(mi.UInt, tx_index.astype(np.uint32))
+        return verification.verify(self._scene, buffer, *ends, candidates.wedges is not None)
+
+    def _power(self, verification: _Verification, buffer: Any, ends: tuple[Any, Any], diffraction: bool) -> Any:
+        """Squared magnitude of the coefficients of verified paths."""
+        import drjit as dr
+
+        buffer = verification.evaluate(self._scene, buffer, *ends, self._settings.samples_per_tx, diffraction)
+        a = buffer.a[0][0]
+        return dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
+
+    @contextmanager
+    def _changed(self, variables: Variables) -> Iterator[None]:
+        """Give the scene another frequency and all materials other values for a while."""
+        materials = self._scene.radio_materials.values()
+        kept = [(each, each.relative_permittivity, each.conductivity, each.thickness) for each in materials]
+        frequency = self._scene.frequency
+        try:
+            self._scene.frequency = frequency + variables.frequency_hz  # ITU materials follow
+            values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
+            for (each, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
+                each.relative_permittivity = new[0] + (each.relative_permittivity - permittivity)
+                each.conductivity = new[1] + (each.conductivity - conductivity)
+                each.thickness = new[2]
+            yield
+        finally:
+            self._scene.frequency = frequency
+            for material, permittivity, conductivity, thickness in kept:
+                material.relative_permittivity = permittivity
+                material.conductivity, material.thickness = conductivity, thickness
+
+    def _solve(self, verification: _Verification, candidates: Candidates, source: Any, targets: Any) -> Any:
+        """Verify candidates in a buffer that keeps their order, and compute their coefficients."""
+        diffraction, samples = candidates.wedges is not None, self._settings.samples_per_tx
+        buffer = verification.verify(self._scene, self._buffer(candidates), source, targets, diffraction)
+        return verification.evaluate(self._scene, buffer, source, targets, samples, diffraction)
+
+    def _buffer(self, candidates: Candidates) -> Any:
+        """Fill one of Sionna RT's path buffers with unverified candidates."""
+        import mitsuba as mi
+        from sionna.rt.constants import InteractionType
+        from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+        face = candidates.face
+        kind = np.where(face == EDGE, InteractionType.DIFFRACTION, InteractionType.SPECULAR).astype(np.uint32)
+        kind[face == -1] = InteractionType.NONE
+        if candidates.wedges is not None and candidates.wedge is not None:
+            # Sionna RT takes the normal of the 0-face from the face that a path diffracts at
+            face = np.where(face == EDGE, candidates.wedges.face[candidates.wedge, :1], face)
+        shape, primitive = self._shape_of_face[face], self._primitive_of_face[face]
+        buffer = PathsBuffer(*face.shape, candidates.wedges is not None)
+        buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (
+            _to_device(mi.TensorXf, axis.astype(np.float32)) for axis in np.moveaxis(candidates.vertices_m, 2, 0)
+        )
+        buffer._shapes, buffer._primitives = _to_device(mi.TensorXu, shape), _to_device(mi.TensorXu, primitive)
+        buffer._interaction_types = _to_device(mi.TensorXu, kind)
+        buffer._tgt_indices = _to_device(mi.UInt, candidates.rx.astype(np.uint32))
+        buffer._paths_counter = mi.UInt(len(face))
+        if candidates.wedges is not None and candidates.wedge is not None:
+            buffer._diffracting_wedges = self._wedge_geometry(candidates.wedges, candidates.wedge)
+        buffer.shrink()
+        return buffer
+
+    def _wedge_geometry(self, wedges: Wedges, index: NDArray[np.int32]) -> Any:
+        """Wedges of candidates as Sionna RT describes them: normal of the 0-face x edge points along that face."""
+        import drjit as dr
+        import mitsuba as mi
+        from sionna.rt.utils.wedges import WedgeGeometry
+
+        upward = index < len(wedges.edge_m)
+        x, y = wedges.edge_m[index % len(wedges.edge_m)].T
+        face, normal, flat = wedges.face[index], wedges.normal[index], np.zeros(len(index))
+
+        def vectors(kind: Any, *columns: NDArray[np.float64]) -> Any:
+            return kind(*(_to_device(mi.Float, column.astype(np.float32)) for column in columns))
+
+        return WedgeGeometry(
+            shape=dr.reinterpret_array(mi.MeshPtr, _to_device(mi.UInt, self._shape_of_face[face[:, 0]])),
+            prim0=_to_device(mi.UInt, self._primitive_of_face[face[:, 0]]),
+            primn=_to_device(mi.UInt, self._primitive_of_face[face[:, 1]]),
+            local_edge=dr.zeros(mi.UInt, len(index)),
+            o=vectors(mi.Point3f, x, y, np.where(upward, 0.0, wedges.height_m)),
+            e_hat=vectors(mi.Vector3f, flat, flat, np.where(upward, 1.0, -1.0)),
+            length=dr.full(mi.Float, wedges.height_m, len(index)),
+            n0=vectors(mi.Normal3f, *normal[:, 0].T, flat),
+            nn=vectors(mi.Normal3f, *normal[:, 1].T, flat),
+        )
+
+
+def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
+    """Yield the derivatives of results with respect to one variable after the other."""
+    import drjit as dr
+
+    for leaf in leaves:
+        dr.clear_grad(results)
+        dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next variable
+        yield dr.grad(results)
+
+
+def _points(positions_m: NDArray[np.float64]) -> Any:
+    """Hand positions (N, 3) over to Dr.Jit."""
+    import drjit as dr
+    import mitsuba as mi
+
+    points = mi.Point3f(*(_to_device(mi.Float, column.astype(np.float32)) for column in positions_m.T))
+    dr.make_opaque(points)
+    return points
+
+
+def _read_buffer(
+    buffer: Any, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+) -> tuple[SolvedPaths, NDArray[np.intp]]:
+    """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
+    buffer.schedule()
+    valid = np.flatnonzero(buffer.valid.numpy())
+    a = buffer.a[0][0]
+    paths = SolvedPaths.of_vertices(
+        path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
+        a=a.real.numpy()[valid].astype(np.float64) + 1j * a.imag.numpy()[valid],
+        delay_s=buffer.tau.numpy()[valid].astype(np.float64),
+        interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
+        vertices_m=np.stack(
+            [each.numpy()[valid] for each in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
+        ),
+        tx_m=tx_m,
+        rx_m=rx_m,
+    )
+    return paths, valid

@@ -1,0 +1,242 @@
+"""Specular candidates of floor plans: sequences of walls, with the reflections off floor and ceiling added.
+
+Floor and ceiling follow analytically: unfolded, the height of a path changes linearly with its length in the plan, so
+where it meets floor and ceiling depends on that length alone.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sionna_partial.scene.floor_plan import grow
+from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.tracing.candidates import EDGE, Candidates
+from sionna_partial.tracing.plan.beams import trace_beams
+from sionna_partial.tracing.plan.bounds import LEVELS, Strengths, level_of, reflected_power
+
+FLOOR, CEILING, DIFFRACTED = -2, -3, -4
+"""Stand for a wall segment where a path meets the floor, the ceiling or a vertical edge."""
+
+_PAIRS_AT_ONCE = 200_000
+"""Number of (sequence of walls, receiver) pairs in a block of candidates, which bounds the memory."""
+
+
+class Room(NamedTuple):
+    """What paths meet between a transmitter (3,) and receivers (N, 3), in the local frame [m].
+
+    Walls (S, 2, 2) stand between the floor at 0 and the ceiling at `height_m`; `floor` and `ceiling` are whether they
+    reflect.
+    """
+
+    walls_m: NDArray[np.float64]
+    height_m: float
+    floor: bool
+    ceiling: bool
+    tx_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, geometry: SceneGeometry, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> "Room":
+        """Take it from a scene."""
+        flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
+        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m)
+
+
+class SpecularCandidates:
+    """All specular paths of at most `max_depth` reflections between the transmitter and the receivers of a room.
+
+    The beams are traced once.
+    """
+
+    def __init__(self, geometry: SceneGeometry, room: Room, max_depth: int) -> None:
+        self._geometry, self._room, self._max_depth = geometry, room, max_depth
+        self._beams = trace_beams(geometry.plan, room.tx_m[:2], room.rx_m[:, :2], max_depth)
+        self._best = np.zeros(len(self._beams.pair_rx), np.uint8)  # level of the strongest candidate of each pair
+
+    def blocks(
+        self, strengths: Strengths, *, pairs_at_once: int = _PAIRS_AT_ONCE
+    ) -> Iterator[tuple[Candidates, float]]:
+        """Yield the candidates that are asked for, and the fraction of the work done; add up the bounds of all."""
+        count = len(self._best)
+        for start in range(0, count, pairs_at_once):
+            stop = min(start + pairs_at_once, count)
+            rx, surface, vertices_m = _expand_heights(
+                self._beams, start, stop, self._room, self._max_depth, strengths, self._best
+            )
+            yield Candidates(rx, faces_of(surface, self._geometry), vertices_m), stop / count
+
+
+def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.int32]:
+    """Turn wall segments, FLOOR, CEILING and DIFFRACTED (C, D) into faces of the scene; -1 stays."""
+    walls = 2 * np.arange(len(geometry.segments), dtype=np.int32)
+    others = np.array([EDGE, geometry.ceiling_face, geometry.floor_face, -1], dtype=np.int32)
+    return np.concatenate([walls, others])[surface]
+
+
+@njit(cache=True, nogil=True)
+def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # type: ignore[no-untyped-def]
+    """Every order of wall, floor and ceiling reflections of some pairs; pairs without any asked for are skipped."""
+    size = max(1, max_depth)
+    walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
+    out_rx, surface, vertices = np.empty(1024, np.int32), np.empty((1024, size), np.int32), np.empty((1024, size, 3))
+    count = np.int64(0)
+    for i in range(start, stop):
+        rx = beams.pair_rx[i]
+        if best[i] >= strengths.last[rx]:
+            continue
+        target, best[i] = room.rx_m[rx], LEVELS
+        k, length, good = unfold(beams, beams.pair_node[i], room.walls_m, target, walls, points)
+        if not good:
+            continue
+        incidence(room.walls_m, room.tx_m, target, walls[:k], points, cosine)
+        for bounces in range(max_depth - k + 1):
+            for first in (FLOOR, CEILING):
+                if not can_bounce(bounces, first, room):
+                    continue
+                height = unfolded_height(room, target, bounces, first)
+                power = _specular_power(strengths, cosine[:k], length, height, bounces)
+                level = level_of(power) if k + bounces > 0 else 0
+                if len(strengths.power):
+                    strengths.power[rx, level] += power
+                best[i] = min(best[i], level)
+                if bounces == 0 and k > 0:
+                    strengths.reflected[rx] += power
+                if not strengths.first[rx] <= level < strengths.last[rx]:
+                    continue
+                out_rx, surface, vertices = grow(out_rx, count + 1), grow(surface, count + 1), grow(vertices, count + 1)
+                out_rx[count] = rx
+                clear(surface[count], vertices[count])
+                merge_heights(walls[:k], points[:k], room, target, bounces, first, surface[count], vertices[count])
+                count += 1
+    return out_rx[:count].copy(), surface[:count].copy(), vertices[:count].copy()
+
+
+@njit(cache=True)
+def clear(surface, vertices):  # type: ignore[no-untyped-def]
+    """Empty one candidate."""
+    for depth in range(len(surface)):
+        surface[depth] = -1
+        vertices[depth, 0] = vertices[depth, 1] = vertices[depth, 2] = 0.0
+
+
+@njit(cache=True)
+def unfolded_height(room, target, bounces, first):  # type: ignore[no-untyped-def]
+    """Height [m] that a path covers, unfolded: floor and ceiling in turn, `bounces` times."""
+    if bounces == 0:
+        return abs(target[2] - room.tx_m[2])
+    to_first = room.tx_m[2] if first == FLOOR else room.height_m - room.tx_m[2]
+    last_is_floor = (bounces % 2 == 1) == (first == FLOOR)
+    from_last = target[2] if last_is_floor else room.height_m - target[2]
+    return to_first + (bounces - 1) * room.height_m + from_last
+
+
+@njit(cache=True)
+def incidence(all_walls, start, end, walls, points, cosine):  # type: ignore[no-untyped-def]
+    """Write the cosines of the angles of incidence, seen from above, at a sequence of walls."""
+    x, y = start[0], start[1]
+    for level in range(len(walls)):
+        wall = all_walls[walls[level]]
+        wx, wy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
+        dx, dy = points[level, 0] - x, points[level, 1] - y
+        if dx * dx + dy * dy < 1e-12:  # at the wall itself: the next leg has the same angle
+            dx = (points[level + 1, 0] if level + 1 < len(walls) else end[0]) - points[level, 0]
+            dy = (points[level + 1, 1] if level + 1 < len(walls) else end[1]) - points[level, 1]
+        size = np.hypot(wx, wy) * np.hypot(dx, dy)
+        cosine[level] = (wx * dy - wy * dx) / size if size > 0.0 else 0.0
+        x, y = points[level, 0], points[level, 1]
+
+
+@njit(cache=True)
+def _specular_power(strengths, cosine, length, height, bounces):  # type: ignore[no-untyped-def]
+    """Upper bound of the power of a path of some length in the plan, with reflections at walls, floor and ceiling."""
+    total = np.hypot(length, height)
+    power = (strengths.wavelength_m / (4.0 * np.pi * total)) ** 2
+    for k in range(len(cosine)):
+        power *= reflected_power(strengths, cosine[k] * length / total)
+    if bounces > 0:
+        power *= reflected_power(strengths, height / total) ** bounces
+    return power
+
+
+@njit(cache=True)
+def can_bounce(bounces, first, room):  # type: ignore[no-untyped-def]
+    """Whether a path can meet floor and ceiling alternately `bounces` times; without any, `first` counts as FLOOR."""
+    if bounces == 0:
+        return first == FLOOR
+    if bounces == 1:
+        return room.floor if first == FLOOR else room.ceiling
+    return room.floor and room.ceiling
+
+
+@njit(cache=True)
+def unfold(beams, node, all_walls, target, walls, points):  # type: ignore[no-untyped-def]
+    """Write the walls of one pair, and where each reflects: (x, y, fraction of the path's length), in path order.
+
+    Returns the number of reflections, the length in the plan and whether all points exist.
+    """
+    parent, segment, source = beams.parent, beams.segment, beams.source
+    k, above = 0, node
+    while parent[above] >= 0:
+        k, above = k + 1, parent[above]
+    x, y = target[0], target[1]
+    total = np.hypot(x - source[node, 0], y - source[node, 1])
+    for level in range(k - 1, -1, -1):
+        sx, sy = source[node, 0], source[node, 1]
+        wall = all_walls[segment[node]]
+        dx, dy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
+        from_source = dx * (sy - wall[0, 1]) - dy * (sx - wall[0, 0])
+        from_point = dx * (y - wall[0, 1]) - dy * (x - wall[0, 0])
+        if abs(from_source - from_point) < 1e-15 or total == 0.0:
+            return k, total, False
+        fraction = from_source / (from_source - from_point)
+        x, y = sx + fraction * (x - sx), sy + fraction * (y - sy)
+        walls[level] = segment[node]
+        points[level, 0], points[level, 1], points[level, 2] = x, y, np.hypot(x - sx, y - sy) / total
+        node = parent[node]
+    return k, total, True
+
+
+@njit(cache=True)
+def merge_heights(walls, points, room, target, bounces, first, surface, vertices):  # type: ignore[no-untyped-def]
+    """Write one candidate: wall reflections and `bounces` alternating floor and ceiling reflections in path order."""
+    tx, height = room.tx_m, room.height_m
+    to_first = tx[2] if first == FLOOR else height - tx[2]
+    unfolded = unfolded_height(room, target, bounces, first) if bounces else 1.0
+    at_walls, at_flats = 0, 0
+    px, py, done = tx[0], tx[1], 0.0
+    for depth in range(len(walls) + bounces):
+        fraction = (to_first + at_flats * height) / unfolded if at_flats < bounces else 2.0
+        if at_walls < len(walls) and points[at_walls, 2] <= fraction:
+            px, py, done = points[at_walls, 0], points[at_walls, 1], points[at_walls, 2]
+            surface[depth] = walls[at_walls]
+            vertices[depth, 0], vertices[depth, 1] = px, py
+            vertices[depth, 2] = _height_at(done, room, target, bounces, first, to_first, unfolded)
+            at_walls += 1
+            continue
+        nx, ny, stop = target[0], target[1], 1.0
+        if at_walls < len(walls):
+            nx, ny, stop = points[at_walls, 0], points[at_walls, 1], points[at_walls, 2]
+        part = (fraction - done) / (stop - done) if stop > done else 0.0
+        is_floor = (at_flats % 2 == 0) == (first == FLOOR)
+        surface[depth] = FLOOR if is_floor else CEILING
+        vertices[depth, 0], vertices[depth, 1] = px + part * (nx - px), py + part * (ny - py)
+        vertices[depth, 2] = 0.0 if is_floor else height
+        at_flats += 1
+
+
+@njit(cache=True)
+def _height_at(fraction, room, target, bounces, first, to_first, unfolded):  # type: ignore[no-untyped-def]
+    """Height of a path after a fraction of its length."""
+    tx_z, height = room.tx_m[2], room.height_m
+    if bounces == 0:
+        return tx_z + fraction * (target[2] - tx_z)
+    travelled = fraction * unfolded
+    if travelled <= to_first:
+        return tx_z - travelled if first == FLOOR else tx_z + travelled
+    legs = int((travelled - to_first) // height)
+    rest = travelled - to_first - legs * height
+    rising = (legs % 2 == 0) == (first == FLOOR)
+    return rest if rising else height - rest

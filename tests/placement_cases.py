@@ -1,0 +1,31 @@
+"""A home of two rooms, known or half seen, and transmitters placed in it."""
+
+from functools import cache
+from typing import Any
+
+from coverage_fakes import map_of
+
+import sionna_partial as sp
+
+TWO_ROOMS = """
+##########
+#....#...#
+#....#...#
+#........#
+#....#...#
+##########
+"""
+"""Two rooms and a door between them, in cells of 0.5 m; the lower left corner is at (0, 0)."""
+
+HALF_SEEN = TWO_ROOMS.replace("...#\n", "..??\n")
+
+
+def home(picture: str) -> sp.PartialMap:
+    return map_of(picture, 0.5, (0.0, 0.0))
+
+
+@cache
+def placed(picture: str = HALF_SEEN, **options: Any) -> sp.TransmitterPlacement:
+    """Place a transmitter with line of sight alone, and the paper's predictor."""
+    settings = sp.TraceSettings(max_depth=0, diffraction=False)
+    return sp.place_transmitter(home(picture), predictor="paper", trace_settings=settings, **options)

@@ -1,0 +1,204 @@
+"""The engine: its verdict depends on a candidate alone, nothing is compiled twice, and Sionna RT is the tested one."""
+
+import dataclasses
+import logging
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from extruded import ROOM, diffracted_blocks, extrude, specular_blocks
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+from sionna_partial.constants import CellState
+from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_scene
+from sionna_partial.tracing import engine
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault, open_scene
+from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.plan.diffraction import find_wedges
+
+TX = np.array([1.07, 1.93, 1.2])
+RX = np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4], [5.2, 3.4, 1.9], [4.1, 0.3, 1.1]])
+
+
+def _solver(geometry: SceneGeometry, folder: Path) -> SceneSolver:
+    xml = write_scene(geometry, folder, offset_m=geometry.origin_m)
+    return SceneSolver(xml, SHAPES, sp.TraceSettings())
+
+
+def _specular(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
+    return specular_blocks(geometry, tx, rx, depth)[0][0]
+
+
+def _diffracted(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:
+    return diffracted_blocks(geometry, find_wedges(geometry, open_ends=False), tx, rx, depth)[0][0]
+
+
+def _sorted(paths: SolvedPaths) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Delays and gains, each in order within a receiver: rounding may swap paths of equal delay."""
+    delay_s, gain = paths.delay_s, np.abs(paths.a)
+    return delay_s[np.lexsort([delay_s, paths.path_rx])], gain[np.lexsort([gain, paths.path_rx])]
+
+
+class TestVerify:
+    def test_order_of_candidates_changes_no_verdict(self, tmp_path: Path) -> None:
+        """Embree loses hits of rays that are called coherent and are not."""
+        home = sp.make_home(9)
+        geometry = build_scene(home)
+        free = (np.argwhere(home.state == CellState.FREE)[::40, ::-1] + 0.5) * home.resolution_m
+        places = np.column_stack([free, np.full(len(free), 1.5)])
+        tx, rx = places[len(places) // 2], np.delete(places, len(places) // 2, axis=0)
+        candidates = _specular(geometry, tx, rx, 6)
+        solver = _solver(geometry, tmp_path)
+        order = np.random.default_rng(0).permutation(len(candidates.rx))
+        shuffled = candidates.rows(order)
+        counts = [
+            np.bincount(solver.verify(each, tx, rx)[0].path_rx, minlength=len(rx)) for each in (candidates, shuffled)
+        ]
+        np.testing.assert_array_equal(*counts)
+
+    @pytest.mark.parametrize("make", [_specular, _diffracted], ids=["specular", "diffracted"])
+    def test_numbers_of_walls_change_nothing(self, make, tmp_path: Path) -> None:
+        """A path depends on where walls are, not on the order in which they are written."""
+        answers = []
+        for number, walls in enumerate((ROOM, ROOM[::-1], ROOM[[2, 5, 0, 4, 1, 3]][:, ::-1])):
+            geometry, folder = extrude(walls), tmp_path / str(number)
+            folder.mkdir()
+            answers.append(_sorted(_solver(geometry, folder).verify(make(geometry, TX, RX, 2), TX, RX)[0]))
+        assert len(answers[0][0]) > 20
+        for delay_s, gain in answers[1:]:
+            np.testing.assert_allclose(delay_s, answers[0][0], rtol=1e-6)
+            np.testing.assert_allclose(gain, answers[0][1], rtol=1e-3)
+
+    @pytest.mark.parametrize("missing", [(), ("ceiling",), ("floor", "ceiling"), ("walls",), SHAPES])
+    def test_shapes_that_the_scene_lacks_count_no_faces(self, missing: tuple[str, ...], tmp_path: Path) -> None:
+        walls = np.zeros((0, 2, 2)) if "walls" in missing else ROOM[:4]
+        floor_m = () if "floor" in missing else ((0, 0, 6, 4),)
+        geometry = extrude(walls, floor_m=floor_m, ceiling="ceiling" not in missing)
+        rx = np.array([[4.9, 3.1, 1.7]])
+        candidates = _specular(geometry, TX, rx, 1)
+        paths = _solver(geometry, tmp_path).verify(candidates, TX, rx)[0]
+        expected = 1 + 4 * ("walls" not in missing) + ("floor" not in missing) + (not missing or missing == ("walls",))
+        assert len(paths.a) == len(candidates.rx) == expected
+
+    def test_a_candidate_through_a_wall_is_refused(self, tmp_path: Path) -> None:
+        geometry = extrude(ROOM)
+        rx = np.array([[5.0, 0.4, 1.5], [2.0, 2.0, 1.5]])
+        through = Candidates(np.array([0, 1], np.int32), np.full((2, 1), -1, np.int32), np.zeros((2, 1, 3)))
+        assert _solver(geometry, tmp_path).verify(through, TX, rx)[0].path_rx.tolist() == [1]
+
+    def test_no_candidates_give_no_paths(self, tmp_path: Path) -> None:
+        geometry = extrude(ROOM)
+        none = _specular(geometry, TX, RX, 2).rows(np.zeros(0, np.intp))
+        paths = _solver(geometry, tmp_path).verify(none, TX, RX)[0]
+        assert paths.a.shape == paths.path_rx.shape == (0,)
+        assert paths.vertices_m.shape == (0, 2, 3)
+
+
+class TestCompiling:
+    @pytest.mark.parametrize("make", [_specular, _diffracted], ids=["specular", "diffracted"])
+    def test_nothing_is_compiled_twice(self, make, tmp_path: Path) -> None:
+        """Other receivers, other numbers of candidates and arrays elsewhere in memory: the kernels are there."""
+        geometry = extrude(ROOM)
+        solver = _solver(geometry, tmp_path)
+        import drjit as dr  # after LLVM
+
+        candidates = make(geometry, TX, RX, 2)
+        solver.verify(candidates, TX, RX)[0]
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            for skip in range(1, 8):
+                fewer = _elsewhere(candidates, skip).rows(np.arange(skip, len(candidates.rx)))
+                solver.verify(fewer, TX + 0.01 * skip, RX)[0]
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        assert len(kernels) >= 7
+        assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []
+
+
+def _elsewhere(candidates: Candidates, skip: int) -> Candidates:
+    """Copy candidates to addresses that are off by `skip` of their numbers."""
+    moved = {}
+    for name in ("rx", "face", "vertices_m"):
+        values = getattr(candidates, name)
+        moved[name] = np.concatenate([np.zeros(skip, values.dtype), values.ravel()])[skip:].reshape(values.shape)
+    return dataclasses.replace(candidates, **moved)
+
+
+WITH_VARIANT = """
+import sys
+from sionna_partial.errors import BackendError
+from sionna_partial.llvm import load_llvm
+from sionna_partial.tracing.engine import load_sionna
+load_llvm()
+import mitsuba
+mitsuba.set_variant(sys.argv[1])
+try:
+    print(load_sionna().__name__)
+except BackendError as error:
+    print(error)
+"""
+
+
+def _load_after(variant: str) -> str:
+    """What loading gives in a process of its own, where someone else set the variant."""
+    command = [sys.executable, "-c", WITH_VARIANT, variant]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+class TestLoadSionna:
+    def test_variant_of_someone_else_is_refused(self) -> None:
+        remedy = f"call mitsuba.set_variant('{MITSUBA_VARIANT}') before the first trace, or import sionna_partial in a"
+        expected = f"mitsuba variant = 'scalar_rgb' is not supported: {remedy} process of its own."
+        assert _load_after("scalar_rgb") == expected
+
+    def test_our_variant_may_be_set_already(self) -> None:
+        assert _load_after(MITSUBA_VARIANT) == "sionna.rt"
+
+
+class TestEngineFault:
+    @pytest.fixture(autouse=True)
+    def _fresh_process(self) -> Iterator[None]:
+        engine_fault.cache_clear()
+        yield
+        engine_fault.cache_clear()
+
+    def test_none_today(self, caplog: pytest.LogCaptureFixture) -> None:
+        assert engine_fault() == ""
+        assert not caplog.records
+
+    def test_other_release_is_named_once(
+        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        monkeypatch.setattr(engine, "TESTED_VERSION", "2.1")
+        with caplog.at_level(logging.WARNING):
+            faults = {engine_fault() for _ in range(3)}
+        assert len(faults) == len(caplog.records) == 1
+        assert "is not of the release 2.1, for which the fast engine was made. Its public path solver" in caplog.text
+        assert 'run pip install "sionna-rt==2.2.*"' in caplog.text
+
+    def test_field_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(engine, "_BUFFER_FIELDS", engine._BUFFER_FIELDS | {"_a_new_one"})
+        assert engine_fault().endswith("has no PathsBuffer._a_new_one, which the fast engine fills")
+
+
+class TestOpenScene:
+    @pytest.mark.parametrize("frequency_hz", [3.5e9, 28e9])
+    def test_frequency_shapes_and_antennas(self, frequency_hz: float, tmp_path: Path) -> None:
+        scene = open_scene(write_scene(extrude(ROOM), tmp_path, offset_m=(0.0, 0.0)), frequency_hz)
+        assert float(scene.frequency.numpy().ravel()[0]) == pytest.approx(frequency_hz)
+        assert set(scene.objects) == {"walls", "floor", "ceiling"}
+        assert scene.tx_array is scene.rx_array
+        assert scene.tx_array.num_ant == 1
+        (pattern,) = scene.tx_array.antenna_pattern.patterns
+        import mitsuba as mi
+
+        zenith, azimuth = mi.Float([0.3, 1.5, 2.9]), mi.Float([0.0, 2.0, -3.0])
+        gain = [part.numpy() for part in pattern(zenith, azimuth)]
+        np.testing.assert_allclose(np.abs(gain[0]), 1.0, rtol=1e-6)  # isotropic,
+        np.testing.assert_allclose(np.abs(gain[1]), 0.0, atol=1e-7)  # vertically polarised

@@ -1,0 +1,163 @@
+"""Scenes and where their paths come from: plans, meshes, and Sionna RT's public path solver in place of both."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from meshes import box, room, scene_mesh
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+from sionna_partial.errors import SettingsError
+from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.tracing import trace
+from sionna_partial.tracing.finder import PlanScene, write_scene_of
+from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.stock import diffracted_as_exact
+
+TX = np.array([1.03, 1.52, 1.4])
+RX = np.array([[1.47, 2.51, 1.7], [4.35, 0.61, 1.2], [3.82, 3.57, 1.3], [2.02, 0.33, 2.2]])
+
+
+def _plan() -> sp.PartialMap:
+    """Two rooms and a door, 5 m x 4 m."""
+    state = np.zeros((40, 50), np.uint8)
+    state[[0, -1], :] = state[:, [0, -1]] = state[:30, 30] = sp.CellState.WALL
+    return sp.PartialMap(state, 0.1)
+
+
+def _as_mesh(plan: sp.PartialMap, folder: Path) -> sp.PartialMap:
+    """The exported scene of a plan, read as a scan."""
+    sp.export_scene(plan, folder / "scene")
+    parts = [trimesh.load(path, force="mesh") for path in sorted((folder / "scene" / "meshes").glob("*.ply"))]
+    trimesh.util.concatenate(parts).export(folder / "scan.ply")
+    return sp.load_map(folder / "scan.ply", resolution_m=0.1)
+
+
+def _delays(links: sp.TracedLinks, rx: int) -> NDArray[np.float64]:
+    return np.sort(links.delay_s[links.path_rx == rx])
+
+
+def test_a_plan_traced_as_a_mesh_has_the_same_paths(tmp_path: Path) -> None:
+    plan, settings = (
+        _plan(),
+        sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, diffraction=False, samples_per_tx=100_000),
+    )
+    exact = sp.trace_links(plan, TX, RX, settings=settings)
+    scan = sp.trace_links(_as_mesh(plan, tmp_path), TX, RX, settings=settings)
+    np.testing.assert_array_equal(scan.link_state, exact.link_state)
+    np.testing.assert_allclose(scan.gain_db, exact.gain_db, atol=1e-3)
+    for index in range(len(RX)):
+        np.testing.assert_allclose(_delays(scan, index), _delays(exact, index), atol=1e-12)
+
+
+def test_a_mesh_far_away_has_the_same_paths() -> None:
+    mesh, far = scene_mesh(*room().geometry.values()), np.array([5e5, 4.5e6, 0.0])
+    there = SceneMesh(mesh.vertices_m + far, mesh.triangles, mesh.material)
+    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=3, samples_per_tx=50_000)
+    near, moved = (
+        sp.trace_links(mesh_map(each, MeshReading(resolution_m=0.1)), TX + shift, RX + shift, settings=settings)
+        for each, shift in ((mesh, 0.0), (there, far))
+    )
+    assert len(near.a) > 50
+    np.testing.assert_allclose(moved.gain_db, near.gain_db, atol=1e-3)
+    np.testing.assert_allclose(moved.vertices_m - far, near.vertices_m, atol=1e-3)
+
+
+def test_diffraction_is_on_for_plans_and_off_for_meshes(tmp_path: Path) -> None:
+    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=2, samples_per_tx=10_000)
+    for partial, diffracts in ((_plan(), True), (_as_mesh(_plan(), tmp_path), False)):
+        links = sp.trace_links(partial, TX, RX, settings=settings)
+        assert links.settings.diffraction is diffracts
+        assert (8 in links.interactions) is diffracts
+
+
+def test_parts_of_a_mesh_have_their_own_materials() -> None:
+    floor, rest = box((0, 0, -0.1), (5, 4, 0)), box((0, 0, 2.9), (5, 4, 3))
+    mesh = trimesh.util.concatenate([floor, rest])
+    metal, glass = sp.Material(itu="metal"), sp.Material(relative_permittivity=1.0001, conductivity_s_m=0.0)
+    parts = SceneMesh(mesh.vertices, mesh.faces, np.repeat([0, 1], 12), (metal, glass))
+    partial = mesh_map(parts, MeshReading(resolution_m=0.1))
+    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1, samples_per_tx=20_000)
+    links = sp.trace_links(partial, (1.0, 2.0, 1.0), [[4.0, 2.0, 1.0]], settings=settings)
+    strength = {round(z, 1): abs(a) for a, (_, _, z) in zip(links.a[1:], links.vertices_m[1:, 0], strict=True)}
+    assert strength[0.0] > 100 * strength[2.9]
+
+
+def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
+    solid = box((0, 0, 0), (5, 4, 3))
+    ground = SceneMesh(solid.vertices, solid.faces, np.zeros(12, int), (sp.Material(itu="wet_ground"),))
+    partial = mesh_map(ground, MeshReading(resolution_m=0.1))
+    for call in (sp.trace_links, sp.gain_gradients):
+        with pytest.raises(SettingsError, match=r"^frequency_hz = 2.* 'wet_ground' is defined for 1-10 GHz"):
+            call(partial, TX, RX)
+    with pytest.raises(SettingsError, match=r"^frequency_hz = 2.* 'wet_ground' is defined for 1-10 GHz"):
+        sp.predict_map(partial, TX)
+
+
+def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, samples_per_tx=20_000)
+    exact = sp.trace_links(_plan(), TX, RX[:2], settings=settings)
+    monkeypatch.setattr(trace, "engine_fault", lambda: "broken")
+    public = sp.trace_links(_plan(), TX, RX[:2], settings=settings)
+    np.testing.assert_array_equal(public.link_state, exact.link_state)
+    bent = (public.interactions == 8).any(axis=1)
+    assert bent.any()
+    assert ((public.interactions == 1)[bent].sum(axis=1) <= 2).all()
+    found = [
+        np.abs(_delays(exact, rx) - delay).min() < 1e-11
+        for rx, delay in zip(public.path_rx, public.delay_s, strict=True)
+    ]
+    assert len(found) > 50
+    assert np.mean(found) > 0.99
+
+
+def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
+    scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(power_tolerance_db=0.0), sp.SceneSettings())
+    assert isinstance(scene, PlanScene)
+    edge_x, edge_y = scene.wedges.edge_m[0]
+    kinds = np.array([[8, 0, 0, 0], [8, 0, 0, 0], [8, 0, 0, 0], [1, 8, 1, 1], [1, 8, 4, 1], [1, 1, 1, 1]], np.uint8)
+    vertices = np.full((6, 4, 3), 1.0)
+    vertices[[0, 1, 2], 0] = [(edge_x, edge_y, 1.0), (edge_x, edge_y, 0.0), (edge_x + 0.1, edge_y, 1.0)]
+    vertices[[3, 4], 1] = (edge_x, edge_y, 1.0)
+    zeros = np.zeros(6)
+    paths = SolvedPaths.of_vertices(
+        zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
+    )
+    assert diffracted_as_exact(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("walls_a_side", "expected"),
+    [(0, (True, False, False, False, True, False)), (1, (True, True, True, False, True, True)), (2, (True,) * 6)],
+)
+def test_bends_count_with_so_many_walls_on_each_side(
+    tmp_path: Path, walls_a_side: int, expected: tuple[bool, ...]
+) -> None:
+    """Floor and ceiling are no walls."""
+    scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(power_tolerance_db=0.0), sp.SceneSettings())
+    assert isinstance(scene, PlanScene)
+    kinds = np.array([[8, 0, 0], [1, 8, 0], [8, 1, 0], [1, 1, 8], [1, 8, 1], [1, 8, 1]], np.uint8)
+    vertices = np.full((6, 3, 3), 1.0)
+    vertices[4, [0, 2], 2] = 0.0, scene.wedges.height_m
+    for path, at in enumerate((kinds == 8).argmax(axis=1)):
+        vertices[path, at, :2] = scene.wedges.edge_m[0]
+    zeros = np.zeros(6)
+    paths = SolvedPaths.of_vertices(
+        zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
+    )
+    assert tuple(diffracted_as_exact(scene.wedges, paths, walls_a_side).tolist()) == expected
+
+
+def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:
+    """Bends over one edge with no wall, with one before or after, and with up to two."""
+    words = []
+    for walls in (0, 1, 2):
+        settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction_walls=walls)
+        links = sp.trace_links(_plan(), TX, RX, settings=settings, scene_settings=sp.SceneSettings(floor_extent="none"))
+        words.append({"".join("D" if kind == 8 else "R" for kind in row if kind) for row in links.interactions})
+    assert {word for word in words[0] if "D" in word} == {"D"}
+    assert {word for word in words[1] if "D" in word} == {"D", "DR", "RD", "RDR"}
+    assert {word for word in words[2] if "D" in word} == {"D", "DR", "RD", "RDR", "DRR", "RRD"}

@@ -1,0 +1,234 @@
+"""Training of the networks that read maps and paths, on links of known rules."""
+
+import dataclasses
+import functools
+import logging
+import math
+
+import numpy as np
+import pytest
+from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, features, make_seen_links
+from scipy.integrate import trapezoid
+from scipy.stats import norm
+
+from sionna_partial.constants import CellState
+from sionna_partial.errors import PredictorError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction import map_networks as module
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M
+from sionna_partial.prediction.map_networks import (
+    LINK_NETWORK,
+    context_networks,
+    evaluate_context_networks,
+    fit_context_networks,
+    link_inputs,
+    receiver_offsets_m,
+)
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.windows import WINDOW_CELLS
+from sionna_partial.settings import PredictorSettings
+
+pytestmark = QUIET
+
+FREE, UNKNOWN = CellState.FREE, CellState.UNKNOWN
+ROOMS, ROOM_CELLS, RESOLUTION_M = 4, 8, 0.5
+HALF_M = ROOMS * ROOM_CELLS * RESOLUTION_M / 2
+DISTANCE_M, GAIN_DB, STD_DB = 5.0, -90.0, 3.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Links:
+    """Links that differ in nothing but the rooms that their receivers are in, and the last column of indirect gains.
+
+    Half of the rooms of each map are seen. The transmitter, and receivers in rooms of both kinds, stand in cells that
+    are not.
+    """
+
+    phi: LinkFeatures
+    in_seen_room: np.ndarray
+    path_seen: np.ndarray
+
+    def truth(self, linked):
+        """Return true states and gains where some links (N,) are NLOS, and the others in outage."""
+        noise = np.random.default_rng(0).normal(GAIN_DB, STD_DB, len(linked))
+        return np.where(linked, NLOS, OUTAGE).astype(np.uint8), np.where(linked, noise, -150.0)
+
+
+@functools.cache
+def make_room_links(maps, links, seed):
+    rng = np.random.default_rng(seed)
+    partial, in_seen_room, rx_m = [], [], []
+    for _ in range(maps):
+        seen = np.kron(rng.permutation(ROOMS**2).reshape(ROOMS, ROOMS) % 2, np.ones((ROOM_CELLS, ROOM_CELLS))) > 0
+        place = rng.permutation(seen.size)[:links]
+        state = np.where(seen, FREE, UNKNOWN)
+        state.ravel()[place] = state[len(seen) // 2, len(seen) // 2] = UNKNOWN
+        partial.append(PartialMap(state, RESOLUTION_M, (-HALF_M, -HALF_M)))
+        in_seen_room.append(seen.ravel()[place])
+        cells = np.column_stack(np.divmod(place, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
+        rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
+    count = maps * links
+    path_seen = rng.uniform(size=count) < 0.5
+    gains_db = np.full((count, len(ATTENUATION_LENGTHS_M)), -90.0)
+    gains_db[~path_seen, -1] = -150.0
+    where, tx_m = (tuple(partial), np.repeat(np.arange(maps), links)), (0.01, 0.01, 1.5)
+    known = {"unobserved_m": 3.0, "distance_m": DISTANCE_M, "state": NLOS, "gain_db": -90.0, "indirect_db": gains_db}
+    phi = features(where, np.concatenate(rx_m), tx_m=tx_m, **known)
+    order = rng.permutation(count)
+    return Links(phi.take(order), np.concatenate(in_seen_room)[order], path_seen[order])
+
+
+TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
+"""Arguments of `make_room_links` for links to learn from, and for links on other maps."""
+
+
+@functools.cache
+def trained(networks, rule):
+    """Return networks trained by a rule, and the losses on the way: few small steps, of greater rate, are enough."""
+    links, losses = make_room_links(*TRAINING), []
+    settings = PredictorSettings(networks, passes=100 if networks == "paths" else 16)
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("LEARNING_RATE", 0.01), ("WINDOWS_AT_ONCE", 8), ("_REPORT_STEPS", 8)):
+            patch.setattr(module, name, value)
+        found = fit_context_networks(
+            links.phi,
+            *links.truth(getattr(links, rule)),
+            settings,
+            progress=lambda share, message: losses.append(float(message.rpartition(" ")[2])),
+        )
+    return found, losses
+
+
+def scores(networks, rule):
+    """Return accuracy, cross-entropy and mean NLOS gain [dB] on other maps."""
+    links = make_room_links(*OTHERS)
+    state, _ = links.truth(getattr(links, rule))
+    probabilities, means_db, _ = evaluate_context_networks(networks, links.phi, FREQUENCY_HZ)
+    accuracy = (probabilities.argmax(axis=0) == state).mean()
+    entropy = -np.log(probabilities[state, np.arange(len(state))]).mean()
+    return accuracy, entropy, means_db[NLOS][state == NLOS].mean()
+
+
+def few_links():
+    """Return the arguments of a training that takes no time: four windows."""
+    return make_seen_links(200)
+
+
+class TestFitContextNetworks:
+    def test_links_of_the_rules_look_alike(self):
+        """The rooms are seen on the map alone, the paths in one column and what is made of it alone."""
+        links = make_room_links(*OTHERS)
+        assert np.flatnonzero(np.ptp(link_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [21, 27]
+        assert not links.phi.context.rx_seen.any()
+        assert 0.4 < links.in_seen_room.mean() < 0.6
+
+    def test_paths(self):
+        accuracy, entropy, gain_db = scores(trained("paths", "path_seen")[0], "path_seen")
+        assert accuracy == 1.0
+        assert entropy < 0.01
+        assert gain_db == pytest.approx(GAIN_DB, abs=1.0)
+
+    def test_paths_do_not_show_where_receivers_are(self):
+        accuracy, entropy, _ = scores(trained("paths", "in_seen_room")[0], "in_seen_room")
+        assert accuracy < 0.6
+        assert entropy > math.log(2.0) - 0.01
+
+    def test_map(self):
+        accuracy, entropy, gain_db = scores(trained("map", "in_seen_room")[0], "in_seen_room")
+        assert accuracy > 0.9
+        assert entropy < 0.5 * math.log(2.0)
+        assert gain_db == pytest.approx(GAIN_DB, abs=4.0)
+
+    @pytest.mark.parametrize("arguments", [("paths", "path_seen"), ("map", "in_seen_room")], ids=str)
+    def test_the_loss_falls(self, arguments):
+        found, losses = trained(*arguments)
+        assert losses[-1] < 0.6 * losses[0]
+        untrained = context_networks(0, with_map=arguments[0] == "map")
+        assert found.keys() == untrained.keys()
+        for name, network in found.items():
+            assert network.input_shape == untrained[name].input_shape
+            assert all(np.isfinite(weight).all() for weight in network.get_weights())
+
+    def test_same_links_same_weights_and_other_seeds_others(self):
+        one, again, other = (
+            fit_context_networks(*few_links(), PredictorSettings("paths", passes=8, seed=seed))[LINK_NETWORK]
+            for seed in (0, 0, 1)
+        )
+        for weight, same, different in zip(*(each.get_weights() for each in (one, again, other)), strict=True):
+            np.testing.assert_array_equal(weight, same)
+            assert (weight != different).any()
+
+    def test_progress(self, caplog):
+        calls = []
+        with caplog.at_level(logging.INFO, module.__name__):
+            settings = PredictorSettings("paths", passes=18)
+            fit_context_networks(*few_links(), settings, progress=lambda *call: calls.append(call))
+        ((done, message),) = calls
+        assert done == 0.0
+        assert message.startswith("step 0 of 5, loss ")
+        (message,) = (record.message for record in caplog.records if record.name == module.__name__)
+        assert message.startswith("5 steps on 4 windows: loss ")
+
+    def test_diverging_training(self):
+        phi, state, gain_db = few_links()
+        with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
+            fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
+
+
+def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
+    gain_db = np.linspace(-60.0, 60.0, 120_001)
+    errors_db, stds_db = np.array([0.0, 2.5, -7.0, 20.0]), np.array([1.0, 4.0, 3.0, 0.5])
+    below = norm.cdf(gain_db / stds_db[:, None])
+    expected = trapezoid((below - (gain_db >= errors_db[:, None])) ** 2, gain_db)
+    np.testing.assert_allclose(module._crps(errors_db, stds_db), expected, atol=2e-3)
+
+
+@pytest.fixture(scope="module")
+def links():
+    return make_room_links(*OTHERS)
+
+
+@pytest.fixture(scope="module")
+def examples(links):
+    """Gains are the numbers of the links."""
+    numbers = np.arange(len(links.phi), dtype=np.float64)
+    state = links.truth(links.in_seen_room)[0]
+    return module._Examples(links.phi, state, numbers, PredictorSettings("map"))
+
+
+class TestExamples:
+    def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
+        """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
+        phi, half, cell_m = links.phi, WINDOW_CELLS / 2, 0.3
+        inputs, state = link_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
+        turns = set()
+        for batch in examples.batches(4, np.random.default_rng(4)):
+            for number, drawn in enumerate(batch["gain_db"].astype(int)):
+                (window,) = set(phi.context.window_index[drawn])
+                offsets_m, moved_m = receiver_offsets_m(phi)[drawn], batch["offsets_m"][number]
+                before, after = ((each / cell_m + half).astype(int).T[::-1] for each in (offsets_m, moved_m))
+                image = batch["windows"][number, 0]
+                np.testing.assert_array_equal(image[*after], phi.context.windows[window, 0][*before])
+                swapped = not np.allclose(abs(moved_m), abs(offsets_m), atol=1e-4)
+                turns.add((swapped, *np.sign(moved_m[0] * (offsets_m[0, ::-1] if swapped else offsets_m[0]))))
+                np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
+                np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
+                free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
+                np.testing.assert_allclose(batch["free_db"][number], free_db, rtol=1e-6)
+        assert len(turns) == 8
+
+    def test_each_pass_has_every_window_once(self, links, examples):
+        drawn = [
+            links.phi.context.window_index[int(numbers[0])]
+            for batch in examples.batches(3, np.random.default_rng(6))
+            for numbers in batch["gain_db"]
+        ]
+        count = len(examples)
+        passes = [sorted(drawn[start : start + count]) for start in range(0, len(drawn) - count, count)]
+        assert passes == [list(range(count))] * 7
+
+    def test_without_a_map_network_there_are_no_windows(self, links):
+        found = module._Examples(links.phi, *links.truth(links.path_seen), PredictorSettings("paths"))
+        (batch,) = found.batches(1, np.random.default_rng(7))
+        assert "windows" not in batch

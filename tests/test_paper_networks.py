@@ -1,0 +1,231 @@
+"""The paper's networks: architecture, evaluation, and training on links of a known model."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from predictor_links import (
+    FREQUENCY_HZ,
+    LOS,
+    NLOS,
+    OUTAGE,
+    QUICK,
+    QUIET,
+    arrays,
+    assert_valid,
+    make_links,
+    p_kept,
+    quick_predictor,
+    trained_predictor,
+    true_gain,
+)
+
+from sionna_partial.constants import LinkState
+from sionna_partial.errors import PredictorError
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.paper_networks import (
+    FEATURES,
+    GAIN_NETWORKS,
+    OUTPUT_WIDTHS,
+    assemble,
+    evaluate_paper,
+    free_space_gain_db,
+    import_keras,
+    network_ranges,
+    own_input,
+    parts,
+)
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.settings import PredictorSettings
+
+pytestmark = QUIET
+
+
+@pytest.fixture(scope="module")
+def quick():
+    return quick_predictor()
+
+
+def test_free_space():
+    """Friis at 1 m and 28 GHz is -61.39 dB (32.45 + 20 log10(MHz km)), and falls by 6.02 dB for twice the distance."""
+    found = free_space_gain_db(np.array([0.0, 0.01, 1.0, 2.0]), FREQUENCY_HZ)
+    np.testing.assert_allclose(found, [-21.391, -21.391, -61.391, -67.412], atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs", "units"),
+    [
+        ("gain_los_given_los", ["distance_m", "unobserved_distance_m", "gain_db"], 20),
+        ("gain_los_given_nlos_outage", ["distance_m"], 10),
+        ("gain_nlos_given_nlos_outage", ["distance_m", "unobserved_distance_m", "gain_db"], 20),
+        ("gain_nlos_given_los", ["distance_m"], 10),
+    ],
+)
+def test_gain_network_is_that_of_the_table(quick, name, inputs, units):
+    network = quick.model.get_layer(name)
+    assert list(network.input) == inputs
+    assert network.output.shape == (None, 2)
+    dense = [layer for layer in network.layers if type(layer).__name__ == "Dense"]
+    hidden, heads = dense[:2], dense[2:]
+    assert [layer.kernel.shape for layer in hidden] == [(len(inputs), units), (units, units)]
+    assert [layer.activation.__name__ for layer in hidden] == ["relu", "relu"]
+    assert [layer.kernel.shape for layer in heads] == [(units, 1), (units, 1)]
+
+
+def test_rows_cover_the_table_once():
+    served = [(row.link_state, partial) for row in GAIN_NETWORKS for partial in row.partial_states]
+    assert sorted(served) == [(state, partial) for state in (LOS, NLOS) for partial in LinkState]
+
+
+@pytest.mark.parametrize("state", LinkState)
+def test_classifiers_are_logistic(quick, state):
+    classifier = quick.model.get_layer(f"state_given_{state.name.lower()}")
+    assert list(classifier.input) == ["distance_m", "unobserved_distance_m"]
+    assert [weights.shape for weights in classifier.get_weights()] == [(2, 3), (3,)]
+    indoor = quick.model.get_layer(f"indoor_given_{state.name.lower()}")
+    assert list(indoor.input) == ["unobserved_distance_m"]
+    assert [weights.shape for weights in indoor.get_weights()] == [(1, 1), (1,)]
+
+
+def test_links_do_not_depend_on_each_other(quick):
+    phi, _, _ = make_links(300, seed=3)
+    together, alone = quick.predict(phi), quick.predict(phi.take(slice(7, 8)))
+    for name, values in arrays(alone).items():
+        np.testing.assert_allclose(values, arrays(together)[name][7:8], rtol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize("partial_state", LinkState)
+def test_sane_far_beyond_the_training_links(quick, partial_state):
+    distance_m = np.array([0.0, 1e-6, 0.1, 1.0, 10.0, 60.0, 1e4, 1e9, 1e200])
+    for share in (0.0, 1.0):
+        for gain_db in (-150.0, -40.0, 1e300):
+            states, gains_db = np.full(9, partial_state), np.full(9, gain_db)
+            assert_valid(quick.predict(LinkFeatures(states, share * distance_m, distance_m, gains_db)))
+
+
+def times(factor, name):
+    """Return a network that multiplies five numbers."""
+    keras = import_keras()
+    place = keras.Input((5,), name="five")
+    return keras.Model(place, keras.layers.Rescaling(factor, name="times")(place), name=name)
+
+
+@pytest.fixture(scope="module")
+def model(quick):
+    """The networks of the paper, and others, put together."""
+    factors = {"twice": 2.0, "never": 0.0, "once": 1.0, "double": 2.0}
+    return assemble(parts(quick.model) | {name: times(factor, name) for name, factor in factors.items()})
+
+
+class TestAssemble:
+    def test_others_have_inputs_and_outputs_of_their_own(self, model):
+        others = ["double", "never", "once", "twice"]
+        assert own_input("double") == "input_of_double"
+        assert list(model.input) == [*FEATURES, *map(own_input, others)]
+        assert list(model.output) == [*OUTPUT_WIDTHS, *others] == list(parts(model))
+        inputs = {name: np.ones((3, 1), dtype=np.float32) for name in FEATURES}
+        inputs |= {own_input(name): np.full((3, 5), number, dtype=np.float32) for number, name in enumerate(others)}
+        outputs = model(inputs)
+        for name, expected in {"double": 0.0, "never": 0.0, "once": 2.0, "twice": 6.0}.items():
+            np.testing.assert_array_equal(outputs[name], np.full((3, 5), expected))
+        np.testing.assert_array_equal(parts(model)["double"](np.ones((2, 5))), np.full((2, 5), 2.0))
+
+    def test_evaluation_of_the_papers_leaves_others_out(self, quick, model):
+        phi = make_links(30, seed=3)[0]
+        alone, found = (evaluate_paper(parts(each), phi) for each in (quick.model, model))
+        for one, other in zip(alone, found, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+    def test_ranges_are_those_of_the_papers_in_their_order(self, quick, model):
+        assert network_ranges(model) == network_ranges(quick.model)
+        assert list(network_ranges(model)) == list(OUTPUT_WIDTHS)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    return trained_predictor()
+
+
+def test_recovers_a_known_model(trained):
+    phi, _, _ = make_links(3000, seed=1)
+    answer = trained.predict(phi)
+    p_partial = np.choose(phi.link_state, [answer.p_outage, answer.p_los, answer.p_nlos])
+    assert np.abs(p_partial - p_kept(phi)).mean() < 0.03
+    for given, mean_db, std_db in (
+        (LOS, answer.gain_los_mean_db, answer.gain_los_std_db),
+        (NLOS, answer.gain_nlos_mean_db, answer.gain_nlos_std_db),
+    ):
+        served = phi.link_state == given
+        true_mean_db, true_std_db = true_gain(phi, np.full(len(phi), given))
+        assert np.abs(mean_db - true_mean_db)[served].mean() < 0.7
+        assert np.abs(std_db / true_std_db - 1.0)[served].mean() < 0.12
+
+
+def test_likelihood_ignores_the_gain_of_outages():
+    phi, state, gain_db = make_links(500)
+    settings = dataclasses.replace(QUICK, minimum_links=20)
+    spoilt_db = np.where(state == OUTAGE, -77.0, gain_db)
+    models = [Predictor.fit(phi, state, values, settings=settings).model for values in (gain_db, spoilt_db)]
+    for one, other in zip(*(model.get_weights() for model in models), strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_same_training_same_weights(quick):
+    again = Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
+    for one, other in zip(quick.model.get_weights(), again.model.get_weights(), strict=True):
+        assert np.array_equal(one, other)
+    other_seed = Predictor.fit(*make_links(900), settings=dataclasses.replace(QUICK, seed=1))
+    assert any(
+        not np.array_equal(one, other)
+        for one, other in zip(quick.model.get_weights(), other_seed.model.get_weights(), strict=True)
+    )
+
+
+@pytest.mark.parametrize("partial_state", LinkState)
+def test_line_of_sight_fades_with_distance_like_free_space(trained, partial_state):
+    distance_m = np.geomspace(0.1, 60.0, 60)
+    free_db = free_space_gain_db(distance_m, FREQUENCY_HZ)
+    traced_db = free_db if partial_state == LOS else np.full(60, -150.0)
+    phi = LinkFeatures(np.full(60, partial_state), np.zeros(60), distance_m, traced_db)
+    answer = trained.predict(phi)
+    assert np.abs(answer.gain_los_mean_db - free_db).max() < 6.0
+    assert np.diff(answer.gain_los_mean_db[::4]).max() < 0.0
+
+
+def test_cells_without_links_fall_back_to_prior_knowledge():
+    phi, _, _ = make_links(60)
+    sight = phi.take(phi.link_state == LOS)
+    model = Predictor.fit(
+        sight, np.full(len(sight), LOS), sight.gain_db, settings=PredictorSettings(minimum_links=1000)
+    )
+    answer = model.predict(dataclasses.replace(phi, link_state=np.full(len(phi), OUTAGE)))
+    free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
+    np.testing.assert_allclose([answer.p_los, answer.p_nlos, answer.p_outage], 1 / 3, atol=1e-6)
+    np.testing.assert_allclose(answer.gain_los_mean_db, free_db, atol=1e-3)
+    np.testing.assert_allclose(answer.gain_los_std_db, 6.0, rtol=1e-4)
+    np.testing.assert_allclose(answer.gain_nlos_mean_db, free_db - 20.0, atol=1e-3)
+    np.testing.assert_allclose(answer.gain_nlos_std_db, 15.0, rtol=1e-4)
+    few = model.predict(sight)
+    assert (few.p_los > 0.8).all()
+    assert (few.gain_los_std_db < 6.0).all()
+
+
+def test_indoor(quick):
+    phi, _, _ = make_links(6000, seed=4)
+    assert quick.predict_indoor(phi).min() > 0.999
+    p_inside = 1.0 / (1.0 + np.exp(phi.unobserved_distance_m - 4.0))
+    inside = np.random.default_rng(0).uniform(size=len(phi)) < p_inside
+    model = quick.fit_indoor(phi, inside)
+    assert np.abs(model.predict_indoor(phi) - p_inside).mean() < 0.03
+    assert np.array_equal(model.predict(phi).p_los, quick.predict(phi).p_los)
+    assert quick.predict_indoor(phi).min() > 0.999
+    assert model.fingerprint != quick.fingerprint
+
+
+def test_diverging_training():
+    phi, state, gain_db = make_links(300)
+    settings = PredictorSettings(steps=3, minimum_links=10)
+    with pytest.raises(
+        PredictorError, match=r"training of gain_\w+ diverged: learning_rate = 0.01, give a smaller one"
+    ):
+        Predictor.fit(phi, state, np.where(gain_db > -150.0, gain_db + 1e30, gain_db), settings=settings)
