@@ -1,0 +1,178 @@
+"""Valid small inputs for hostile cases to spoil, and how each is read."""
+
+import functools
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import sionna_partial as sp
+
+HERE = str(Path(__file__).parent)
+
+TX = (1.1, 1.1, 1.5)
+
+CUBE = np.array([(x, y, z) for x in (0.0, 4.0) for y in (0.0, 3.0) for z in (0.0, 2.5)])
+FACES = (
+    *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
+    *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
+)
+
+
+class Wrong(Exception):
+    """A result that nobody should trust came back."""
+
+
+def must_refuse(call: Callable[[], Any]) -> None:
+    """Call, and raise `Wrong` unless it is refused."""
+    try:
+        result = call()
+    except sp.SionnaPartialError:
+        return
+    raise Wrong(f"accepted, and gave {str(result)[:200]}")
+
+
+def python(code: str, *, seconds: float = 60.0, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run Python code in a process of its own, with other environment variables."""
+    environment = os.environ | {"PYTHONPATH": str(Path(sp.__file__).parents[1])} | variables
+    return subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=seconds, check=False
+    )
+
+
+def must_end_in_one_line(result: subprocess.CompletedProcess[str], *codes: int) -> None:
+    """Raise `Wrong` for a traceback, a signal or another exit code than those allowed."""
+    if result.returncode not in codes or "Traceback" in result.stderr:
+        raise Wrong(f"exit {result.returncode}: {result.stderr[-1500:]}")
+
+
+def room() -> sp.PartialMap:
+    """Return a room of 4 x 3 m, a wall with a door in its middle, the right part partly unknown."""
+    state = np.zeros((15, 20), dtype=np.uint8)
+    state[[0, -1]] = state[:, [0, -1]] = sp.CellState.WALL
+    state[:9, 10] = sp.CellState.WALL
+    state[2:8, 14:19] = sp.CellState.UNKNOWN
+    return sp.PartialMap(state, 0.2)
+
+
+def _yaml(folder: Path) -> Path:
+    sp.save_map(room(), folder / "map.yaml")
+    return folder / "map.yaml"
+
+
+def _npz(folder: Path) -> Path:
+    sp.save_map(room(), folder / "map.npz")
+    return folder / "map.npz"
+
+
+def _ply(folder: Path) -> Path:
+    rows = ["ply", "format ascii 1.0", f"element vertex {len(CUBE)}", *(f"property float {axis}" for axis in "xyz")]
+    rows += [f"element face {len(FACES)}", "property list uchar int vertex_indices", "end_header"]
+    rows += [" ".join(map(str, point)) for point in CUBE] + [f"3 {a} {b} {c}" for a, b, c in FACES]
+    path = folder / "room.ply"
+    path.write_text("\n".join(rows) + "\n", encoding="ascii")
+    return path
+
+
+def _obj(folder: Path) -> Path:
+    rows = [f"v {x} {y} {z}" for x, y, z in CUBE] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in FACES]
+    path = folder / "room.obj"
+    path.write_text("\n".join(rows) + "\n", encoding="ascii")
+    return path
+
+
+def _scene(folder: Path) -> Path:
+    sp.export_scene(room(), folder / "scene")
+    return folder / "scene" / "scene.xml"
+
+
+def _csv(folder: Path) -> Path:
+    path = folder / "measured.csv"
+    rows = [f"1.1,1.1,1.5,{0.5 + 0.1 * k:.2f},2.3,1.5,{-60.0 - k}" for k in range(12)]
+    path.write_text("\n".join(["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db", *rows]) + "\n", encoding="ascii")
+    return path
+
+
+def _predictor(folder: Path) -> Path:
+    shipped = Path(sp.__file__).parent / "predictors"
+    for suffix in ("keras", "json"):
+        shutil.copy(shipped / f"paper.{suffix}", folder / f"mine.{suffix}")
+    return folder / "mine.keras"
+
+
+@functools.cache
+def _coverage_bytes() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "coverage.nc"
+        sp.save_coverage(sp.predict_map(room(), TX, spacing_m=0.5, predictor="paper"), path)
+        return path.read_bytes()
+
+
+def _coverage(folder: Path) -> Path:
+    path = folder / "coverage.nc"
+    path.write_bytes(_coverage_bytes())
+    return path
+
+
+def _read_coverage(path: Path) -> None:
+    import xarray as xr
+
+    try:
+        coverage = xr.load_dataset(path)
+    except Exception:  # xarray reads it, not we
+        return
+    sp.save_coverage(coverage, path.with_name("again.csv"))
+    sp.plot_coverage(coverage)
+
+
+@functools.cache
+def _dataset_folder() -> Path:
+    folder = Path(tempfile.mkdtemp(prefix="hostile_dataset_"))
+    settings = sp.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0, 5))
+    sp.build_dataset(folder / "links", [1], settings, workers=1)
+    return folder / "links"
+
+
+def _dataset(folder: Path) -> Path:
+    shutil.copytree(_dataset_folder(), folder / "links")
+    return next((folder / "links").rglob("*.parquet"))
+
+
+KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
+    "map.yaml": (_yaml, sp.load_map),
+    "map.pgm": (lambda folder: _yaml(folder).with_suffix(".pgm"), lambda path: sp.load_map(path.with_suffix(".yaml"))),
+    "map.npz": (_npz, sp.load_map),
+    "mesh.ply": (_ply, lambda path: sp.load_map(path, resolution_m=0.2)),
+    "mesh.obj": (_obj, lambda path: sp.load_map(path, resolution_m=0.2)),
+    "scene.xml": (_scene, lambda path: sp.load_map(path, resolution_m=0.2)),
+    "scene folder": (_scene, lambda path: sp.load_map(path.parent)),
+    "measurements.csv": (_csv, lambda path: sp.calibrate_materials(room(), path)),
+    "predictor.keras": (_predictor, sp.Predictor.load),
+    "predictor.json": (
+        lambda folder: _predictor(folder).with_suffix(".json"),
+        lambda path: sp.Predictor.load(path.with_suffix(".keras")),
+    ),
+    "coverage.nc": (_coverage, _read_coverage),
+    "dataset.parquet": (_dataset, lambda path: sp.read_dataset(path.parent.parent)),
+    "dataset.json": (
+        lambda folder: _dataset(folder).parent.parent / "dataset.json",
+        lambda path: sp.read_dataset(path.parent),
+    ),
+}
+"""By name of the kind: what writes a valid file into a folder, and what reads it."""
+
+
+def read(kind: str, path: Path) -> Any:
+    """Read a file of a kind as a user would."""
+    return KINDS[kind][1](path)
+
+
+def valid(kind: str, folder: Path) -> Path:
+    """Write a valid file of a kind into a folder."""
+    return KINDS[kind][0](folder)

@@ -1,0 +1,86 @@
+"""Run the cases of a folder one after the other, and write down how each ends (see attack.py)."""
+
+import contextlib
+import io
+import json
+import os
+import sys
+import tempfile
+import traceback
+import warnings
+from pathlib import Path
+from typing import Any
+
+
+def command(*arguments: object) -> str:
+    """Run the command line in this process; return what it wrote.
+
+    Raises
+    ------
+    Refused
+        If it ended with exit code 2 and one error line.
+    """
+    from sionna_partial.cli import app
+
+    out, err = io.StringIO(), io.StringIO()
+    code: Any = 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            app([*map(str, arguments)], prog_name="sionna-partial")
+        except SystemExit as end:
+            code = end.code
+    errors = [line for line in err.getvalue().splitlines() if line.startswith("error: ")]
+    if code == 2 and (len(errors) == 1 or "Usage:" in err.getvalue()):
+        raise Refused(errors[0] if errors else err.getvalue())
+    assert code in (0, None), f"exit code {code}: {err.getvalue()[-500:]}"
+    return out.getvalue()
+
+
+class Refused(Exception):
+    """The command line refused its input as it should."""
+
+
+def run(code: str, folder: Path) -> tuple[str, str]:
+    """Run the code of a case in an empty folder; return how it ended, and its message."""
+    import numpy as np
+    from inputs import Wrong
+
+    import sionna_partial as sp
+
+    names = {"sp": sp, "np": np, "folder": folder, "command": command, "Path": Path}
+    try:
+        exec(code, names)
+    except (sp.SionnaPartialError, Refused) as error:
+        message = str(error)
+        return ("refused" if message.strip() else "traceback"), message
+    except Wrong as error:
+        return "wrong", str(error)
+    except BaseException:
+        return "traceback", " | ".join(traceback.format_exc().splitlines()[-4:])
+    return "works", ""
+
+
+def main() -> None:
+    """Run all cases."""
+    home = Path(sys.argv[1])
+    sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+    sys.path.insert(0, str(Path(__file__).parent))
+    warnings.simplefilter("ignore")
+    with (home / "reports").open("a", encoding="utf-8") as reports:
+        for number, (_, code) in enumerate(json.loads((home / "cases").read_text(encoding="utf-8"))):
+            folder = home / f"case{number}"
+            folder.mkdir()
+            os.chdir(folder)
+            ending, message = run(code, folder)
+            left = sorted(path.name for path in folder.rglob("*") if path.name.startswith((".tmp", "sionna_partial_")))
+            left += sorted(
+                path.name for path in Path(tempfile.gettempdir()).iterdir() if path.name.startswith("sionna_partial_")
+            )
+            if left and ending in ("works", "refused"):
+                ending, message = "left behind", ", ".join(left)
+            reports.write(json.dumps([ending, message[:2000]]) + "\n")
+            reports.flush()
+
+
+if __name__ == "__main__":
+    main()
