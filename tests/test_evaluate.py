@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
-from predictor_links import LOS, OUTAGE, QUIET, context_predictor, corridors, quick_predictor
+from predictor_links import LOS, OUTAGE, QUIET, quick_predictor
 
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import PredictorError
@@ -20,7 +20,6 @@ from sionna_partial.evaluation.evaluate import (
 )
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.windows import map_windows
 
 pytestmark = QUIET
 
@@ -126,19 +125,6 @@ class TestEvaluate:
         rows = evaluate(quick_predictor(), right, baselines=fitted_baselines()).select(model="partial trace")
         assert {(row.metrics.accuracy, row.metrics.rmse_db, row.metrics.nll_state) for row in rows} == {(1.0, 0.0, 0.0)}
         assert set(right.link_state) >= {LOS, OUTAGE}
-
-    def test_windows_of_a_stage_are_drawn_once(self, table, monkeypatch):
-        """For the test homes and for the training homes."""
-        drawn = []
-
-        def counted(partial, tx_m):
-            drawn.append(len(tx_m))
-            return map_windows(partial, tx_m)
-
-        predictor = dataclasses.replace(context_predictor("map"), homes=("home 0",))
-        monkeypatch.setattr("sionna_partial.prediction.windows.map_windows", counted)
-        evaluate(predictor, table, baselines=fitted_baselines())
-        assert drawn == [1] * (2 * 2 * len(corridors()))
 
     def test_progress(self, table):
         calls = []

@@ -139,7 +139,7 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("options", "message"),
         [
-            ({"objective": "all"}, "objective = 'all' is not allowed: give 'coverage' or 'percentile'"),
+            ({"objective": "all"}, "objective = 'all' is not allowed: choose one of"),
             ({"threshold_db": -150.0}, r"threshold_db = -150\.0 is not allowed: give a number in \(-150, 0\]"),
             ({"threshold_db": 0.1}, r"threshold_db = 0\.1 is not allowed"),
             ({"threshold_db": "loud"}, "threshold_db = 'loud' is not allowed"),
