@@ -1,7 +1,6 @@
 """The trace against closed forms and against stock Sionna RT."""
 
 import dataclasses
-import doctest
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing import trace
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
 
@@ -77,11 +75,6 @@ def test_free_space_gain_delay_and_angles() -> None:
     np.testing.assert_allclose(links.delay_s, distance / SPEED_OF_LIGHT_M_S, rtol=1e-5)
     np.testing.assert_allclose(links.departure_rad[0], [np.pi / 2, np.arctan2(4, 3)], atol=1e-5)
     np.testing.assert_allclose(links.arrival_rad[0], [np.pi / 2, np.arctan2(-4, -3)], atol=1e-5)
-
-
-def test_example_in_the_documentation() -> None:
-    result = doctest.testmod(trace)
-    assert (result.attempted, result.failed) == (6, 0)
 
 
 def test_one_mirror_image_with_the_slab_reflection_coefficient() -> None:

@@ -15,11 +15,11 @@ from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.style import RED, corners_m, shade, window_m
+from sionna_partial.plots.style import RED, STAR, corners_m, legend_below, shade, window_m
 
 _WIDTH_IN, _DPI = 9.0, 130
 _WALL, _UNKNOWN = "black", "0.86"
-_STAR: dict[str, Any] = {"marker": "*", "markersize": 15, "markerfacecolor": "white", "markeredgecolor": "black"}
+_STAR: dict[str, Any] = STAR | {"markersize": 15}
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
@@ -36,7 +36,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot: it need not be closed.
+        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
@@ -58,7 +58,14 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     bar = figure.colorbar(squares, ax=axis, label=label, shrink=0.8)
     if coverage:
         bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
-    _add_legend(figure)
+    handles = [
+        Line2D([], [], label="transmitter", **_STAR),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
+        Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
+        Patch(color=_WALL, label="wall"),
+        Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
+    ]
+    legend_below(figure, handles)
     return figure
 
 
@@ -107,15 +114,4 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
     x, y = placement.trajectory_m[:, :2].T
     axis.plot(x, y, color=RED, marker="o", markersize=4, linewidth=1.8, zorder=5)
     x, y = placement.position_m[:2]
-    axis.plot(x, y, linestyle="none", zorder=6, **_STAR)
-
-
-def _add_legend(figure: Figure) -> None:
-    handles = [
-        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
-        Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
-        Patch(color=_WALL, label="wall"),
-        Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    axis.plot(x, y, zorder=6, **_STAR)

@@ -116,6 +116,20 @@ def import_keras() -> ModuleType:
     return keras
 
 
+class _TensorFlow:
+    """TensorFlow, imported after Keras when something of it is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        import_keras()
+        import tensorflow
+
+        setattr(self, name, getattr(tensorflow, name))
+        return getattr(tensorflow, name)
+
+
+tf: Any = _TensorFlow()
+
+
 def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
     """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
     return _gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
@@ -192,7 +206,6 @@ def distribution_by_paper(
 
     Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
-    import tensorflow as tf
 
     def outputs(name: str) -> Any:
         network = networks[name]

@@ -3,5 +3,5 @@
 - `finder` writes the scene of a map and finds its paths: exact candidates of floor plans (`plan`), or those that rays
   find in meshes (`mesh`), which `engine` verifies on Sionna RT's internals. `stock` does without these.
 - `trace` is the door for links; `path_set` is the forward model: power and vertices of paths found once, for
-  other parameters, and their derivatives; `gradients` asks it.
+  other parameters, and their derivatives.
 """
