@@ -14,7 +14,7 @@ from sionna_partial.scene.scene import SHAPES, build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import SceneSolver, load_sionna
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.stock import listed_before, stock_paths
+from sionna_partial.tracing.trace import listed_before, stock_paths
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 NO_FLOOR = SceneSettings(floor_extent="none")
