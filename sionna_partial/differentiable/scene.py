@@ -59,7 +59,7 @@ from sionna_partial.prediction.paper_networks import (
     tf,
 )
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.unobserved import Bools, unobserved_lengths_m
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
@@ -342,16 +342,22 @@ class _Legs:
     """The straight legs of the Q indirect paths: what moves with the transmitter, and how much of it is unobserved.
 
     `paths` are their numbers (Q,), `rx` their receivers (Q,), `unobserved_m` their lengths in unknown cells as traced
-    (Q,) [m], and `strongest` is the strongest of them to each receiver (N,), -1 where there is none.
+    (Q,) [m], and `strongest` is the strongest of them to each receiver (N,), -1 where there is none. Legs join nodes,
+    which are numbered in this order: the transmitter, the receivers, and all vertices, path by path.
     """
 
     def __init__(self, partial: PartialMap, paths: PathSet) -> None:
         self.paths = np.flatnonzero(~paths.is_direct)
         self.rx = paths.path_rx[self.paths]
         self._rx_m = paths.rx_m
-        vertices_m = paths.vertices_m[self.paths]
-        self._of_path, self._start, self._end = _leg_nodes(paths.interactions[self.paths] > 0, self.rx, len(paths.rx_m))
+        interacts, vertices_m = paths.interactions[self.paths] > 0, paths.vertices_m[self.paths]
         nodes_m = np.concatenate([paths.base.tx_m[None], paths.rx_m, vertices_m.reshape(-1, 3)])
+        first = np.zeros((len(self.rx), 1), dtype=np.intp)
+        numbers = 1 + len(paths.rx_m) + np.arange(interacts.size).reshape(interacts.shape)
+        exists = np.pad(interacts, ((0, 0), (1, 1)), constant_values=True)
+        of_path, nodes = np.nonzero(exists)[0], np.hstack([first, numbers, 1 + self.rx[:, None]])[exists]
+        same = of_path[:-1] == of_path[1:]
+        self._of_path, self._start, self._end = of_path[:-1][same], nodes[:-1][same], nodes[1:][same]
         self._base = nodes_m[self._start], nodes_m[self._end]
         self._exact_m = unobserved_lengths_m(partial, *self._base)
         self.unobserved_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
@@ -366,22 +372,6 @@ class _Legs:
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
         moved_m = moved_lengths_m(lengths, self._exact_m, self._base, ends)
         return tf.math.unsorted_segment_sum(moved_m, self._of_path, len(self.rx))
-
-
-def _leg_nodes(
-    interacts: Bools, rx: NDArray[np.int32], receivers: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Path, start and end of each leg of Q paths that interact at some of D vertices (Q, D), to receivers (Q,).
-
-    Nodes are numbered in this order: the transmitter, the receivers, and all vertices, path by path.
-    """
-    paths, depth = interacts.shape
-    vertices = 1 + receivers + np.arange(paths * depth).reshape(paths, depth)
-    all_nodes = np.column_stack([np.zeros(paths, dtype=np.intp), vertices, 1 + rx])
-    there = np.column_stack([np.ones(paths, dtype=bool), interacts, np.ones(paths, dtype=bool)])
-    of_path, nodes = np.nonzero(there)[0], all_nodes[there]
-    on = of_path[:-1] == of_path[1:]
-    return of_path[:-1][on], nodes[:-1][on], nodes[1:][on]
 
 
 def _gain_db(power: Any) -> Any:

@@ -162,7 +162,12 @@ def gain_network(
         hidden = layer(keras, "Dense", name, units, activation="relu", kernel_initializer=start)(hidden)
     shape = layer(keras, "Dense", "mean_shape", 1, kernel_initializer="zeros")(hidden)
     offset = layer(keras, "Rescaling", "offset_db", std_db, offset_db)(shape)
-    mean = layer(keras, "Add", "mean_db")([_anchor(keras, row, tensors, frequency_hz), offset])
+    if row.anchored_to_trace:
+        anchor = tensors["gain_db"]
+    else:
+        decades = keras.ops.log10(keras.ops.maximum(tensors["distance_m"], NEAREST_M))
+        anchor = layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
+    mean = layer(keras, "Add", "mean_db")([anchor, offset])
     low, high = (2.0 * math.log(std) for std in STD_RANGE_DB)
     first = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
     spread = layer(keras, "Dense", "spread_shape", 1, activation="sigmoid", kernel_initializer="zeros")
@@ -268,14 +273,6 @@ def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, An
     offset = [-ranges[name][0] * factor for name, factor in zip(names, scale, strict=True)]
     scaled = layer(keras, "Rescaling", "scaled", scale, offset)(joined)
     return tensors, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
-
-
-def _anchor(keras: ModuleType, row: GainNetwork, tensors: Mapping[str, Any], frequency_hz: float) -> Any:
-    """Return the tensor (N, 1) of the gain from which the network gives the offset [dB]."""
-    if row.anchored_to_trace:
-        return tensors["gain_db"]
-    decades = keras.ops.log10(keras.ops.maximum(tensors["distance_m"], NEAREST_M))
-    return layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
 
 
 def _gain_at_1m_db(frequency_hz: float) -> float:

@@ -24,7 +24,7 @@ from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
 from sionna_partial.tracing.finder import part_of, write_scene_of
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
 from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
@@ -158,13 +158,9 @@ class PathSet:
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
         self._rows = [slice(*each) for each in itertools.pairwise(ends)]
-        depth = max(1, scene.settings.max_depth)
-        paths = [join_paths([], depth), *(solved for _, solved in self._parts)]
-        self.path_tx = np.concatenate([each.path_tx for each in paths])
-        self.path_rx = np.concatenate([each.path_rx for each in paths])
-        self.power = np.concatenate([np.abs(each.a) ** 2 for each in paths])
-        self.interactions = np.concatenate([_widened(each.interactions, depth, 0) for each in paths])
-        self.vertices_m = np.concatenate([_widened(each.vertices_m, depth, math.nan) for each in paths]) + scene.shift_m
+        paths = SolvedPaths.concatenate([solved for _, solved in self._parts], scene.settings.max_depth)
+        self.path_tx, self.path_rx, self.interactions = paths.path_tx, paths.path_rx, paths.interactions
+        self.power, self.vertices_m = np.abs(paths.a) ** 2, paths.vertices_m + scene.shift_m
 
     def __len__(self) -> int:
         """Return the number of paths P."""
@@ -333,29 +329,16 @@ def _merged(parts: list[Part]) -> list[Part]:
         depth = max(candidates.face.shape[1] for candidates, _ in some)
         candidates = Candidates.concatenate(
             [
-                replace(each, face=_widened(each.face, depth, -1), vertices_m=_widened(each.vertices_m, depth, 0.0))
+                replace(each, face=widened(each.face, depth, -1), vertices_m=widened(each.vertices_m, depth, 0.0))
                 for each, _ in some
             ]
         )
-        columns: dict[str, NDArray[Any]] = {}
-        for field in fields(SolvedPaths):
-            own = [getattr(paths, field.name) for _, paths in some]
-            if field.name in ("interactions", "vertices_m"):
-                own = [_widened(each, depth, 0 if field.name == "interactions" else math.nan) for each in own]
-            columns[field.name] = np.concatenate(own)
-        paths = SolvedPaths(**columns)
+        paths = SolvedPaths.concatenate([solved for _, solved in some], depth)
         for start in range(0, len(paths.a), PATHS_PER_BLOCK):
             rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))
             whole = len(rows) == len(paths.a)
             merged.append((candidates, paths) if whole else (candidates.rows(rows), paths.take(rows)))
     return merged
-
-
-def _widened(columns: NDArray[Any], depth: int, value: float) -> NDArray[Any]:
-    """Add interactions that there are not up to the depth D: (P, D, ...)."""
-    wide = np.full((len(columns), depth, *columns.shape[2:]), value, dtype=columns.dtype)
-    wide[:, : columns.shape[1]] = columns
-    return wide
 
 
 def one_transmitter(tx: ArrayLike) -> ArrayLike:
