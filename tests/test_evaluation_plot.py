@@ -51,7 +51,7 @@ class TestPlotStages:
 
 
 def calibration(error=0.0, links=100):
-    """Calibration with two bins of `links` links, right less often than they say by `error`."""
+    """Calibration with two bins of `links` links, less often right than their confidence by `error`."""
     counts, confidence = np.zeros(CONFIDENCE_BINS, dtype=np.int64), np.zeros(CONFIDENCE_BINS)
     counts[[8, 13]], confidence[[8, 13]] = links, [0.55, 0.9]
     accuracy = np.where(counts > 0, confidence - error, 0.0)

@@ -28,7 +28,7 @@ SETTINGS = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
 
 
 def all_slopes(found: GainGradients) -> NDArray[np.float64]:
-    """Derivatives (7, N), those of the place first."""
+    """Derivatives (7, N), those of the position first."""
     return np.vstack([found.tx_db_per_m.T, *(getattr(found, name) for name in SLOPES[1:])])
 
 
@@ -152,12 +152,16 @@ class TestGainGradients:
     def test_progress_rises_to_one(self) -> None:
         calls: list[tuple[float, str]] = []
         gain_gradients(
-            small_room(), TX_M, RX_M, settings=SETTINGS, progress=lambda share, message: calls.append((share, message))
+            small_room(),
+            TX_M,
+            RX_M,
+            settings=SETTINGS,
+            progress=lambda fraction, message: calls.append((fraction, message)),
         )
-        shares, messages = zip(*calls, strict=True)
-        assert list(shares) == sorted(shares)
-        assert shares[0] == 0.0
-        assert shares[-1] == pytest.approx(1.0)
+        fractions, messages = zip(*calls, strict=True)
+        assert list(fractions) == sorted(fractions)
+        assert fractions[0] == 0.0
+        assert fractions[-1] == pytest.approx(1.0)
         assert list(dict.fromkeys(messages)) == [
             "building the scene",
             "differentiating reflections",

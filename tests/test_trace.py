@@ -385,7 +385,7 @@ def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: Parti
     valid = paths.valid.numpy().reshape(len(rx), -1) & upright & ~junction
     delay = paths.tau.numpy().reshape(len(rx), -1)
     power = sum(part.numpy().reshape(len(rx), -1).astype(float) ** 2 for part in paths.a)
-    # A diffraction, one reflection and nothing: Sionna RT counts a part of the way twice, and is too weak.
+    # A diffraction, one reflection and nothing: Sionna RT counts a part of the trajectory twice, and is too weak.
     too_long = (kind == [8, 1, 0]).all(axis=2)
     recalled = []
     for index, path in zip(*np.nonzero(valid), strict=True):
@@ -426,7 +426,7 @@ class TestPathsOnDisk:
         assert stored.vertices_m.shape == (0, 6, 3)
 
     def test_nothing_half_written_stays(self, tmp_path: Path) -> None:
-        def stop(share: float, message: str) -> None:
+        def stop(fraction: float, message: str) -> None:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
