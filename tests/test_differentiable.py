@@ -17,7 +17,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.differentiable.scene import STEEPEST, LinkDistribution, moved_lengths_m, moved_paths
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathScene, PathSet
@@ -31,14 +31,6 @@ RX_M = np.array(
 )
 STEPS = dict(zip(PARAMETERS, (1e-3, 2e-3, 5e-3, 1e-5, 1e7), strict=True))
 OUTPUTS = tuple(field.name for field in fields(LinkDistribution))
-
-
-@pytest.fixture(scope="module")
-def tf():
-    import_keras()
-    import tensorflow
-
-    return tensorflow
 
 
 def partial_room():
@@ -112,7 +104,7 @@ class TestValues:
         for name in OUTPUTS:
             np.testing.assert_allclose(getattr(found, name), getattr(here, name), atol=1e-4, err_msg=name)
 
-    def test_arguments_may_be_of_any_kind(self, links_of, tf):
+    def test_arguments_may_be_of_any_kind(self, links_of):
         links = links_of("partial", "paper")
         tx_m = TX_M + 0.01
         kinds = (
@@ -141,7 +133,7 @@ class TestValues:
         one, other = one(tx_m=tx_m), other(tx_m=tx_m)
         assert all(getattr(one, name).numpy().tobytes() == getattr(other, name).numpy().tobytes() for name in OUTPUTS)
 
-    def test_no_receivers(self, tf):
+    def test_no_receivers(self):
         tx_m = tf.Variable(TX_M)
         for kind in MAPS:
             links = scene_of(kind).links(TX_M, [])
@@ -155,7 +147,7 @@ class TestValues:
     @pytest.mark.parametrize(
         "tx_m", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["pillar", "far", "receiver"]
     )
-    def test_impossible_positions_have_finite_slopes(self, tx_m, predictor, links_of, tf):
+    def test_impossible_positions_have_finite_slopes(self, tx_m, predictor, links_of):
         links, tx_m = links_of("partial", predictor), tf.Variable(np.array(tx_m))
         with tf.GradientTape(persistent=True) as tape:
             found = links(tx_m=tx_m)
@@ -168,23 +160,23 @@ class TestValues:
 
 class TestSlopes:
     @staticmethod
-    def outputs(found, tf):
+    def outputs(found):
         columns = [found.gain_mean_db, found.gain_std_db, 100.0 * found.p_los, 100.0 * found.coverage(-75.0, 1.0)]
         return tf.stack([*columns, found.gain_nlos_mean_db])
 
     @pytest.mark.parametrize("name", PARAMETERS)
     @pytest.mark.parametrize(("kind", "predictor"), [("partial", "paper"), ("partial", "map"), ("complete", None)])
-    def test_by_differences(self, kind, predictor, name, links_of, tf):
+    def test_by_differences(self, kind, predictor, name, links_of):
         links = links_of(kind, predictor)
         variable, step = tf.Variable(getattr(links.base, name)), STEPS[name]
         weight = np.random.default_rng(0).uniform(0.5, 1.5, len(RX_M))
         with tf.GradientTape(persistent=True) as tape:
-            here = tf.unstack(self.outputs(links(**{name: variable}), tf) @ weight[:, None])
+            here = tf.unstack(self.outputs(links(**{name: variable})) @ weight[:, None])
         found = np.array([np.ravel(tape.gradient(each, variable)) for each in here])
         value = variable.numpy()
         for entry, along in enumerate(np.eye(value.size)):
             ends_m = [value + sign * step * along.reshape(value.shape) for sign in (1, -1)]
-            ends = [self.outputs(links(**{name: tx_m}), tf).numpy() for tx_m in ends_m]
+            ends = [self.outputs(links(**{name: tx_m})).numpy() for tx_m in ends_m]
             expected = (ends[0] - ends[1]) / (2 * step)
             rounding = 1e-4 / step  # networks have single precision
             off = np.abs(found[:, entry] - expected @ weight)
@@ -192,12 +184,12 @@ class TestSlopes:
             assert np.abs(expected[0]).sum() > 5 * rounding
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
-    def test_weights(self, predictor, tf):
+    def test_weights(self, predictor):
         scene = scene_of("partial", predictor)
         links, rng = scene.links(TX_M, RX_M), np.random.default_rng(0)
         for output in range(5):
             with tf.GradientTape() as tape:
-                value = tf.reduce_sum(self.outputs(links(), tf)[output])
+                value = tf.reduce_sum(self.outputs(links())[output])
             slopes = [
                 np.zeros(w.shape) if s is None else s.numpy()
                 for w, s in zip(scene.weights, tape.gradient(value, scene.weights), strict=True)
@@ -211,7 +203,7 @@ class TestSlopes:
             for sign in (1, -1):
                 for weight, value, along in zip(scene.weights, kept, along_gradient, strict=True):
                     weight.assign(value + sign * step * along)
-                ends.append(tf.reduce_sum(self.outputs(links(), tf)[output]).numpy())
+                ends.append(tf.reduce_sum(self.outputs(links())[output]).numpy())
             for weight, value in zip(scene.weights, kept, strict=True):
                 weight.assign(value)
             expected = (ends[0] - ends[1]) / (2 * step)
@@ -219,14 +211,14 @@ class TestSlopes:
                 (slope * along).sum() for slope, along in zip(slopes, along_gradient, strict=True)
             ) == pytest.approx(expected, rel=0.03)
 
-    def test_trace_of_a_complete_map_needs_no_weights(self, links_of, tf):
+    def test_trace_of_a_complete_map_needs_no_weights(self, links_of):
         links = links_of("complete")
         with tf.GradientTape() as tape:
             value = tf.reduce_sum(links().gain_mean_db)
         assert set(tape.gradient(value, links._scene.weights)) == {None}
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
-    def test_weights_are_those_that_answer(self, predictor, tf):
+    def test_weights_are_those_that_answer(self, predictor):
         scene = scene_of("partial", predictor)
         links = scene.links(TX_M, RX_M)
         with tf.GradientTape() as tape:
@@ -283,7 +275,7 @@ class TestErrors:
         with pytest.raises(SettingsError, match=rf"{name} = .* is not allowed: {remedy}"):
             links_of("partial", "paper")(**{name: value})
 
-    def test_within_a_function(self, links_of, tf):
+    def test_within_a_function(self, links_of):
         links = links_of("partial", "paper")
         with pytest.raises(
             SettingsError, match=r"tx_m = .* is not allowed: call links eagerly, not within tf\.function"
@@ -295,7 +287,7 @@ class TestErrors:
         with pytest.raises(PositionError, match=r"tx has shape \(1, 3\): give one transmitter"):
             scene.links(TX_M[None], RX_M)
 
-    def test_second_derivatives(self, links_of, tf):
+    def test_second_derivatives(self, links_of):
         links, tx_m = links_of("partial", "paper"), tf.Variable(TX_M)
         with tf.GradientTape() as outer:
             with tf.GradientTape() as tape:
@@ -323,7 +315,7 @@ def empty() -> PathSet:
     return PathScene(small_room(), settings=sp.TraceSettings(max_depth=1)).paths(TX_M, [])
 
 
-def variables(tf, paths, *names):
+def variables(paths, *names):
     return {name: tf.Variable(getattr(paths.base, name)) for name in names}
 
 
@@ -334,7 +326,7 @@ def upstream(paths, seed=0):
 
 
 class TestMovedPaths:
-    def test_values(self, tf, paths):
+    def test_values(self, paths):
         there = {"tx_m": paths.base.tx_m + 0.01, "conductivity_s_m": np.array([0.3])}
         power, vertices_m = moved_paths(paths, {name: tf.constant(value) for name, value in there.items()})
         expected, expected_m = paths.at(replace(paths.base, **there))
@@ -343,14 +335,14 @@ class TestMovedPaths:
         np.testing.assert_array_equal(vertices_m, np.nan_to_num(expected_m))
         assert not vertices_m.numpy()[paths.interactions == 0].any()
 
-    def test_nothing_given_is_the_trace(self, tf, paths):
+    def test_nothing_given_is_the_trace(self, paths):
         power, vertices_m = moved_paths(paths, {})
         np.testing.assert_array_equal(power, paths.power)
         np.testing.assert_array_equal(vertices_m, np.nan_to_num(paths.vertices_m))
 
-    def test_gradient(self, tf, paths):
+    def test_gradient(self, paths):
         of_power, of_vertices = upstream(paths)
-        given = variables(tf, paths, *PARAMETERS)
+        given = variables(paths, *PARAMETERS)
         with tf.GradientTape() as tape:
             power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
             value = tf.reduce_sum(power * of_power) + tf.reduce_sum(vertices_m * of_vertices)
@@ -363,7 +355,7 @@ class TestMovedPaths:
             np.testing.assert_allclose(np.ravel(found[name]), expected[name], rtol=1e-9, err_msg=name)
             assert np.all(found[name].numpy() != 0.0)
 
-    def test_slopes_are_those_of_where_it_was_evaluated(self, tf, paths):
+    def test_slopes_are_those_of_where_it_was_evaluated(self, paths):
         tx_m = tf.Variable(paths.base.tx_m)
         before = paths.base.tx_m.copy()
         with tf.GradientTape() as tape:
@@ -373,8 +365,8 @@ class TestMovedPaths:
         np.testing.assert_allclose(tape.gradient(value, tx_m), paths.transmitter_slopes(paths.base)[0].sum(axis=0))
 
     @pytest.mark.parametrize("at_once", [True, False])
-    def test_jacobian(self, tf, paths, at_once):
-        given = variables(tf, paths, "tx_m", "thickness_m", "frequency_hz")
+    def test_jacobian(self, paths, at_once):
+        given = variables(paths, "tx_m", "thickness_m", "frequency_hz")
         with tf.GradientTape(persistent=True) as tape:
             power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
         options = {"experimental_use_pfor": at_once}
@@ -388,9 +380,9 @@ class TestMovedPaths:
             of_vertices = tape.jacobian(vertices_m, given["tx_m"], **options)
             np.testing.assert_allclose(of_vertices, paths.transmitter_slopes(paths.base)[1], rtol=1e-12)
 
-    def test_a_part_of_the_paths(self, tf, paths):
+    def test_a_part_of_the_paths(self, paths):
         """TensorFlow hands back derivatives of single entries in another form."""
-        given = variables(tf, paths, "tx_m", "conductivity_s_m")
+        given = variables(paths, "tx_m", "conductivity_s_m")
         with tf.GradientTape() as tape:
             power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
             value = tf.reduce_sum(tf.gather(power, [3, 5])) + 0.0 * tf.reduce_sum(tf.gather(vertices_m, [2]))
@@ -398,8 +390,8 @@ class TestMovedPaths:
         for name, each in found.items():
             np.testing.assert_allclose(each, slopes[name][[3, 5]].sum(axis=0), rtol=1e-9)
 
-    def test_no_paths(self, tf, empty):
-        given = variables(tf, empty, *PARAMETERS)
+    def test_no_paths(self, empty):
+        given = variables(empty, *PARAMETERS)
         with tf.GradientTape() as tape:
             power, vertices_m = moved_paths(empty, {name: tf.identity(each) for name, each in given.items()})
             value = tf.reduce_sum(power) + tf.reduce_sum(vertices_m)
@@ -421,45 +413,45 @@ def partial():
 
 
 class TestMovedLengths:
-    def of(self, tf, partial, rx_m, tx_m):
+    def of(self, partial, rx_m, tx_m):
         """Return lengths to receivers from where the transmitter is now."""
         first = np.broadcast_to(TX, rx_m.shape)
         exact_m = unobserved_lengths_m(partial, first, rx_m)
         ends = tf.broadcast_to(tx_m, rx_m.shape), tf.constant(rx_m)
         return exact_m, moved_lengths_m(SmoothLengths(partial, CellState.UNKNOWN), exact_m, (first, rx_m), ends)
 
-    def test_exact_where_it_was_traced(self, tf, partial, rx_m):
-        exact_m, found_m = self.of(tf, partial, rx_m, tf.constant(TX))
+    def test_exact_where_it_was_traced(self, partial, rx_m):
+        exact_m, found_m = self.of(partial, rx_m, tf.constant(TX))
         assert (exact_m > 0.5).tolist() == [True, True, True, False, False]
         np.testing.assert_array_equal(found_m, exact_m)
 
-    def test_what_was_seen_stays_so(self, tf, partial, rx_m):
+    def test_what_was_seen_stays_so(self, partial, rx_m):
         tx_m = tf.constant(TX + np.array([3.4, 1.0, 0.0]))
         assert (unobserved_lengths_m(partial, tx_m.numpy(), rx_m)[3:] > 0.3).all()
         with tf.GradientTape() as tape:
             tape.watch(tx_m)
-            found_m = self.of(tf, partial, rx_m, tx_m)[1][3:]
+            found_m = self.of(partial, rx_m, tx_m)[1][3:]
         assert found_m.numpy().tolist() == [0.0, 0.0]
         assert tape.gradient(found_m, tx_m).numpy().tolist() == [0.0, 0.0, 0.0]
 
-    def test_follows_the_frontier(self, tf, partial, rx_m):
+    def test_follows_the_frontier(self, partial, rx_m):
         """As the exact length does over a while, not in each cell."""
         step = np.array([0.0, 0.3, 0.0])
-        _, found_m = self.of(tf, partial, rx_m, tf.constant(TX + step))
+        _, found_m = self.of(partial, rx_m, tf.constant(TX + step))
         np.testing.assert_allclose(found_m, unobserved_lengths_m(partial, TX + step, rx_m), atol=0.08)
 
-    def test_gradient_by_differences(self, tf, partial, rx_m):
+    def test_gradient_by_differences(self, partial, rx_m):
         tx_m = tf.constant(TX)
         with tf.GradientTape() as tape:
             tape.watch(tx_m)
-            found_m = self.of(tf, partial, rx_m, tx_m)[1]
+            found_m = self.of(partial, rx_m, tx_m)[1]
         jacobian = tape.jacobian(found_m, tx_m)
         steps = 1e-5 * np.eye(3)
-        ends = [[self.of(tf, partial, rx_m, tf.constant(TX + s * step))[1].numpy() for step in steps] for s in (1, -1)]
+        ends = [[self.of(partial, rx_m, tf.constant(TX + s * step))[1].numpy() for step in steps] for s in (1, -1)]
         np.testing.assert_allclose(jacobian, np.transpose(np.subtract(*ends) / 2e-5), rtol=1e-4, atol=1e-7)
         assert (np.abs(jacobian[:3, :2]).max(axis=1) > 0.01).all()
 
-    def test_both_ends_count(self, tf, partial):
+    def test_both_ends_count(self, partial):
         """A segment in the unknown is as long as it is."""
         ends = [tf.Variable([[x, y, 1.5]], dtype=tf.float64) for x, y in ((5.2, 1.3), (5.7, 3.4))]
         base = tuple(end.numpy() for end in ends)
@@ -471,7 +463,7 @@ class TestMovedLengths:
         for slope, sign in zip(tape.gradient(found_m, ends), (-1, 1), strict=True):
             np.testing.assert_allclose(slope, sign * along, rtol=1e-9, atol=1e-12)
 
-    def test_steepest(self, tf, partial):
+    def test_steepest(self, partial):
         """Where the exact length is larger by far than the smooth one, it grows `STEEPEST` times as fast."""
         lengths = SmoothLengths(partial, CellState.UNKNOWN)
         start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
@@ -484,7 +476,7 @@ class TestMovedLengths:
             found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), moved))
             np.testing.assert_allclose(found_m, exact_m + pace * grown_m, rtol=1e-12)
 
-    def test_no_length_is_negative(self, tf, partial):
+    def test_no_length_is_negative(self, partial):
         lengths = SmoothLengths(partial, CellState.UNKNOWN)
         start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
         near = tf.constant(np.array([[1.5, 1.0, 1.5]]))
@@ -493,18 +485,18 @@ class TestMovedLengths:
             found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), near))
             assert found_m.numpy()[0] >= 0.0
 
-    def test_complete_map_and_no_segments(self, tf):
+    def test_complete_map_and_no_segments(self):
         complete = sp.PartialMap(np.pad(np.zeros((8, 8), dtype=np.uint8), 1, constant_values=1), 0.5)
         lengths, nothing = SmoothLengths(complete, CellState.UNKNOWN), np.zeros((0, 3))
         assert moved_lengths_m(lengths, np.zeros(0), (nothing, nothing), (tf.constant(nothing),) * 2).shape == (0,)
         ends = np.array([[1.0, 1.0, 1.0]]), np.array([[99.0, 1.0, 1.0]])
         assert moved_lengths_m(lengths, np.zeros(1), ends, tuple(map(tf.constant, ends))).numpy().tolist() == [0.0]
 
-    def test_second_derivatives_are_refused(self, tf, partial, rx_m):
+    def test_second_derivatives_are_refused(self, partial, rx_m):
         tx_m = tf.Variable(TX)
         with tf.GradientTape() as outer:
             with tf.GradientTape() as tape:
-                value = tf.reduce_sum(self.of(tf, partial, rx_m, tf.convert_to_tensor(tx_m))[1] ** 2)
+                value = tf.reduce_sum(self.of(partial, rx_m, tf.convert_to_tensor(tx_m))[1] ** 2)
             slope = tape.gradient(value, tx_m)
         with pytest.raises(LookupError, match="first derivatives only"):
             outer.gradient(slope, tx_m)
@@ -524,33 +516,33 @@ def random_parts(count=200, seed=0):
     return probabilities, means_db, stds_db
 
 
-def of(tf, *parts):
+def of(*parts):
     return LinkDistribution.of_parts(*(tf.cast(part, tf.float64) for part in parts), ops=import_keras().ops)
 
 
 class TestOfParts:
-    def test_as_link_prediction(self, tf):
+    def test_as_link_prediction(self):
         parts = random_parts()
-        found, expected = of(tf, *parts), LinkPrediction.of_parts(*parts)
+        found, expected = of(*parts), LinkPrediction.of_parts(*parts)
         assert [field.name for field in fields(found)] == [field.name for field in fields(expected)]
         for field in fields(expected):
             values = getattr(found, field.name)
             assert values.dtype == tf.float64
             np.testing.assert_allclose(values.numpy(), getattr(expected, field.name), rtol=1e-12, err_msg=field.name)
 
-    def test_slopes_by_differences(self, tf):
+    def test_slopes_by_differences(self):
         parts = [part[:, 30:][:, np.arange(170) % 4 != 2] for part in random_parts()]
         tensors = [tf.constant(part) for part in parts]
         with tf.GradientTape(persistent=True) as tape:
             tape.watch(tensors)
-            found = of(tf, *tensors)
+            found = of(*tensors)
         for name in ("gain_mean_db", "gain_std_db"):
             for index, tensor in enumerate(tensors):
                 slopes = tape.gradient(getattr(found, name), tensor, unconnected_gradients="zero")
                 for row in range(3):
                     step = 1e-5 * np.eye(3)[row][:, None]
                     ends = [
-                        getattr(of(tf, *(part + sign * step * (k == index) for k, part in enumerate(parts))), name)
+                        getattr(of(*(part + sign * step * (k == index) for k, part in enumerate(parts))), name)
                         for sign in (1, -1)
                     ]
                     expected = (ends[0] - ends[1]).numpy() / 2e-5
@@ -558,12 +550,12 @@ class TestOfParts:
                         slopes[row], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max() + 1e-5
                     )
 
-    def test_no_spread_has_no_slope(self, tf):
+    def test_no_spread_has_no_slope(self):
         """A square root has an infinite one at 0, which times 0 is NaN."""
         certain, mean_db = tf.constant([[0.0], [1.0], [0.0]], tf.float64), tf.constant([[-80.0]] * 3, tf.float64)
         with tf.GradientTape(persistent=True) as tape:
             tape.watch(mean_db)
-            found = of(tf, certain, mean_db, tf.zeros_like(mean_db))
+            found = of(certain, mean_db, tf.zeros_like(mean_db))
         assert found.gain_std_db.numpy().tolist() == [0.0]
         assert tape.gradient(found.gain_std_db, mean_db).numpy().ravel().tolist() == [0.0, 0.0, 0.0]
         assert tape.gradient(found.gain_mean_db, mean_db).numpy().ravel().tolist() == [0.0, 1.0, 0.0]
@@ -571,9 +563,9 @@ class TestOfParts:
 
 class TestCoverage:
     @pytest.mark.parametrize("softness_db", [0.0, 3.0])
-    def test_beside_scipy(self, tf, softness_db):
+    def test_beside_scipy(self, softness_db):
         parts = random_parts()
-        found = of(tf, *parts).coverage(THRESHOLD_DB, softness_db).numpy()
+        found = of(*parts).coverage(THRESHOLD_DB, softness_db).numpy()
         spread = np.hypot(parts[2], softness_db)
         with np.errstate(divide="ignore", invalid="ignore"):
             fractions = stats.norm.sf(THRESHOLD_DB, parts[1], spread)
@@ -581,21 +573,21 @@ class TestCoverage:
         np.testing.assert_allclose(found, (parts[0][1:] * fractions[1:]).sum(axis=0), rtol=1e-10, atol=1e-14)
         assert ((found >= 0.0) & (found <= 1.0)).all()
 
-    def test_step_without_spread(self, tf):
+    def test_step_without_spread(self):
         means_db = [[-150.0] * 3, [-99.0, -100.0, -101.0], [-150.0] * 3]
-        certain = of(tf, np.repeat([[0.0], [1.0], [0.0]], 3, axis=1), means_db, np.zeros((3, 3)))
+        certain = of(np.repeat([[0.0], [1.0], [0.0]], 3, axis=1), means_db, np.zeros((3, 3)))
         assert certain.coverage(THRESHOLD_DB).numpy().tolist() == [1.0, 0.0, 0.0]
         np.testing.assert_allclose(certain.coverage(THRESHOLD_DB, 1.0), stats.norm.cdf([1.0, 0.0, -1.0]), rtol=1e-12)
 
     @pytest.mark.parametrize("softness_db", [0.0, 3.0])
-    def test_slopes(self, tf, softness_db):
+    def test_slopes(self, softness_db):
         """Those of the Gaussian density, and 0 where there is no spread; nowhere NaN, be the gain where it may."""
         probabilities, means_db, stds_db = random_parts()
         means_db[1, :4] = THRESHOLD_DB
         tensors = [tf.constant(part) for part in (probabilities, means_db, stds_db)]
         with tf.GradientTape() as tape:
             tape.watch(tensors)
-            covered = of(tf, *tensors).coverage(THRESHOLD_DB, softness_db)
+            covered = of(*tensors).coverage(THRESHOLD_DB, softness_db)
         of_probability, of_mean, of_std = (slope.numpy() for slope in tape.gradient(covered, tensors))
         assert all(np.isfinite(slope).all() for slope in (of_probability, of_mean, of_std))
         spread = np.hypot(stds_db, softness_db)
