@@ -10,7 +10,6 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.evaluation.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability
 from sionna_partial.plots.evaluation_plot import plot_reliability, plot_stages
-from sionna_partial.plots.style import figure_png
 
 pytestmark = QUIET
 
@@ -39,10 +38,6 @@ class TestPlotStages:
     def test_every_line_has_a_colour_of_its_own(self, evaluation):
         lines = plot_stages(evaluation).axes[0].get_lines()
         assert len({line.get_color() for line in lines if "training" not in line.get_label()}) == len(lines) - 1
-
-    def test_equal_files(self, evaluation):
-        one, other = (figure_png(plot_stages(evaluation)) for _ in range(2))
-        assert one == other
 
     def test_nothing_to_draw(self, evaluation):
         rows = tuple(row for row in evaluation.rows if row.receivers == "anywhere")
@@ -76,10 +71,6 @@ class TestPlotReliability:
     def test_no_disc_without_links(self):
         above = plot_reliability({0: calibration(links=0)}).axes[0]
         assert len(above.collections[0].get_offsets()) == 0
-
-    def test_equal_files(self):
-        one, other = (figure_png(plot_reliability({0: calibration()})) for _ in range(2))
-        assert one == other
 
     def test_nothing_to_draw(self):
         with pytest.raises(

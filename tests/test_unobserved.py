@@ -80,19 +80,6 @@ def test_segment_along_a_border_is_in_the_freest_cell(below, above, expected_m, 
     assert found == pytest.approx(0.1 * expected_m, abs=1e-6)
 
 
-def test_zero_everywhere_on_a_complete_map():
-    room = drawn("""
-        ?????
-        ?###?
-        ?#.#?
-        ?###?
-        ?????
-    """)
-    assert room.is_complete
-    ends = np.array([(0.5, 0.5, 1.0), (2.5, 2.4, 1.0), (9.0, 9.0, 1.0)])
-    assert unobserved_lengths_m(room, np.array([2.5, 2.5, 1.0]), ends).tolist() == [0.0, 0.0, 0.0]
-
-
 @pytest.mark.parametrize("measure", [unobserved_lengths_m, walled_lengths_m])
 def test_no_segments(measure):
     assert measure(HALF, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)

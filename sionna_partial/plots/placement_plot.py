@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -50,15 +51,15 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
     _draw_map(axis, placement.partial)
-    squares = _draw_receivers(axis, placement)
+    scale = _draw_receivers(axis, placement)
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
     coverage = placement.settings.objective == "coverage"
     label = f"probability of more than {placement.settings.threshold_db:g} dB" if coverage else "mean path gain [dB]"
-    bar = figure.colorbar(squares, ax=axis, label=label, shrink=0.8)
+    bar = figure.colorbar(scale, ax=axis, label=label, shrink=0.8)
     if coverage:
         bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
-    handles = [
+    handles: list[Line2D | Patch] = [
         Line2D([], [], label="transmitter", **_STAR),
         Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
         Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
@@ -93,8 +94,8 @@ def _draw_map(axis: Axes, partial: PartialMap) -> None:
         axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
 
 
-def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollection:
-    """Draw a square for each receiver, and return them as what the colour scale is for."""
+def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> ScalarMappable:
+    """Draw a square for each receiver, and return the colour scale."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.settings.objective == "coverage"
@@ -103,9 +104,7 @@ def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollect
     squares.set_array(placement.values)
     squares.set_alpha((0.15 + 0.75 * np.clip(placement.weight, 0.0, 1.0)).tolist())
     axis.add_collection(squares)
-    scale = PatchCollection([], cmap="viridis", norm=norm)
-    scale.set_array(np.zeros(0))
-    return scale
+    return ScalarMappable(norm, "viridis")
 
 
 def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
