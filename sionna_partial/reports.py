@@ -25,6 +25,7 @@ _COLUMNS = {
     "coverage_90": ("in 90 %", ".3f"),
 }
 _WHERE = {"indoor": "receivers indoors", "anywhere": "receivers anywhere on the map, outage outdoors"}
+_ENDS_SEEN = {"all": "", "both": ", both ends seen", "one": ", one end seen", "none": ", no end seen"}
 _MISSING = "-"
 
 
@@ -51,11 +52,13 @@ def markdown(evaluation: Evaluation) -> str:
         f"`{_MISSING}` stands where there is no finite value, as of the likelihood of a gain that is predicted "
         "without standard deviation.",
     ]
-    sections = [_metrics_section(evaluation, "test", ends_seen="all")]
-    sections += [_metrics_section(evaluation, "test", ends_seen=ends) for ends in ("both", "one", "none")]
+    sections = [_section(evaluation, "test", ends_seen=ends) for ends in _ENDS_SEEN]
     if "train" in evaluation.homes:
-        sections.append(_metrics_section(evaluation, "train", ends_seen="all"))
-    return "\n\n".join([*head, *sections, *_anywhere(evaluation), *_differences(evaluation)]) + "\n"
+        sections.append(_section(evaluation, "train"))
+    for homes in evaluation.homes:
+        if evaluation.select(homes=homes, receivers="anywhere", ends_seen="all"):
+            sections.append(_section(evaluation, homes, "anywhere"))
+    return "\n\n".join([*head, *sections, *_differences(evaluation)]) + "\n"
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
@@ -107,20 +110,6 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, name
     return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *lines))
 
 
-def _metrics_section(evaluation: Evaluation, homes: str, ends_seen: str) -> str:
-    whose = {"all": "", "both": ", both ends seen", "one": ", one end seen", "none": ", no end seen"}[ends_seen]
-    rows = evaluation.select(homes=homes, receivers="indoor", ends_seen=ends_seen)
-    return _section(f"{homes.capitalize()} homes, {_WHERE['indoor']}{whose}", rows)
-
-
-def _anywhere(evaluation: Evaluation) -> Iterable[str]:
-    """Sections on receivers that may be outside."""
-    for homes in evaluation.homes:
-        rows = evaluation.select(homes=homes, receivers="anywhere", ends_seen="all")
-        if rows:
-            yield _section(f"{homes.capitalize()} homes, {_WHERE['anywhere']}", rows)
-
-
 def _differences(evaluation: Evaluation) -> Iterable[str]:
     """Sections on paired differences."""
     for receivers, where, first in (("indoor", "indoors", "predictor"), ("anywhere", "anywhere", "with indoor model")):
@@ -140,18 +129,14 @@ def _by_stage(rows: Sequence[Row]) -> str:
     return markdown_table(header, cells)
 
 
-def _section(title: str, rows: Sequence[Row]) -> str:
-    header = ["stage", "model", *(label for label, _ in _COLUMNS.values())]
+def _section(evaluation: Evaluation, homes: str, receivers: str = "indoor", ends_seen: str = "all") -> str:
     cells = [
-        [
-            stage_name(row.stage),
-            row.model,
-            *(_text(getattr(row.metrics, name), _COLUMNS[name][1]) for name in _COLUMNS),
-        ]
-        for row in rows
+        [stage_name(row.stage), row.model, *(_text(getattr(row.metrics, name), _COLUMNS[name][1]) for name in _COLUMNS)]
+        for row in evaluation.select(homes=homes, receivers=receivers, ends_seen=ends_seen)
         if row.metrics.links
     ]
-    return f"### {title}\n\n{markdown_table(header, cells, names=2)}"
+    table = markdown_table(["stage", "model", *(label for label, _ in _COLUMNS.values())], cells, names=2)
+    return f"### {homes.capitalize()} homes, {_WHERE[receivers]}{_ENDS_SEEN[ends_seen]}\n\n{table}"
 
 
 def _difference_cells(each: Difference) -> list[str]:

@@ -37,8 +37,8 @@ def panels(figure: Figure) -> list:
 class TestPlotExploration:
     def test_each_moment_has_a_panel_that_says_what_it_shows(self, exploration):
         titles = [panel.get_title() for panel in panels(plot_exploration(exploration.at((10, 60))))]
-        shares = exploration.at((10, 60)).observed_fractions
-        assert titles == [f"step 10: {shares[0]:.0%} seen", f"step 60: {shares[1]:.0%} seen"]
+        fractions = exploration.at((10, 60)).observed_fractions
+        assert titles == [f"step 10: {fractions[0]:.0%} seen", f"step 60: {fractions[1]:.0%} seen"]
 
     def test_cells_have_their_colours(self, home, exploration):
         image = panels(plot_exploration(exploration.at((30,))))[0].images[0]
@@ -73,9 +73,9 @@ class TestPlotExploration:
     def test_a_map_that_drifts_shows_both_ways(self, home):
         drifting = explore_trajectory(home, (40,), 2, sensor=SensorSettings(drift_m_per_m=0.05))
         figure = plot_exploration(drifting)
-        ways = [line for line in panels(figure)[0].lines if len(line.get_xdata()) == 41]
-        assert np.array_equal(ways[0].get_xdata(), drifting.poses[:, 0])
-        assert np.array_equal(ways[1].get_xdata(), drifting.believed_poses[:, 0])
+        trajectories = [line for line in panels(figure)[0].lines if len(line.get_xdata()) == 41]
+        assert np.array_equal(trajectories[0].get_xdata(), drifting.poses[:, 0])
+        assert np.array_equal(trajectories[1].get_xdata(), drifting.believed_poses[:, 0])
         (view,) = panels(figure)[0].patches
         assert view.get_xy()[0] == pytest.approx(drifting.believed_poses[-1, :2])
         assert [text.get_text() for text in figure.legends[0].texts][:2] == [
@@ -102,13 +102,13 @@ class TestAnimateExploration:
         with Image.open(tmp_path / "way.gif") as animation:
             assert animation.n_frames == len(exploration.steps)
             assert animation.info["loop"] == 0
-            shares = []
+            fractions = []
             for index in range(animation.n_frames):
                 animation.seek(index)
                 pixels = np.asarray(animation.convert("RGB"))
-                shares.append((pixels == 255).all(axis=2).mean())
+                fractions.append((pixels == 255).all(axis=2).mean())
             assert animation.info["duration"] > 1000
-        assert shares[0] < shares[1] < shares[-1]
+        assert fractions[0] < fractions[1] < fractions[-1]
         assert (tmp_path / "way.gif").stat().st_size < 200_000
 
     def test_its_colours_are_those_that_are_drawn(self, exploration, tmp_path):

@@ -127,6 +127,14 @@ def test_robot_sees_all_of_a_small_home_and_then_stays():
         assert maps[1] == maps[0] == maps[2]
 
 
+@pytest.mark.parametrize("door_cells", [10, 4])
+def test_narrow_doors_take_a_slim_robot(door_cells):
+    state = np.full((40, 83), CellState.WALL, dtype=np.uint8)
+    state[1:-1, 1:41] = state[1:-1, 42:-1] = state[10 : 10 + door_cells, 41] = CellState.FREE
+    (partial,) = explore(PartialMap(state, 0.05), (400,), 0)
+    assert partial.observed_fraction > 0.9
+
+
 def test_unknown_cells_stay_unknown_and_stop_the_view():
     home = plan("\n".join(["###########", *["#....?....#"] * 6, "###########"]))
     for seed in range(6):

@@ -73,12 +73,12 @@ def test_some_homes_have_rooms_that_nobody_reaches():
 
 def test_what_nobody_reaches_is_the_lesser_part():
     """Real homes have at most a few rooms of that kind, not a hall beside them."""
-    shares = []
+    fractions = []
     for home in homes_with_shut_rooms().values():
         first, *others = parts_of(home)
-        shares.append(sum(other.sum() for other in others) / sum(part.sum() for part in (first, *others)))
-    assert 0.03 < np.mean(shares) < 0.25, shares
-    assert max(shares) < 0.4, shares
+        fractions.append(sum(other.sum() for other in others) / sum(part.sum() for part in (first, *others)))
+    assert 0.03 < np.mean(fractions) < 0.25, fractions
+    assert max(fractions) < 0.4, fractions
 
 
 def roamed_fraction(home: PartialMap, radius_m: float) -> float:
@@ -92,10 +92,10 @@ def roamed_fraction(home: PartialMap, radius_m: float) -> float:
 
 
 def test_a_robot_gets_around():
-    """A disc of 0.18 m gets nearly everywhere, though doors and furniture narrow the ways."""
-    shares = [roamed_fraction(make_home(seed), 0.18) for seed in range(16)]
-    assert np.mean(np.array(shares) >= 0.95) >= 0.9, shares
-    assert min(shares) > 0.8, shares
+    """A disc of 0.18 m gets nearly everywhere, though doors and furniture narrow the passages."""
+    fractions = [roamed_fraction(make_home(seed), 0.18) for seed in range(16)]
+    assert np.mean(np.array(fractions) >= 0.95) >= 0.9, fractions
+    assert min(fractions) > 0.8, fractions
 
 
 def rooms_of(home: PartialMap, smallest_m2: float) -> int:
@@ -113,14 +113,14 @@ def test_rooms_are_behind_doors(seed):
 
 def test_furniture_and_locked_rooms_leave_islands_and_gaps():
     """Real homes are no boxes: a good part of their convex hull is not free."""
-    shares, islands = [], []
+    fractions, islands = [], []
     for seed in range(20):
         free = apartment(seed).state == CellState.FREE
         hull = shapely.MultiPoint(np.argwhere(free)).convex_hull
-        shares.append(free.sum() / hull.area)
+        fractions.append(free.sum() / hull.area)
         islands.append(ndimage.label(~free)[1] - 1)
-    assert 0.5 < np.mean(shares) < 0.8
-    assert np.std(shares) > 0.05
+    assert 0.5 < np.mean(fractions) < 0.8
+    assert np.std(fractions) > 0.05
     assert min(islands) == 0
     assert max(islands) >= 3
 
@@ -144,7 +144,7 @@ def test_some_walls_meet_at_corners_of_cells_only_and_some_are_thick():
         beside = ndimage.binary_dilation(free) & ~free
         layers.append((home.state == CellState.WALL).sum() / beside.sum())
     assert min(layers) == 1
-    assert any(1 < share < 1.5 for share in layers)
+    assert any(1 < fraction < 1.5 for fraction in layers)
     assert max(layers) > 1.5
 
 

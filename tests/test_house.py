@@ -27,15 +27,15 @@ ROOMS = {
     "tracing": (
         *("candidates", "paths", "engine", "slab"),
         *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
-        *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "stock", "trace"),
-        *("path_set", "gradients"),
+        *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "trace"),
+        "path_set",
     ),
     "prediction": (
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "coverage": ("coverage",),
-    "differentiable": ("smooth_lengths", "link_distribution", "path_power", "scene"),
+    "differentiable": ("smooth_lengths", "scene"),
     "measurements": ("measurements",),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement"),
@@ -63,6 +63,19 @@ HEAVY = IN_FUNCTIONS | {
     *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed"),
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
+
+HOMES = {
+    **dict.fromkeys(["drjit", "mitsuba", "sionna"], ("tracing.", "llvm")),
+    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable.", "training")),
+    "matplotlib": ("plots.",),
+}
+"""Beginnings of the modules that may import these libraries."""
+
+STRAYS = {
+    ("scene.scene", "sionna"): "the table of ITU materials",
+    ("datasets.home_process", "drjit"): "the threads of a worker",
+}
+"""Modules that import one of them all the same, and what for."""
 
 PLOTS_ARE_FOR = ("plots.", "cli.", "export", "demo", "reports")
 """Beginnings of the modules that may import plots: they are a leaf."""
@@ -139,6 +152,11 @@ class TestOneDirection:
     def test_plots_are_a_leaf(self) -> None:
         users = [module for module in MODULES if any(name.startswith("plots.") for name in own_imports(module))]
         assert [module for module in users if not module.startswith(PLOTS_ARE_FOR)] == []
+
+    def test_each_heavy_library_has_its_rooms(self) -> None:
+        found = {(module, name.partition(".")[0]) for module in MODULES for name in imported(tree_of(module))}
+        strays = {(module, name) for module, name in found if name in HOMES and not module.startswith(HOMES[name])}
+        assert strays == STRAYS.keys()
 
     def test_only_the_command_line_uses_the_lazy_names(self) -> None:
         for module in MODULES:

@@ -226,7 +226,7 @@ class TestTakeAndConcatenate:
 
 class TestSeen:
     @pytest.mark.parametrize(
-        ("place", "seen"),
+        ("position", "seen"),
         [
             ((4.5, 2.5, 1.5), True),
             ((5.5, 2.5, 1.5), False),
@@ -239,10 +239,10 @@ class TestSeen:
         ],
         ids=str,
     )
-    def test_by_hand(self, place, seen):
-        assert context_of(2, rx=place).rx_seen.tolist() == [seen, seen]
-        assert context_of(2, tx=place).tx_seen.tolist() == [seen, seen]
-        assert context_of(1, rx=place).tx_seen.tolist() == [True]
+    def test_by_hand(self, position, seen):
+        assert context_of(2, rx=position).rx_seen.tolist() == [seen, seen]
+        assert context_of(2, tx=position).tx_seen.tolist() == [seen, seen]
+        assert context_of(1, rx=position).tx_seen.tolist() == [True]
 
     def test_each_link_on_its_own_map(self):
         both = features(((HALF, WHOLE), np.array([0, 1, 1])), (FAR, FAR, (0.5, -1.0, 1.5)), tx_m=TX).context

@@ -48,7 +48,7 @@ def inputs(phi):
 
 
 def shaken(networks, seed=0):
-    """Give networks random weights everywhere, biases included, so that they say about 1, and return them."""
+    """Give networks random weights everywhere, biases included, so that their outputs are about 1, and return them."""
     rng = np.random.default_rng(seed)
     for weight in (weight for network in networks.values() for weight in network.weights):
         shape = tuple(weight.shape)
@@ -88,11 +88,11 @@ class TestLinkInputs:
     @given(
         st.sampled_from(LinkState), st.just(0.0) | st.floats(1e-3, 900.0), st.floats(0.0, 1.0), st.floats(-150.0, 30.0)
     )
-    def test_a_few_units_whatever_the_link(self, state, distance_m, share, gain_db):
+    def test_a_few_units_whatever_the_link(self, state, distance_m, fraction, gain_db):
         """In a building of any size."""
         floor = PartialMap(np.zeros((1, 100), dtype=np.uint8), 10.0, (-5.0, -5.0))
         place = (distance_m, 0.0, 1.5)
-        phi = features(floor, place, unobserved_m=share * distance_m, state=state, gain_db=gain_db)
+        phi = features(floor, place, unobserved_m=fraction * distance_m, state=state, gain_db=gain_db)
         found = inputs(phi)
         assert all(np.isfinite(column).all() for column in found.values())
         assert max(abs(column[0]) for column in found.values()) < 7.0
@@ -206,9 +206,9 @@ class TestReadMapsAndLinks:
         count = windows.shape[0]
         known = tf.cast(tf.reduce_any(windows > 0, axis=(1, 2, 3), keepdims=True), tf.float32)
         y, x = np.mgrid[:WINDOW_CELLS, :WINDOW_CELLS].astype(np.float32)
-        places = np.tile(np.stack([x, y], axis=-1), (count, 1, 1, 1)) * known
+        positions = np.tile(np.stack([x, y], axis=-1), (count, 1, 1, 1)) * known
         rest = np.full((count, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES - 3), 100.0, dtype=np.float32)
-        return tf.concat([places, windows[..., :1], rest], axis=-1)
+        return tf.concat([positions, windows[..., :1], rest], axis=-1)
 
     def seen(self, windows, offsets_m):
         offsets_m = np.asarray(offsets_m, dtype=np.float32)
@@ -302,7 +302,7 @@ class TestEvaluateContextNetworks:
         assert abs(near - far)[0].max() > 0.01
 
     def test_on_a_map_the_place_counts(self, networks, home):
-        """The links are equal in all but where the receivers are: the map network says so."""
+        """The links are equal in all but where the receivers are: only the map network sees a difference."""
         place = np.array([[2.5, 0.5, 1.5], [0.5, 2.5, 1.5]])
         state = home.state.copy()
         state[8:12, 8:12] = FREE

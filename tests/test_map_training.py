@@ -61,12 +61,12 @@ def make_room_links(maps, links, seed):
     partial, in_seen_room, rx_m = [], [], []
     for _ in range(maps):
         seen = np.kron(rng.permutation(ROOMS**2).reshape(ROOMS, ROOMS) % 2, np.ones((ROOM_CELLS, ROOM_CELLS))) > 0
-        place = rng.permutation(seen.size)[:links]
+        position = rng.permutation(seen.size)[:links]
         state = np.where(seen, FREE, UNKNOWN)
-        state.ravel()[place] = state[len(seen) // 2, len(seen) // 2] = UNKNOWN
+        state.ravel()[position] = state[len(seen) // 2, len(seen) // 2] = UNKNOWN
         partial.append(PartialMap(state, RESOLUTION_M, (-HALF_M, -HALF_M)))
-        in_seen_room.append(seen.ravel()[place])
-        cells = np.column_stack(np.divmod(place, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
+        in_seen_room.append(seen.ravel()[position])
+        cells = np.column_stack(np.divmod(position, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
         rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
     count = maps * links
     path_seen = rng.uniform(size=count) < 0.5
@@ -85,7 +85,7 @@ TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
 
 @functools.cache
 def trained(networks, rule):
-    """Return networks trained by a rule, and the losses on the way: few small steps, of greater rate, are enough."""
+    """Return networks trained by a rule, and the losses of the steps: few small steps, of greater rate, are enough."""
     links, losses = make_room_links(*TRAINING), []
     settings = PredictorSettings(networks, passes=100 if networks == "paths" else 16)
     with pytest.MonkeyPatch.context() as patch:
@@ -95,7 +95,7 @@ def trained(networks, rule):
             links.phi,
             *links.truth(getattr(links, rule)),
             settings,
-            progress=lambda share, message: losses.append(float(message.rpartition(" ")[2])),
+            progress=lambda fraction, message: losses.append(float(message.rpartition(" ")[2])),
         )
     return found, losses
 

@@ -97,17 +97,17 @@ def test_links_do_not_depend_on_each_other(quick):
 @pytest.mark.parametrize("partial_state", LinkState)
 def test_sane_far_beyond_the_training_links(quick, partial_state):
     distance_m = np.array([0.0, 1e-6, 0.1, 1.0, 10.0, 60.0, 1e4, 1e9, 1e200])
-    for share in (0.0, 1.0):
+    for fraction in (0.0, 1.0):
         for gain_db in (-150.0, -40.0, 1e300):
             states, gains_db = np.full(9, partial_state), np.full(9, gain_db)
-            assert_valid(quick.predict(LinkFeatures(states, share * distance_m, distance_m, gains_db)))
+            assert_valid(quick.predict(LinkFeatures(states, fraction * distance_m, distance_m, gains_db)))
 
 
 def times(factor, name):
     """Return a network that multiplies five numbers."""
     keras = import_keras()
-    place = keras.Input((5,), name="five")
-    return keras.Model(place, keras.layers.Rescaling(factor, name="times")(place), name=name)
+    position = keras.Input((5,), name="five")
+    return keras.Model(position, keras.layers.Rescaling(factor, name="times")(position), name=name)
 
 
 @pytest.fixture(scope="module")

@@ -84,8 +84,8 @@ def in_order(paths: PathSet, power: NDArray[np.float64], vertices_m: NDArray[np.
     """The same order of the fixed paths themselves, by the lengths of paths with the vertices (P, D, 3)."""
     tx_m = paths.base.tx_m
     delay = np.zeros(len(paths))
-    for index, (places, rx) in enumerate(zip(vertices_m, paths.path_rx, strict=True)):
-        chain = np.array([tx_m, *places[~np.isnan(places[:, 0])], paths.rx_m[rx]])
+    for index, (positions, rx) in enumerate(zip(vertices_m, paths.path_rx, strict=True)):
+        chain = np.array([tx_m, *positions[~np.isnan(positions[:, 0])], paths.rx_m[rx]])
         delay[index] = np.linalg.norm(np.diff(chain, axis=0), axis=1).sum()
     order = np.lexsort((delay, *paths.interactions.T, paths.path_rx))
     return power[order], vertices_m[order]
@@ -209,7 +209,7 @@ class TestAt:
 
     @pytest.mark.parametrize("which", ["paths", "mesh_paths"])
     def test_transmitter_moved_as_a_new_trace(self, which: str, request: pytest.FixtureRequest) -> None:
-        """Where the new place has the same kinds of paths; here it has."""
+        """Where the new position has the same kinds of paths; here it has."""
         paths = request.getfixturevalue(which)
         there = changed(paths, tx_m=[4e-3, -3e-3, 5e-3])
         partial = paths._scene.partial
@@ -269,8 +269,8 @@ class TestAt:
 
     def test_no_path_through_a_wall(self, paths: PathSet) -> None:
         """In the pillar, and far from all of it."""
-        for place in ([2.3, 1.6, 1.4], [1e4, 1.0, 1.0], [1e9, -1e9, 1e9]):
-            there = replace(paths.base, tx_m=np.array(place))
+        for position in ([2.3, 1.6, 1.4], [1e4, 1.0, 1.0], [1e9, -1e9, 1e9]):
+            there = replace(paths.base, tx_m=np.array(position))
             power, vertices_m = paths.at(there)
             assert not power.any()
             assert np.isfinite(vertices_m[paths.interactions > 0]).all()
@@ -317,12 +317,12 @@ class TestSlopes:
         expected = by_differences(lambda there: sums(paths, paths.at(there)[0][:, None])[:, 0], paths, "tx_m", 2e-3)
         off = np.linalg.norm(sums(paths, power) - expected, axis=1)
         assert (off <= 0.01 * np.linalg.norm(expected, axis=1)).all()
-        places = by_differences(lambda there: np.nan_to_num(paths.at(there)[1]), paths, "tx_m", 2e-3)
-        np.testing.assert_allclose(vertices_m, places, atol=2e-3)
+        positions = by_differences(lambda there: np.nan_to_num(paths.at(there)[1]), paths, "tx_m", 2e-3)
+        np.testing.assert_allclose(vertices_m, positions, atol=2e-3)
         assert (np.abs(vertices_m).max(axis=(1, 2, 3)) > 0.1).any()
 
     def test_reflection_off_the_floor_by_hand(self) -> None:
-        """The bend divides the way across as the heights are; its power falls with the square of the way."""
+        """The reflection point divides the length as the heights; the power falls with the square of the length."""
         tx, rx = np.array([1.03, 1.92, 1.4]), np.array([3.2, 2.1, 1.1])
         metal = replace(FLOOR, material=sp.Material(1.0, 1e7, 0.1))
         paths = PathScene(FIELD, scene_settings=metal).paths(tx, rx[None])
@@ -467,9 +467,9 @@ class TestNothingThere:
     def test_progress(self, room: PathScene) -> None:
         calls: list[tuple[float, str]] = []
         room.paths(TX_M, RX_M, progress=lambda share, message: calls.append((share, message)))
-        shares = [share for share, _ in calls]
-        assert shares == sorted(shares)
-        assert shares[-1] == pytest.approx(1.0)
+        fractions = [share for share, _ in calls]
+        assert fractions == sorted(fractions)
+        assert fractions[-1] == pytest.approx(1.0)
         assert {message for _, message in calls} == {"verifying reflections", "verifying diffractions", "traced"}
 
 

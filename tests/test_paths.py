@@ -9,7 +9,7 @@ from sionna_partial.tracing.paths import PathColumns, SolvedPaths, join_paths
 
 
 def _paths(*rows: tuple[int, int, float, complex], depth: int = 1) -> SolvedPaths:
-    """Paths of (transmitter, receiver, delay [s], gain), all told apart by gain."""
+    """Paths of (transmitter, receiver, delay [s], gain), each with a gain of its own."""
     tx, rx, delay_s, a = (np.array(column) for column in zip(*rows, strict=True)) if rows else [np.zeros(0)] * 4
     count = len(rows)
     return SolvedPaths(

@@ -38,7 +38,7 @@ def half_plane(edge_m=5.0):
 
 
 def interpolated(partial, kind):
-    """Return the bilinear interpolation of the mask as a function of places (..., 2) [m], by SciPy."""
+    """Return the bilinear interpolation of the mask as a function of positions (..., 2) [m], by SciPy."""
     mask = np.pad((partial.state == kind).astype(float), 1, constant_values=float(kind == UNKNOWN))
     middles_m = [
         start + (np.arange(size) - 0.5) * partial.resolution_m
@@ -121,7 +121,7 @@ class TestLengths:
 
     @pytest.mark.parametrize("kind", CellState)
     def test_between_zero_and_the_distance(self, kind):
-        # Long ways through cells of the kind, between quarters of cells: rounding would exceed 1.
+        # Long segments through cells of the kind, between quarters of cells: rounding would exceed 1.
         state = np.random.default_rng(0).choice([kind, (kind + 1) % 3], (12, 20), p=[0.9, 0.1])
         partial = PartialMap(state, RESOLUTION_M, (0.3, -0.7))
         quarters = np.random.default_rng(1).integers(0, 48, (2, 50_000, 3)) / 4
@@ -163,7 +163,7 @@ class TestBesideTheExactLength:
 
 class TestSlopes:
     def test_half_plane_by_hand(self):
-        # In the plane, with its start in the free half, a segment is unknown for (x - 5 m) / (x - x_start) of its way.
+        # In the plane, a segment that starts in the free half is unknown for (x - 5 m) / (x - x_start) of its length.
         smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
         _, start, end = one(smooth, (2.0, 3.0, 1.0), (6.0, 6.0, 1.0))
         np.testing.assert_allclose(start, [5 / 16 - 4 / 5 / 4, -3 / 5 / 4, 0.0], atol=1e-12)
@@ -226,12 +226,12 @@ class TestSlopes:
         assert not np.any(smooth.slopes(places_m, places_m))
 
 
-places = st.integers(-6, 46).map(lambda quarters: quarters / 4)
+positions = st.integers(-6, 46).map(lambda quarters: quarters / 4)
 """Coordinates in quarters of a cell: many are on lines through middles of cells or on borders of cells."""
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.integers(0, 20), st.tuples(places, places, places, places))
+@given(st.integers(0, 20), st.tuples(positions, positions, positions, positions))
 def test_segments_between_quarters_of_cells(seed, ends):
     partial = PartialMap(random_map(seed, (10, 10)).state, 1.0)
     smooth, start_m, end_m = SmoothLengths(partial, WALL), np.array([[*ends[:2], 1.0]]), np.array([[*ends[2:], 1.5]])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from extruded import specular_blocks
 from numpy.typing import NDArray
+from test_trace import NO_FLOOR, WAVELENGTH_M, _room
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError
@@ -14,24 +15,13 @@ from sionna_partial.scene.scene import SHAPES, build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import SceneSolver, load_sionna
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.stock import listed_before, stock_paths
+from sionna_partial.tracing.trace import listed_before, stock_paths
 
-WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
-NO_FLOOR = SceneSettings(floor_extent="none")
 NOWHERE = np.zeros((0, 3))
 
 TX = np.array([1.03, 2.93, 1.4])
 RX = np.array([[2.21, 1.12, 1.2], [5.02, 2.03, 1.5], [4.02, 0.93, 1.5]])
 """In the room: in sight, seen through the door, and beside it."""
-
-
-def _room(height: int = 42) -> PartialMap:
-    """6 m x 4 m of free cells in walls, parted by a wall with a door of 1 m."""
-    state = np.full((height, 62), CellState.WALL, dtype=np.uint8)
-    state[1:-1, 1:-1] = CellState.FREE
-    state[1:15, 30] = CellState.WALL
-    state[25:-1, 30] = CellState.WALL
-    return PartialMap(state, 0.1)
 
 
 def _write(partial: PartialMap, folder: Path, settings: SceneSettings | None = None) -> Path:

@@ -1,7 +1,6 @@
 """The trace against closed forms and against stock Sionna RT."""
 
 import dataclasses
-import doctest
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing import trace
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
 
@@ -77,11 +75,6 @@ def test_free_space_gain_delay_and_angles() -> None:
     np.testing.assert_allclose(links.delay_s, distance / SPEED_OF_LIGHT_M_S, rtol=1e-5)
     np.testing.assert_allclose(links.departure_rad[0], [np.pi / 2, np.arctan2(4, 3)], atol=1e-5)
     np.testing.assert_allclose(links.arrival_rad[0], [np.pi / 2, np.arctan2(-4, -3)], atol=1e-5)
-
-
-def test_example_in_the_documentation() -> None:
-    result = doctest.testmod(trace)
-    assert (result.attempted, result.failed) == (6, 0)
 
 
 def test_one_mirror_image_with_the_slab_reflection_coefficient() -> None:
@@ -392,7 +385,7 @@ def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: Parti
     valid = paths.valid.numpy().reshape(len(rx), -1) & upright & ~junction
     delay = paths.tau.numpy().reshape(len(rx), -1)
     power = sum(part.numpy().reshape(len(rx), -1).astype(float) ** 2 for part in paths.a)
-    # A diffraction, one reflection and nothing: Sionna RT counts a part of the way twice, and is too weak.
+    # A diffraction, one reflection and nothing: Sionna RT counts a part of the trajectory twice, and is too weak.
     too_long = (kind == [8, 1, 0]).all(axis=2)
     recalled = []
     for index, path in zip(*np.nonzero(valid), strict=True):
@@ -433,7 +426,7 @@ class TestPathsOnDisk:
         assert stored.vertices_m.shape == (0, 6, 3)
 
     def test_nothing_half_written_stays(self, tmp_path: Path) -> None:
-        def stop(share: float, message: str) -> None:
+        def stop(fraction: float, message: str) -> None:
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):

@@ -58,8 +58,8 @@ def _matched(lengths: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
 
 @pytest.mark.parametrize("name", PLANS)
 def test_every_path_of_the_image_method_and_no_other(name: str, tmp_path: Path) -> None:
-    geometry, place = PLANS[name]
-    tx = np.array(place)
+    geometry, position = PLANS[name]
+    tx = np.array(position)
     away = np.random.default_rng(1).uniform((0.1, 0.1, 0.2), (5.9, 3.9, 2.3), (25, 3))
     rx = np.concatenate([LATTICE, away])
     paths = _trace(geometry, tx, rx, tmp_path)
@@ -198,7 +198,7 @@ class TestTransmitters:
 
     def test_progress_runs_through_all_of_them(self) -> None:
         seen: list[float] = []
-        trace_links(_room(), self.TX, [[2.0, 1.0, 1.5]], progress=lambda share, message: seen.append(share))
+        trace_links(_room(), self.TX, [[2.0, 1.0, 1.5]], progress=lambda fraction, message: seen.append(fraction))
         assert seen == sorted(seen)
         assert seen[0] == 0.0
         assert seen[-1] == pytest.approx(1.0)
@@ -216,6 +216,6 @@ def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:
     bent = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
     assert len(bent) > 3
     for path in bent:
-        places = np.abs(deep.vertices_m[:, :2] - shallow.vertices_m[path]).max(axis=(1, 2))
-        same = (deep.path_rx == shallow.path_rx[path]) & (deep.interactions[:, 2] == 0) & (places < 1e-4)
+        positions = np.abs(deep.vertices_m[:, :2] - shallow.vertices_m[path]).max(axis=(1, 2))
+        same = (deep.path_rx == shallow.path_rx[path]) & (deep.interactions[:, 2] == 0) & (positions < 1e-4)
         assert abs(deep.a[same]) == pytest.approx(abs(shallow.a[path]), rel=1e-3)

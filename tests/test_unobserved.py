@@ -80,19 +80,6 @@ def test_segment_along_a_border_is_in_the_freest_cell(below, above, expected_m, 
     assert found == pytest.approx(0.1 * expected_m, abs=1e-6)
 
 
-def test_zero_everywhere_on_a_complete_map():
-    room = drawn("""
-        ?????
-        ?###?
-        ?#.#?
-        ?###?
-        ?????
-    """)
-    assert room.is_complete
-    ends = np.array([(0.5, 0.5, 1.0), (2.5, 2.4, 1.0), (9.0, 9.0, 1.0)])
-    assert unobserved_lengths_m(room, np.array([2.5, 2.5, 1.0]), ends).tolist() == [0.0, 0.0, 0.0]
-
-
 @pytest.mark.parametrize("measure", [unobserved_lengths_m, walled_lengths_m])
 def test_no_segments(measure):
     assert measure(HALF, np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
@@ -124,8 +111,8 @@ cells = st.tuples(thousandths, thousandths)
 
 
 def shares(state, *pairs):
-    """Return the unknown share of segments between places in thousandths of a cell."""
-    starts, ends = (np.array(places) / 1_000 for places in zip(*pairs, strict=True))
+    """Return the unknown fraction of segments between positions in thousandths of a cell."""
+    starts, ends = (np.array(positions) / 1_000 for positions in zip(*pairs, strict=True))
     return line_fractions(state, starts, ends)[:, CellState.UNKNOWN]
 
 
@@ -138,18 +125,18 @@ def is_unknown(state, x, y):
     return FREE not in found and UNKNOWN in found
 
 
-def exact_share(state, start, end):
-    """Return the unknown share of a segment in exact fractions: between two grid lines it is in one cell."""
-    places = [Fraction(place, 1_000) for place in start]
+def exact_fraction(state, start, end):
+    """Return the unknown fraction of a segment in exact fractions: between two grid lines it is in one cell."""
+    positions = [Fraction(position, 1_000) for position in start]
     steps = [Fraction(there - here, 1_000) for here, there in zip(start, end, strict=True)]
     met = {Fraction(0), Fraction(1)}
-    for place, step in zip(places, steps, strict=True):
-        met |= {(line - place) / step for line in range(-3, 13) if step}
-    share = Fraction(0)
+    for position, step in zip(positions, steps, strict=True):
+        met |= {(line - position) / step for line in range(-3, 13) if step}
+    fraction = Fraction(0)
     for here, there in pairwise(sorted(each for each in met if 0 <= each <= 1)):
-        if is_unknown(state, *(place + (here + there) / 2 * step for place, step in zip(places, steps, strict=True))):
-            share += there - here
-    return float(share)
+        if is_unknown(state, *(at + (here + there) / 2 * step for at, step in zip(positions, steps, strict=True))):
+            fraction += there - here
+    return float(fraction)
 
 
 class TestWalls:
@@ -176,17 +163,17 @@ class TestWalls:
 
     @given(st.data())
     def test_what_is_known_and_outside_is_no_wall(self, data):
-        """Not a rounding of it: the networks are told of any length at all."""
+        """Not a rounding of it: any length at all is a feature of the networks."""
         state = data.draw(hnp.arrays(np.uint8, (3, 4), elements=st.sampled_from([FREE, UNKNOWN])))
         start, end = (np.array([data.draw(cells)]) / 1_000 for _ in range(2))
         assert line_fractions(state, start, end)[:, CellState.WALL] == 0.0
 
     @given(grids, cells, cells)
     def test_inside_the_grid_as_if_walls_alone_were_unknown(self, state, start, end):
-        place = np.clip([start, end], 0, 1_000 * np.array(state.shape[::-1]))
+        position = np.clip([start, end], 0, 1_000 * np.array(state.shape[::-1]))
         padded = np.pad(state, 1, constant_values=FREE)
         walls = np.where(padded == WALL, UNKNOWN, FREE).astype(np.uint8)
-        starts, ends = place[:1] / 1_000, place[1:] / 1_000
+        starts, ends = position[:1] / 1_000, position[1:] / 1_000
         expected = line_fractions(walls, starts + 1.0, ends + 1.0)[:, CellState.UNKNOWN]
         assert line_fractions(state, starts, ends)[:, CellState.WALL][0] == pytest.approx(expected[0], abs=1e-9)
 
@@ -194,26 +181,26 @@ class TestWalls:
 @settings(max_examples=1000)
 @given(grids, cells, cells)
 def test_exact(state, start, end):
-    assert shares(state, (start, end))[0] == pytest.approx(exact_share(state, start, end), abs=1e-9)
+    assert shares(state, (start, end))[0] == pytest.approx(exact_fraction(state, start, end), abs=1e-9)
 
 
-places = st.tuples(st.floats(-0.3, 1.3), st.floats(-0.3, 1.3), st.floats(0.0, 3.0))
+positions = st.tuples(st.floats(-0.3, 1.3), st.floats(-0.3, 1.3), st.floats(0.0, 3.0))
 
 
-def scaled(partial, place):
-    """Return the world point of a place in fractions of the map."""
+def scaled(partial, position):
+    """Return the world point of a position in fractions of the map."""
     x0, y0, x1, y1 = partial.bounds_m
-    return np.array([x0 + place[0] * (x1 - x0), y0 + place[1] * (y1 - y0), place[2]])
+    return np.array([x0 + position[0] * (x1 - x0), y0 + position[1] * (y1 - y0), position[2]])
 
 
-@given(grids, places, places)
+@given(grids, positions, positions)
 def test_between_zero_and_length(state, start, end):
     partial = PartialMap(state, 0.3)
     start_m, end_m = scaled(partial, start), scaled(partial, end)
     assert 0.0 <= length_m(partial, start_m, end_m) <= np.linalg.norm(end_m - start_m)
 
 
-@given(grids, places, places, st.data())
+@given(grids, positions, positions, st.data())
 def test_revealing_cells_never_raises_it(state, start, end, data):
     seen = data.draw(hnp.arrays(np.uint8, state.shape, elements=st.sampled_from([FREE, WALL, UNKNOWN, UNKNOWN])))
     revealed = np.where(state == CellState.UNKNOWN, seen, state)

@@ -56,7 +56,7 @@ def cells_m(partial, *states):
 
 
 def covered(partial, tx_m, state):
-    """Return the share of each cell of a window that the map's cells in a state cover, cell by cell."""
+    """Return the fraction of each cell of a window that the map's cells in a state cover, cell by cell."""
     low = middles_m(tx_m) - CELL_M / 2
     total = np.zeros(len(low))
     for corner in cells_m(partial, state):
@@ -66,7 +66,7 @@ def covered(partial, tx_m, state):
 
 
 def crossed(partial, tx_m, *states, wider_m=0.0):
-    """Return the share of each line from the transmitter to a cell of its window inside the map's cells in states.
+    """Return the fraction of each line from the transmitter to a cell of its window inside the map's cells in states.
 
     Each cell of the map, wider on all sides, cuts its own piece out of each line (Liang and Barsky 1984).
     """
@@ -89,17 +89,17 @@ maps = st.builds(
 shares = st.tuples(st.floats(-1.0, 2.0), st.floats(-1.0, 2.0))
 
 
-def placed(partial, share):
-    """Return the place of a transmitter in fractions of the map, off round numbers [m]."""
+def placed(partial, fraction):
+    """Return the position of a transmitter in fractions of the map, off round numbers [m]."""
     x0, y0, x1, y1 = partial.bounds_m
-    return np.array([x0 + share[0] * (x1 - x0) + 0.00123, y0 + share[1] * (y1 - y0) + 0.00377])
+    return np.array([x0 + fraction[0] * (x1 - x0) + 0.00123, y0 + fraction[1] * (y1 - y0) + 0.00377])
 
 
 class TestTransmitterWindow:
     @settings(max_examples=20, deadline=None)
     @given(maps, shares)
-    def test_shares_of_free_and_wall_are_exact(self, partial, share):
-        tx_m = placed(partial, share)
+    def test_fractions_of_free_and_wall_are_exact(self, partial, fraction):
+        tx_m = placed(partial, fraction)
         window = transmitter_window(partial, tx_m)
         assert window.shape == SHAPE
         assert window.dtype == np.uint8
@@ -109,8 +109,8 @@ class TestTransmitterWindow:
 
     @settings(max_examples=20, deadline=None)
     @given(maps, shares)
-    def test_lines_are_exact(self, partial, share):
-        tx_m = placed(partial, share)
+    def test_lines_are_exact(self, partial, fraction):
+        tx_m = placed(partial, fraction)
         window = transmitter_window(partial, tx_m)
         np.testing.assert_allclose(channel(window, "seen"), crossed(partial, tx_m, FREE, WALL), atol=ROUNDING)
         of_walls, hidden = crossed(partial, tx_m, WALL), channel(window, "hidden")
@@ -167,7 +167,7 @@ class TestTransmitterWindow:
         assert (channel(window, "seen")[np.ix_(near, near)] == 1.0).all()
 
     def test_detours(self):
-        """None in the open, long out of a closed room, and in between where a way around is known."""
+        """None in the open, long out of a closed room, and in between where a route around is known."""
         state = np.full((WINDOW_CELLS, WINDOW_CELLS), FREE)
         partial = PartialMap(state, CELL_M, (-HALF_M, -HALF_M))
         open_detour = channel(transmitter_window(partial, TX_M), "detour")

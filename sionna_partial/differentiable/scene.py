@@ -20,7 +20,9 @@ What gradients include, and what they do not:
 """
 
 import math
-from functools import cached_property
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +31,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.differentiable.link_distribution import LinkDistribution
-from sionna_partial.differentiable.path_power import moved_lengths_m, moved_paths
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -56,9 +56,10 @@ from sionna_partial.prediction.paper_networks import (
     free_space_gain_db,
     import_keras,
     parts,
+    tf,
 )
-from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.prediction.unobserved import Bools, unobserved_lengths_m
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
@@ -66,6 +67,9 @@ from sionna_partial.tracing.trace import Progress
 
 WINDOW_STEP_M = CELLS_M[0] / 2
 """How far from the transmitter further windows are drawn [m]."""
+
+STEEPEST = 4.0
+"""Largest ratio of the growth of a length to that of its smooth surrogate, as where it hardly touches a cell."""
 
 _NEAREST_M = 1e-6
 """Distance that a transmitter keeps from receivers: at the receiver, a distance has no slope [m]."""
@@ -77,6 +81,28 @@ _LIMITS = {
     "thickness_m": (0.0, 10.0),
     "frequency_hz": FREQUENCIES_HZ,
 }
+
+
+@dataclass(frozen=True, eq=False)
+class LinkDistribution(LinkPrediction):
+    """A `LinkPrediction` of (N,) float64 tensors, which have derivatives: for objectives and losses."""
+
+    def coverage(self, threshold_db: float, softness_db: float = 0.0) -> Any:
+        """Return the probability (N,) that the gain exceeds a threshold above -150 dB [dB].
+
+        Where nothing is uncertain the probability is a step, which has no slope; `softness_db`, the standard deviation
+        of a further Gaussian spread of the gain [dB], makes it one.
+        """
+        covered = tf.zeros_like(self.p_los)
+        for probability, mean_db, std_db in (
+            (self.p_los, self.gain_los_mean_db, self.gain_los_std_db),
+            (self.p_nlos, self.gain_nlos_mean_db, self.gain_nlos_std_db),
+        ):
+            variance = std_db**2 + softness_db**2
+            spread, above_db = variance > 0.0, mean_db - threshold_db
+            above = 0.5 * tf.math.erfc(-above_db / tf.sqrt(2.0 * tf.where(spread, variance, 1.0)))
+            covered += probability * tf.where(spread, above, tf.cast(above_db > 0.0, above.dtype))
+        return covered
 
 
 class DifferentiableScene:
@@ -96,6 +122,22 @@ class DifferentiableScene:
     ------
     MapError, SettingsError, PredictorError, BackendError
         As `predict_map`, or for paths that only rays find.
+
+    Examples
+    --------
+    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m:
+
+    >>> import numpy as np
+    >>> import sionna_partial as sp
+    >>> import tensorflow as tf
+    >>> room = sp.PartialMap(np.pad(np.zeros((18, 58), dtype=np.uint8), 1, constant_values=1), resolution_m=0.1)
+    >>> scene = sp.DifferentiableScene(room, trace_settings=sp.TraceSettings(max_depth=0))
+    >>> links = scene.links((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
+    >>> tx_m = tf.Variable(links.base.tx_m)
+    >>> with tf.GradientTape() as tape:
+    ...     gain_db = links(tx_m=tx_m).gain_mean_db[0]
+    >>> (tape.gradient(gain_db, tx_m).numpy() + 0.0).round(3).tolist()
+    [4.343, 0.0, 0.0]
     """
 
     def __init__(
@@ -160,22 +202,6 @@ class DifferentiableLinks:
     ----------
     base : PathParameters
         Where they were traced; its fields are the arguments of a call.
-
-    Examples
-    --------
-    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m:
-
-    >>> import numpy as np
-    >>> import sionna_partial as sp
-    >>> import tensorflow as tf
-    >>> room = sp.PartialMap(np.pad(np.zeros((18, 58), dtype=np.uint8), 1, constant_values=1), resolution_m=0.1)
-    >>> scene = sp.DifferentiableScene(room, trace_settings=sp.TraceSettings(max_depth=0))
-    >>> links = scene.links((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
-    >>> tx_m = tf.Variable(links.base.tx_m)
-    >>> with tf.GradientTape() as tape:
-    ...     gain_db = links(tx_m=tx_m).gain_mean_db[0]
-    >>> (tape.gradient(gain_db, tx_m).numpy() + 0.0).round(3).tolist()
-    [4.343, 0.0, 0.0]
     """
 
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
@@ -213,9 +239,7 @@ class DifferentiableLinks:
         SettingsError
             For another shape, a value out of range, or a call within `tf.function`.
         """
-        import tensorflow as tf
-
-        values = (tx_m, relative_permittivity, conductivity_s_m, thickness_m, frequency_hz)
+        ops, values = import_keras().ops, (tx_m, relative_permittivity, conductivity_s_m, thickness_m, frequency_hz)
         pairs = zip(PARAMETERS, values, strict=True)
         given = {name: self._tensor(name, value) for name, value in pairs if value is not None}
         power, vertices_m = moved_paths(self._paths, given)
@@ -224,7 +248,7 @@ class DifferentiableLinks:
         trace = states, tf.stack([gain_db] * len(LinkState)), tf.zeros_like(states)
         complete = context_of(self._phi).complete
         if complete.all():
-            return LinkDistribution.of_parts(*trace)
+            return LinkDistribution.of_parts(*trace, ops=ops)
         moved_m = given.get("tx_m")
         numeric = self._moved_features(moved_m, gain_db)
         if LINK_NETWORK in self._scene.networks:
@@ -234,12 +258,10 @@ class DifferentiableLinks:
             inputs = {name: tf.cast(numeric[name], tf.float32)[:, None] for name in FEATURES}
             predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state)
         pairs = zip(trace, predicted, strict=True)
-        return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs))
+        return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
 
     def _tensor(self, name: str, value: Any) -> Any:
         """Check one argument, and return it as a float64 tensor."""
-        import tensorflow as tf
-
         require(tf.executing_eagerly(), name, value, "call links eagerly, not within tf.function.")
         tensor = tf.cast(tf.convert_to_tensor(value, dtype_hint=tf.float64), tf.float64)
         shape = getattr(self.base, name).shape
@@ -257,14 +279,10 @@ class DifferentiableLinks:
 
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
         """Sum (N,) over the paths to each receiver."""
-        import tensorflow as tf
-
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the gain, and what derives from the transmitter position alone, None being where it was."""
-        import tensorflow as tf
-
         numeric, rx_m = numeric_features(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
         if tx_m is None:
             return numeric
@@ -280,8 +298,6 @@ class DifferentiableLinks:
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
         """Return what derives from the indirect paths, whose power (P,) and vertices (P, D, 3) are those now."""
-        import tensorflow as tf
-
         legs = self._legs
         unobserved_m = tf.constant(legs.unobserved_m)
         if tx_m is not None:
@@ -296,8 +312,6 @@ class DifferentiableLinks:
 
     def _by_context(self, tx_m: Any, numeric: dict[str, Any]) -> tuple[Any, Any, Any]:
         """Evaluate the networks that read maps and paths: see `distribution`."""
-        import tensorflow as tf
-
         ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
         columns = input_columns(tf.constant(binary_features(self._phi)), numeric, frequency_hz, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
@@ -308,8 +322,6 @@ class DifferentiableLinks:
 
     def _maps(self, tx_m: Any) -> list[Any]:
         """Return the outputs (1, ...) of the map networks around the transmitter: linear around where it was."""
-        import tensorflow as tf
-
         networks = self._scene.networks
         if not reads_maps(networks):
             return []
@@ -330,16 +342,22 @@ class _Legs:
     """The straight legs of the Q indirect paths: what moves with the transmitter, and how much of it is unobserved.
 
     `paths` are their numbers (Q,), `rx` their receivers (Q,), `unobserved_m` their lengths in unknown cells as traced
-    (Q,) [m], and `strongest` is the strongest of them to each receiver (N,), -1 where there is none.
+    (Q,) [m], and `strongest` is the strongest of them to each receiver (N,), -1 where there is none. Legs join nodes,
+    which are numbered in this order: the transmitter, the receivers, and all vertices, path by path.
     """
 
     def __init__(self, partial: PartialMap, paths: PathSet) -> None:
         self.paths = np.flatnonzero(~paths.is_direct)
         self.rx = paths.path_rx[self.paths]
         self._rx_m = paths.rx_m
-        vertices_m = paths.vertices_m[self.paths]
-        self._of_path, self._start, self._end = _leg_nodes(paths.interactions[self.paths] > 0, self.rx, len(paths.rx_m))
+        interacts, vertices_m = paths.interactions[self.paths] > 0, paths.vertices_m[self.paths]
         nodes_m = np.concatenate([paths.base.tx_m[None], paths.rx_m, vertices_m.reshape(-1, 3)])
+        first = np.zeros((len(self.rx), 1), dtype=np.intp)
+        numbers = 1 + len(paths.rx_m) + np.arange(interacts.size).reshape(interacts.shape)
+        exists = np.pad(interacts, ((0, 0), (1, 1)), constant_values=True)
+        of_path, nodes = np.nonzero(exists)[0], np.hstack([first, numbers, 1 + self.rx[:, None]])[exists]
+        same = of_path[:-1] == of_path[1:]
+        self._of_path, self._start, self._end = of_path[:-1][same], nodes[:-1][same], nodes[1:][same]
         self._base = nodes_m[self._start], nodes_m[self._end]
         self._exact_m = unobserved_lengths_m(partial, *self._base)
         self.unobserved_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
@@ -349,8 +367,6 @@ class _Legs:
 
     def moved_m(self, lengths: SmoothLengths, tx_m: Any, vertices_m: Any) -> Any:
         """Return the length (Q,) in unknown cells with the transmitter at `tx_m`, and vertices (P, D, 3) now [m]."""
-        import tensorflow as tf
-
         vertices_m = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
         nodes_m = tf.concat([tx_m[None], self._rx_m, vertices_m], axis=0)
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
@@ -358,25 +374,78 @@ class _Legs:
         return tf.math.unsorted_segment_sum(moved_m, self._of_path, len(self.rx))
 
 
-def _leg_nodes(
-    interacts: Bools, rx: NDArray[np.int32], receivers: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Path, start and end of each leg of Q paths that interact at some of D vertices (Q, D), to receivers (Q,).
-
-    Nodes are numbered in this order: the transmitter, the receivers, and all vertices, path by path.
-    """
-    paths, depth = interacts.shape
-    vertices = 1 + receivers + np.arange(paths * depth).reshape(paths, depth)
-    all_nodes = np.column_stack([np.zeros(paths, dtype=np.intp), vertices, 1 + rx])
-    there = np.column_stack([np.ones(paths, dtype=bool), interacts, np.ones(paths, dtype=bool)])
-    of_path, nodes = np.nonzero(there)[0], all_nodes[there]
-    on = of_path[:-1] == of_path[1:]
-    return of_path[:-1][on], nodes[:-1][on], nodes[1:][on]
-
-
 def _gain_db(power: Any) -> Any:
     """Gain (N,) of power, at least -150 dB; there it does not change."""
-    import tensorflow as tf
-
     floor = 10.0 ** (GAIN_FLOOR_DB / 10.0)
     return 10.0 / math.log(10.0) * tf.math.log(tf.maximum(power, floor))
+
+
+def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
+    """Evaluate power (P,) and vertices (P, D, 3) of paths, 0 where there are none, for float64 tensors.
+
+    They are `given` for fields of `PathParameters`; the others are as the paths were traced. There are first
+    derivatives only.
+    """
+
+    @tf.custom_gradient
+    def evaluate(*tensors: Any) -> tuple[tuple[Any, Any], Callable[..., list[Any]]]:
+        values = {name: tensor.numpy() for name, tensor in zip(given, tensors, strict=True)}
+        parameters = replace(paths.base, **values)
+
+        @cache
+        def slopes() -> dict[str, NDArray[np.float64]]:
+            constants = [name for name in given if name != "tx_m"]
+            found = paths.slopes(parameters, constants) if constants else {}
+            if "tx_m" in given:
+                found["tx_m"], of_vertices = paths.transmitter_slopes(parameters)
+                found["vertices_m"] = of_vertices.reshape(-1, 3)
+            return found
+
+        def pull_back(of_power: Any, of_vertices: Any) -> list[Any]:
+            found = {name: _pulled(slopes()[name], of_power) for name in given}
+            if "tx_m" in given:
+                found["tx_m"] += _pulled(slopes()["vertices_m"], tf.reshape(of_vertices, [-1]))
+            return [_once_only(tf.reshape(found[name], values[name].shape)) for name in given]
+
+        power, vertices_m = paths.at(parameters)
+        return (tf.constant(power), tf.constant(np.nan_to_num(vertices_m))), pull_back
+
+    if not given:
+        return tf.constant(paths.power), tf.constant(np.nan_to_num(paths.vertices_m))
+    power, vertices_m = evaluate(*given.values())
+    return power, vertices_m
+
+
+def _pulled(slopes: NDArray[np.float64], upstream: Any) -> Any:
+    """Sum (K,) of slopes (P, K) times upstream derivatives (P,), in an order that does not depend on threads."""
+    rows = tf.convert_to_tensor(upstream)[:, None] * slopes
+    return tf.math.unsorted_segment_sum(rows, np.zeros(len(slopes), dtype=np.int32), 1)[0]
+
+
+def _once_only(slopes: Any) -> Any:
+    """Return derivatives that TensorFlow cannot differentiate again: a part would be missing."""
+    return tf.raw_ops.PreventGradient(input=slopes, message="links have first derivatives only.")
+
+
+def moved_lengths_m(
+    lengths: SmoothLengths,
+    exact_m: NDArray[np.float64],
+    base: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ends: tuple[Any, Any],
+) -> Any:
+    """Return lengths (N,) that change from exact ones as smooth ones do while the ends of their segments move.
+
+    Exact lengths [m] are those in cells of one kind at the ends `base` (N, 3), and `ends` are the present ones [m].
+    Lengths that were 0 stay so.
+    """
+
+    @tf.custom_gradient
+    def smooth_m(start: Any, end: Any) -> tuple[Any, Callable[[Any], list[Any]]]:
+        def pull_back(upstream: Any) -> list[Any]:
+            return [_once_only(upstream[:, None] * slopes) for slopes in lengths.slopes(start.numpy(), end.numpy())]
+
+        return tf.constant(lengths(start.numpy(), end.numpy())), pull_back
+
+    first_m = lengths(*base)
+    pace = np.divide(exact_m, first_m, out=np.full_like(exact_m, STEEPEST), where=first_m > exact_m / STEEPEST)
+    return tf.maximum(exact_m + np.where(exact_m > 0.0, pace, 0.0) * (smooth_m(*ends) - first_m), 0.0)

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
@@ -15,11 +16,11 @@ from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.style import RED, corners_m, shade, window_m
+from sionna_partial.plots.style import RED, STAR, corners_m, legend_below, shade, window_m
 
 _WIDTH_IN, _DPI = 9.0, 130
 _WALL, _UNKNOWN = "black", "0.86"
-_STAR: dict[str, Any] = {"marker": "*", "markersize": 15, "markerfacecolor": "white", "markeredgecolor": "black"}
+_STAR: dict[str, Any] = STAR | {"markersize": 15}
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
@@ -36,7 +37,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not known to pyplot: it need not be closed.
+        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
@@ -50,15 +51,22 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
     _draw_map(axis, placement.partial)
-    squares = _draw_receivers(axis, placement)
+    scale = _draw_receivers(axis, placement)
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
     coverage = placement.settings.objective == "coverage"
     label = f"probability of more than {placement.settings.threshold_db:g} dB" if coverage else "mean path gain [dB]"
-    bar = figure.colorbar(squares, ax=axis, label=label, shrink=0.8)
+    bar = figure.colorbar(scale, ax=axis, label=label, shrink=0.8)
     if coverage:
         bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
-    _add_legend(figure)
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], label="transmitter", **_STAR),
+        Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
+        Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
+        Patch(color=_WALL, label="wall"),
+        Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
+    ]
+    legend_below(figure, handles)
     return figure
 
 
@@ -86,8 +94,8 @@ def _draw_map(axis: Axes, partial: PartialMap) -> None:
         axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
 
 
-def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollection:
-    """Draw a square for each receiver, and return them as what the colour scale is for."""
+def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> ScalarMappable:
+    """Draw a square for each receiver, and return the colour scale."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.settings.objective == "coverage"
@@ -96,9 +104,7 @@ def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> PatchCollect
     squares.set_array(placement.values)
     squares.set_alpha((0.15 + 0.75 * np.clip(placement.weight, 0.0, 1.0)).tolist())
     axis.add_collection(squares)
-    scale = PatchCollection([], cmap="viridis", norm=norm)
-    scale.set_array(np.zeros(0))
-    return scale
+    return ScalarMappable(norm, "viridis")
 
 
 def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
@@ -107,15 +113,4 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
     x, y = placement.trajectory_m[:, :2].T
     axis.plot(x, y, color=RED, marker="o", markersize=4, linewidth=1.8, zorder=5)
     x, y = placement.position_m[:2]
-    axis.plot(x, y, linestyle="none", zorder=6, **_STAR)
-
-
-def _add_legend(figure: Figure) -> None:
-    handles = [
-        Line2D([], [], linestyle="none", label="transmitter", **_STAR),
-        Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
-        Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
-        Patch(color=_WALL, label="wall"),
-        Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
-    ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
+    axis.plot(x, y, zorder=6, **_STAR)

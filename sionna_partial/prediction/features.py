@@ -137,15 +137,9 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
         If `partial` is no PartialMap.
     """
     require_map("partial", partial)
-    transmitters = links.tx.reshape(-1, 3)
-    paths = IndirectPaths(partial, transmitters, links.rx)
+    paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx)
     paths.add(links)
-    link_state = links.link_state.ravel()
-    unobserved_m = np.concatenate([unobserved_lengths_m(partial, tx, links.rx) for tx in transmitters])
-    distance_m = np.linalg.norm(links.rx - transmitters[:, None], axis=-1).ravel()
-    context = paths.context(link_state, unobserved_m)
-    phi = LinkFeatures(link_state, unobserved_m, distance_m, links.gain_db.ravel(), context)
-    return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
+    return _features(paths, links.link_state.ravel(), links.gain_db.ravel(), windows=windows)
 
 
 def features_of_paths(
@@ -162,13 +156,18 @@ def features_of_paths(
         is_direct[paths.path_rx[paths.is_direct]] = True
         if context:
             indirect.add(paths)
-    link_state, gain_db = link_summary(power, is_direct)
-    unobserved_m, distance_m = unobserved_lengths_m(partial, tx_m, rx_m), np.linalg.norm(rx_m - tx_m, axis=-1)
-    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db)
-    if not context:
-        return phi
-    phi = replace(phi, context=indirect.context(link_state, unobserved_m))
-    return phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64))
+    return _features(indirect, *link_summary(power, is_direct), context=context)
+
+
+def _features(
+    paths: IndirectPaths, link_state: NDArray[np.uint8], gain_db: Floats, *, context: bool = True, windows: bool = True
+) -> LinkFeatures:
+    """Return the features of all links of `paths`, whose states and gains (N,) are given."""
+    unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
+    distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
+    found = paths.context(link_state, unobserved_m) if context else None
+    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db, found)
+    return phi.with_windows((paths.partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:

@@ -149,7 +149,7 @@ class IndirectPaths:
     """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced."""
 
     def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats) -> None:
-        self._partial, self._tx_m, self._rx_m = partial, tx_m, rx_m
+        self.partial, self.tx_m, self.rx_m = partial, tx_m, rx_m
         count = len(tx_m) * len(rx_m)
         self._power, self._strongest = np.zeros((len(ATTENUATION_LENGTHS_M), count)), np.zeros(count)
         self._strongest_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
@@ -161,8 +161,8 @@ class IndirectPaths:
             indirect = start + np.flatnonzero(np.any(paths.interactions[block] > 0, axis=1))
             tx, rx = paths.path_tx[indirect], paths.path_rx[indirect]
             interactions, vertices_m = paths.interactions[indirect], paths.vertices_m[indirect]
-            unobserved_m = path_unobserved_m(self._partial, self._tx_m[tx], interactions, vertices_m, self._rx_m[rx])
-            self._add(tx.astype(np.int64) * len(self._rx_m) + rx, np.abs(paths.a[indirect]) ** 2, unobserved_m)
+            unobserved_m = path_unobserved_m(self.partial, self.tx_m[tx], interactions, vertices_m, self.rx_m[rx])
+            self._add(tx.astype(np.int64) * len(self.rx_m) + rx, np.abs(paths.a[indirect]) ** 2, unobserved_m)
 
     def _add(self, link: NDArray[np.int64], power: Floats, unobserved_m: Floats) -> None:
         for total, length_m in zip(self._power, ATTENUATION_LENGTHS_M, strict=True):
@@ -176,9 +176,9 @@ class IndirectPaths:
 
     def context(self, link_state: NDArray[np.uint8], unobserved_distance_m: Floats) -> LinkContext:
         """Return the context of all T N links, transmitter by transmitter, without windows."""
-        tx_m, rx_m = np.repeat(self._tx_m, len(self._rx_m), axis=0), np.tile(self._rx_m, (len(self._tx_m), 1))
+        tx_m, rx_m = np.repeat(self.tx_m, len(self.rx_m), axis=0), np.tile(self.rx_m, (len(self.tx_m), 1))
         return LinkContext.on_maps(
-            (self._partial,),
+            (self.partial,),
             np.zeros(len(tx_m), dtype=np.int64),
             tx_m=tx_m,
             rx_m=rx_m,

@@ -22,7 +22,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
-from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer
+from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
 from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
@@ -200,8 +200,6 @@ def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> li
     """
     if not reads_maps(networks):
         return []
-    import tensorflow as tf
-
     windows = tf.concat([windows, tf.zeros_like(windows[:1])], axis=0)
     maps = [networks[name](windows[:, scale], training=training) for scale, name in enumerate(MAP_NETWORKS)]
     return [each[:-1] - each[-1:] for each in maps]
@@ -212,8 +210,6 @@ def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: A
 
     `maps` are from `read_maps`, `links` are (B, R, LINK_INPUTS), `offsets_m` (B, R, 2) of `receiver_offsets_m`.
     """
-    import tensorflow as tf
-
     at_receivers = [_interpolated(each, offsets_m / cell_m) for each, cell_m in zip(maps, CELLS_M, strict=False)]
     links = tf.concat([links, *at_receivers], axis=-1)
     outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
@@ -225,8 +221,6 @@ def _interpolated(maps: Any, offsets: Any) -> Any:
 
     They are bilinear between the centres of cells, and fade to 0 towards the border.
     """
-    import tensorflow as tf
-
     half = WINDOW_CELLS / 2
     inside = tf.clip_by_value((half - tf.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
     centres = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5 - half
@@ -240,8 +234,6 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB]. The
     mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
     """
-    import tensorflow as tf
-
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
     nlos_db = _NLOS_OFFSET_DB + _NLOS_SCALE_DB * outputs[..., 4]
     means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
@@ -254,8 +246,6 @@ def distribution(outputs: Any, free_db: Any, possible: Bools) -> tuple[Any, Any,
 
     `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not `possible` (N, 3) have probability 0.
     """
-    import tensorflow as tf
-
     states = tf.where(possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
     outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
     log_probabilities, gains_db, log_variances = decode(outputs, free_db)
@@ -387,8 +377,6 @@ def _turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.flo
 
 def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     """Return a function that takes one of so many gradient steps and returns the loss."""
-    import tensorflow as tf
-
     keras = import_keras()
     rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
     optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
@@ -416,8 +404,6 @@ def _crps(errors_db: Any, stds_db: Any) -> Any:
     Gains have longer tails than Gaussians. The likelihood widens them until the tails are covered, which makes the
     90 % interval too wide for most links; this score does not.
     """
-    import tensorflow as tf
-
     z = errors_db / stds_db
     density = tf.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
     return stds_db * (z * tf.math.erf(z / math.sqrt(2.0)) + 2.0 * density - 1.0 / math.sqrt(math.pi))

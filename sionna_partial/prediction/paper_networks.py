@@ -116,6 +116,20 @@ def import_keras() -> ModuleType:
     return keras
 
 
+class _TensorFlow:
+    """TensorFlow, imported after Keras when something of it is first used."""
+
+    def __getattr__(self, name: str) -> Any:
+        import_keras()
+        import tensorflow
+
+        setattr(self, name, getattr(tensorflow, name))
+        return getattr(tensorflow, name)
+
+
+tf: Any = _TensorFlow()
+
+
 def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
     """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
     return _gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
@@ -148,7 +162,12 @@ def gain_network(
         hidden = layer(keras, "Dense", name, units, activation="relu", kernel_initializer=start)(hidden)
     shape = layer(keras, "Dense", "mean_shape", 1, kernel_initializer="zeros")(hidden)
     offset = layer(keras, "Rescaling", "offset_db", std_db, offset_db)(shape)
-    mean = layer(keras, "Add", "mean_db")([_anchor(keras, row, tensors, frequency_hz), offset])
+    if row.anchored_to_trace:
+        anchor = tensors["gain_db"]
+    else:
+        decades = keras.ops.log10(keras.ops.maximum(tensors["distance_m"], NEAREST_M))
+        anchor = layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
+    mean = layer(keras, "Add", "mean_db")([anchor, offset])
     low, high = (2.0 * math.log(std) for std in STD_RANGE_DB)
     first = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
     spread = layer(keras, "Dense", "spread_shape", 1, activation="sigmoid", kernel_initializer="zeros")
@@ -192,7 +211,6 @@ def distribution_by_paper(
 
     Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
-    import tensorflow as tf
 
     def outputs(name: str) -> Any:
         network = networks[name]
@@ -255,14 +273,6 @@ def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, An
     offset = [-ranges[name][0] * factor for name, factor in zip(names, scale, strict=True)]
     scaled = layer(keras, "Rescaling", "scaled", scale, offset)(joined)
     return tensors, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
-
-
-def _anchor(keras: ModuleType, row: GainNetwork, tensors: Mapping[str, Any], frequency_hz: float) -> Any:
-    """Return the tensor (N, 1) of the gain from which the network gives the offset [dB]."""
-    if row.anchored_to_trace:
-        return tensors["gain_db"]
-    decades = keras.ops.log10(keras.ops.maximum(tensors["distance_m"], NEAREST_M))
-    return layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
 
 
 def _gain_at_1m_db(frequency_hz: float) -> float:

@@ -8,20 +8,23 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import require
+from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
+from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
 from sionna_partial.tracing.finder import part_of, write_scene_of
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
 from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
@@ -155,13 +158,9 @@ class PathSet:
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
         self._rows = [slice(*each) for each in itertools.pairwise(ends)]
-        depth = max(1, scene.settings.max_depth)
-        paths = [join_paths([], depth), *(solved for _, solved in self._parts)]
-        self.path_tx = np.concatenate([each.path_tx for each in paths])
-        self.path_rx = np.concatenate([each.path_rx for each in paths])
-        self.power = np.concatenate([np.abs(each.a) ** 2 for each in paths])
-        self.interactions = np.concatenate([_widened(each.interactions, depth, 0) for each in paths])
-        self.vertices_m = np.concatenate([_widened(each.vertices_m, depth, math.nan) for each in paths]) + scene.shift_m
+        paths = SolvedPaths.concatenate([solved for _, solved in self._parts], scene.settings.max_depth)
+        self.path_tx, self.path_rx, self.interactions = paths.path_tx, paths.path_rx, paths.interactions
+        self.power, self.vertices_m = np.abs(paths.a) ** 2, paths.vertices_m + scene.shift_m
 
     def __len__(self) -> int:
         """Return the number of paths P."""
@@ -330,29 +329,16 @@ def _merged(parts: list[Part]) -> list[Part]:
         depth = max(candidates.face.shape[1] for candidates, _ in some)
         candidates = Candidates.concatenate(
             [
-                replace(each, face=_widened(each.face, depth, -1), vertices_m=_widened(each.vertices_m, depth, 0.0))
+                replace(each, face=widened(each.face, depth, -1), vertices_m=widened(each.vertices_m, depth, 0.0))
                 for each, _ in some
             ]
         )
-        columns: dict[str, NDArray[Any]] = {}
-        for field in fields(SolvedPaths):
-            own = [getattr(paths, field.name) for _, paths in some]
-            if field.name in ("interactions", "vertices_m"):
-                own = [_widened(each, depth, 0 if field.name == "interactions" else math.nan) for each in own]
-            columns[field.name] = np.concatenate(own)
-        paths = SolvedPaths(**columns)
+        paths = SolvedPaths.concatenate([solved for _, solved in some], depth)
         for start in range(0, len(paths.a), PATHS_PER_BLOCK):
             rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))
             whole = len(rows) == len(paths.a)
             merged.append((candidates, paths) if whole else (candidates.rows(rows), paths.take(rows)))
     return merged
-
-
-def _widened(columns: NDArray[Any], depth: int, value: float) -> NDArray[Any]:
-    """Add interactions that there are not up to the depth D: (P, D, ...)."""
-    wide = np.full((len(columns), depth, *columns.shape[2:]), value, dtype=columns.dtype)
-    wide[:, : columns.shape[1]] = columns
-    return wide
 
 
 def one_transmitter(tx: ArrayLike) -> ArrayLike:
@@ -372,3 +358,142 @@ def path_settings(
         remedy = "paths that are found by shooting rays have no gradients: give False"
         require(not value, name, value, f"{remedy}, and trace_links for the gain alone.")
     return settings, scene_settings
+
+
+@dataclass(frozen=True)
+class GainGradients:
+    """Path gain from one transmitter to N receivers, and its derivatives.
+
+    The derivatives are those of the paths that exist: they do not include paths that appear or vanish. They are 0 in
+    an outage, where the gain is -150 dB.
+
+    Parameters
+    ----------
+    tx : (3,) float64 array
+        Transmitter position [m].
+    rx : (N, 3) float64 array
+        Receiver positions [m].
+    link_state : (N,) uint8 array of LinkState
+    gain_db : (N,) float64 array
+        Omnidirectional path gain [dB], at least -150 (paper, eq. 5).
+    tx_db_per_m : (N, 3) float64 array
+        Its derivatives with respect to the transmitter's x, y and z [dB/m].
+    relative_permittivity_db : (N,) float64 array
+        With respect to the real relative permittivity [dB], of all materials together where a mesh has several.
+    conductivity_db_per_s_m : (N,) float64 array
+        With respect to their conductivity [dB / (S/m)].
+    thickness_db_per_m : (N,) float64 array
+        With respect to their thickness [dB/m].
+    frequency_db_per_hz : (N,) float64 array
+        With respect to the carrier frequency [dB/Hz]. ITU materials follow the frequency where Sionna RT loads them by
+        name, which it does for all but `vacuum`.
+    settings : TraceSettings
+    scene_settings : SceneSettings
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    link_state: NDArray[np.uint8]
+    gain_db: NDArray[np.float64]
+    tx_db_per_m: NDArray[np.float64]
+    relative_permittivity_db: NDArray[np.float64]
+    conductivity_db_per_s_m: NDArray[np.float64]
+    thickness_db_per_m: NDArray[np.float64]
+    frequency_db_per_hz: NDArray[np.float64]
+    settings: TraceSettings
+    scene_settings: SceneSettings
+
+
+def gain_gradients(
+    scene: PartialMap | str | Path,
+    tx: ArrayLike,
+    rx: ArrayLike,
+    *,
+    settings: TraceSettings | None = None,
+    scene_settings: SceneSettings | None = None,
+    progress: Progress | None = None,
+) -> GainGradients:
+    """Differentiate the path gain from a transmitter to N receivers with Sionna RT and Dr.Jit.
+
+    The paths are those of `trace_links` with the same arguments. The power of a link is the sum of the powers of its
+    paths, without their phases. Candidates are verified first; Dr.Jit then differentiates the image method and the
+    field calculator of Sionna RT for the paths among them, in forward mode, one parameter after the other.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        What is known of the building; unknown space is free.
+    tx : (3,) array-like
+        Transmitter position [m].
+    rx : (N, 3) array-like
+        Receiver positions [m]; N may be 0.
+    settings : TraceSettings, optional
+        Refraction and diffuse reflection must be off; diffraction too on meshes.
+    scene_settings : SceneSettings, optional
+    progress : callable, optional
+        Called as ``progress(fraction_done, message)``.
+
+    Returns
+    -------
+    GainGradients
+
+    Raises
+    ------
+    PositionError
+        For a transmitter or receiver that is not finite, outside the map or inside a wall, a receiver at the
+        transmitter, or several transmitters.
+    SettingsError
+        For a frequency that the material does not cover, settings of another kind, or paths that only rays find.
+    BackendError
+        If LLVM or Sionna RT cannot be used, or Sionna RT is another than the fast engine was made for.
+    OutputError
+        If no temporary file can be written.
+
+    Examples
+    --------
+    In free space, the gain falls with 20 log10 of the distance and of the frequency. At 2 m it rises by 20 / ln(10) / 2
+    dB for each metre that the transmitter comes nearer:
+
+    >>> import numpy as np
+    >>> import sionna_partial as sp
+    >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
+    >>> no_floor = sp.SceneSettings(floor_extent="none")
+    >>> found = sp.gain_gradients(field, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)], scene_settings=no_floor)
+    >>> (found.tx_db_per_m + 0.0).round(3).tolist()
+    [[4.343, 0.0, 0.0]]
+    >>> (found.frequency_db_per_hz * 1e9).round(4).tolist()
+    [-0.3102]
+    """
+    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    settings, scene_settings = path_settings(partial, settings, scene_settings)
+    tx_m, rx_m = checked_positions(partial, one_transmitter(tx), rx, settings.frequency_hz)
+    report = progress or (lambda fraction, message: None)
+    report(0.0, "building the scene")
+    power, is_direct, slopes = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool), np.zeros((7, len(rx_m)))
+    if len(rx_m):
+        paths = PathScene(partial, settings=settings, scene_settings=scene_settings)
+
+        def part(fraction: float, message: str) -> None:
+            report(0.1 + 0.9 * fraction, message.replace("verifying", "differentiating"))
+
+        for block in paths.blocks(tx_m[0], rx_m, part):
+            is_direct[block.path_rx[block.is_direct]] = True
+            columns = np.concatenate(list(block.slopes(block.base, together=True).values()), axis=1)
+            for total, values in zip((power, *slopes), (block.power, *columns.T), strict=True):
+                total += np.bincount(block.path_rx, weights=values, minlength=len(rx_m))
+    link_state, gain_db = link_summary(power, is_direct)
+    above = gain_db > GAIN_FLOOR_DB
+    slopes_db = np.where(above, 10.0 / math.log(10.0) * slopes / np.where(above, power, 1.0), 0.0)
+    return GainGradients(
+        tx=tx_m[0].copy(),
+        rx=rx_m.copy(),
+        link_state=link_state,
+        gain_db=gain_db,
+        tx_db_per_m=slopes_db[:3].T,
+        relative_permittivity_db=slopes_db[3],
+        conductivity_db_per_s_m=slopes_db[4],
+        thickness_db_per_m=slopes_db[5],
+        frequency_db_per_hz=slopes_db[6],
+        settings=settings,
+        scene_settings=scene_settings,
+    )

@@ -1,6 +1,7 @@
 """Verified paths, however they were found, and how lists of them are joined."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,15 @@ class SolvedPaths:
         """Return the paths of transmitter `tx`, with receivers counted from `first_rx`."""
         path_tx = np.full(len(self.a), tx, np.int32)
         return replace(self, path_tx=path_tx, path_rx=self.path_rx + np.int32(first_rx))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence["SolvedPaths"], depth: int) -> "SolvedPaths":
+        """Join paths in the order given, with room for `depth` interactions."""
+        parts = [join_paths([], depth), *parts]
+        columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(cls)}
+        for name, value in (("interactions", 0), ("vertices_m", math.nan)):
+            columns[name] = [widened(column, max(1, depth), value) for column in columns[name]]
+        return cls(**{name: np.concatenate(column) for name, column in columns.items()})
 
     @classmethod
     def of_vertices(
@@ -126,6 +136,13 @@ class PathFiles:
 
     def _file(self, name: str) -> Path:
         return self._folder / f"{name}.npy"
+
+
+def widened(columns: NDArray[Any], depth: int, value: float) -> NDArray[Any]:
+    """Add interactions that there are not up to the depth D: (P, D, ...)."""
+    wide = np.full((len(columns), depth, *columns.shape[2:]), value, dtype=columns.dtype)
+    wide[:, : columns.shape[1]] = columns
+    return wide
 
 
 def _column_types(depth: int) -> dict[str, tuple[tuple[int, ...], type]]:

@@ -1,0 +1,605 @@
+"""The prediction as TensorFlow functions: values of the predictor, slopes of its finite differences."""
+
+import functools
+import subprocess
+import sys
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from pillar_room import RX_M as PILLAR_RX_M
+from pillar_room import TX_M, small_room
+from predictor_links import QUIET
+from scipy import stats
+
+import sionna_partial as sp
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.differentiable.scene import STEEPEST, LinkDistribution, moved_lengths_m, moved_paths
+from sionna_partial.differentiable.smooth_lengths import SmoothLengths
+from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.prediction.paper_networks import import_keras, tf
+from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathScene, PathSet
+
+pytestmark = QUIET
+
+TRACE = sp.TraceSettings(max_depth=1)
+SCENE = sp.SceneSettings(material=sp.Material(thickness_m=0.02))
+RX_M = np.array(
+    [[1.47, 2.51, 1.7], [3.05, 0.61, 1.2], [3.12, 2.52, 1.3], [3.7, 1.2, 1.1], [2.6, 2.45, 1.9], [0.7, 0.7, 1]]
+)
+STEPS = dict(zip(PARAMETERS, (1e-3, 2e-3, 5e-3, 1e-5, 1e7), strict=True))
+OUTPUTS = tuple(field.name for field in fields(LinkDistribution))
+
+
+def partial_room():
+    """Return the small room, of which a corner behind the pillar and a wall were not seen."""
+    whole = small_room()
+    x, y = np.meshgrid(np.arange(42), np.arange(32))
+    return replace(whole, state=np.where(x + 0.5 * y > 33, CellState.UNKNOWN, whole.state).astype(np.uint8))
+
+
+MAPS = {
+    "partial": partial_room(),
+    "empty": sp.PartialMap(np.full((32, 42), CellState.UNKNOWN), 0.1),
+    "complete": small_room(),
+}
+
+
+@functools.cache
+def loaded(predictor=None):
+    return sp.Predictor.load(predictor)
+
+
+def scene_of(kind, predictor=None):
+    return sp.DifferentiableScene(MAPS[kind], predictor=loaded(predictor), trace_settings=TRACE, scene_settings=SCENE)
+
+
+@pytest.fixture(scope="module")
+def links_of():
+    """Return links of a kind of map and a predictor; each are traced once."""
+    made = {}
+
+    def links(kind, predictor=None):
+        if (kind, predictor) not in made:
+            made[kind, predictor] = scene_of(kind, predictor).links(TX_M, RX_M)
+        return made[kind, predictor]
+
+    return links
+
+
+def predicted(kind, predictor):
+    links = sp.trace_links(MAPS[kind], TX_M, RX_M, settings=TRACE, scene_settings=SCENE)
+    return loaded(predictor).predict(sp.link_features(MAPS[kind], links)), links
+
+
+def assert_same(found, expected, **tolerance):
+    for name in OUTPUTS:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), **tolerance, err_msg=name)
+
+
+class TestValues:
+    @pytest.mark.parametrize("predictor", ["paper", "map"])
+    @pytest.mark.parametrize("kind", ["partial", "empty"])
+    def test_unmoved_as_predictor(self, kind, predictor, links_of):
+        expected, links = predicted(kind, predictor)
+        assert (links.link_state == sp.LinkState.NLOS).any() == (kind == "partial")
+        assert_same(links_of(kind, predictor)(), expected, rtol=1e-6, atol=1e-9)
+
+    def test_complete_map_is_the_trace(self, links_of):
+        _, links = predicted("complete", "paper")
+        found = links_of("complete")()
+        expected = loaded().predict(sp.link_features(MAPS["complete"], links))
+        assert_same(found, expected, rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(found.gain_mean_db, links.gain_db, rtol=1e-9)
+        assert not found.gain_std_db.numpy().any()
+
+    @pytest.mark.parametrize("predictor", ["paper", "map"])
+    @pytest.mark.parametrize("kind", MAPS)
+    def test_moved_by_nothing(self, kind, predictor, links_of):
+        links = links_of(kind, predictor)
+        given = {name: getattr(links.base, name) for name in PARAMETERS}
+        found, here = links(**given), links()
+        for name in OUTPUTS:
+            np.testing.assert_allclose(getattr(found, name), getattr(here, name), atol=1e-4, err_msg=name)
+
+    def test_arguments_may_be_of_any_kind(self, links_of):
+        links = links_of("partial", "paper")
+        tx_m = TX_M + 0.01
+        kinds = (
+            tx_m,
+            tx_m.tolist(),
+            tf.constant(tx_m),
+            tf.Variable(tx_m),
+            tf.constant(tx_m, tf.float64),
+        )
+        found = [links(tx_m=kind).gain_mean_db.numpy() for kind in kinds]
+        assert all(np.array_equal(one, found[0]) for one in found)
+        np.testing.assert_allclose(links(tx_m=tf.constant(tx_m, tf.float32)).gain_mean_db, found[0], atol=1e-4)
+
+    @pytest.mark.parametrize("predictor", ["paper", "map"])
+    def test_moved_as_a_new_trace(self, predictor, links_of):
+        """Nearer than where it was for all but one, as the networks have kinks, and much nearer for some."""
+        links, tx_m = links_of("partial", predictor), TX_M + np.array([0.04, -0.03, 0.02])
+        there = links._scene.links(tx_m, RX_M)
+        here, moved, traced = (each.gain_mean_db.numpy() for each in (links(), links(tx_m=tx_m), there()))
+        assert (np.abs(moved - traced) < np.abs(here - traced)).sum() >= len(RX_M) - 1
+        assert (np.abs(moved - traced) < 0.3 * np.abs(here - traced)).sum() >= 2
+
+    def test_two_runs_give_the_same_bytes(self, links_of):
+        one, other = links_of("partial"), scene_of("partial").links(TX_M, RX_M)
+        tx_m = TX_M + 0.01
+        one, other = one(tx_m=tx_m), other(tx_m=tx_m)
+        assert all(getattr(one, name).numpy().tobytes() == getattr(other, name).numpy().tobytes() for name in OUTPUTS)
+
+    def test_no_receivers(self):
+        tx_m = tf.Variable(TX_M)
+        for kind in MAPS:
+            links = scene_of(kind).links(TX_M, [])
+            with tf.GradientTape() as tape:
+                found = links(tx_m=tx_m)
+                value = tf.reduce_sum(found.gain_mean_db)
+            assert all(getattr(found, name).shape == (0,) for name in OUTPUTS)
+            assert not np.any(tape.gradient(value, tx_m, unconnected_gradients="zero"))
+
+    @pytest.mark.parametrize("predictor", ["paper", "map"])
+    @pytest.mark.parametrize(
+        "tx_m", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["pillar", "far", "receiver"]
+    )
+    def test_impossible_positions_have_finite_slopes(self, tx_m, predictor, links_of):
+        links, tx_m = links_of("partial", predictor), tf.Variable(np.array(tx_m))
+        with tf.GradientTape(persistent=True) as tape:
+            found = links(tx_m=tx_m)
+        for name in OUTPUTS:
+            assert np.isfinite(getattr(found, name)).all(), name
+            slope = tape.gradient(getattr(found, name), tx_m, unconnected_gradients="zero")
+            assert np.isfinite(slope).all(), name
+        np.testing.assert_allclose(found.p_los + found.p_nlos + found.p_outage, 1.0, atol=1e-6)
+
+
+class TestSlopes:
+    @staticmethod
+    def outputs(found):
+        columns = [found.gain_mean_db, found.gain_std_db, 100.0 * found.p_los, 100.0 * found.coverage(-75.0, 1.0)]
+        return tf.stack([*columns, found.gain_nlos_mean_db])
+
+    @pytest.mark.parametrize("name", PARAMETERS)
+    @pytest.mark.parametrize(("kind", "predictor"), [("partial", "paper"), ("partial", "map"), ("complete", None)])
+    def test_by_differences(self, kind, predictor, name, links_of):
+        links = links_of(kind, predictor)
+        variable, step = tf.Variable(getattr(links.base, name)), STEPS[name]
+        weight = np.random.default_rng(0).uniform(0.5, 1.5, len(RX_M))
+        with tf.GradientTape(persistent=True) as tape:
+            here = tf.unstack(self.outputs(links(**{name: variable})) @ weight[:, None])
+        found = np.array([np.ravel(tape.gradient(each, variable)) for each in here])
+        value = variable.numpy()
+        for entry, along in enumerate(np.eye(value.size)):
+            ends_m = [value + sign * step * along.reshape(value.shape) for sign in (1, -1)]
+            ends = [self.outputs(links(**{name: tx_m})).numpy() for tx_m in ends_m]
+            expected = (ends[0] - ends[1]) / (2 * step)
+            rounding = 1e-4 / step  # networks have single precision
+            off = np.abs(found[:, entry] - expected @ weight)
+            assert (off <= 0.02 * np.abs(expected).sum(axis=1) + rounding).all()
+            assert np.abs(expected[0]).sum() > 5 * rounding
+
+    @pytest.mark.parametrize("predictor", ["paper", "map"])
+    def test_weights(self, predictor):
+        scene = scene_of("partial", predictor)
+        links, rng = scene.links(TX_M, RX_M), np.random.default_rng(0)
+        for output in range(5):
+            with tf.GradientTape() as tape:
+                value = tf.reduce_sum(self.outputs(links())[output])
+            slopes = [
+                np.zeros(w.shape) if s is None else s.numpy()
+                for w, s in zip(scene.weights, tape.gradient(value, scene.weights), strict=True)
+            ]
+            kept, step = [weight.numpy() for weight in scene.weights], 1e-3
+            along_gradient = [
+                slope / max(np.linalg.norm(slope), 1e-9) + 0.01 * rng.normal(size=slope.shape) / np.sqrt(slope.size)
+                for slope in slopes
+            ]
+            ends = []
+            for sign in (1, -1):
+                for weight, value, along in zip(scene.weights, kept, along_gradient, strict=True):
+                    weight.assign(value + sign * step * along)
+                ends.append(tf.reduce_sum(self.outputs(links())[output]).numpy())
+            for weight, value in zip(scene.weights, kept, strict=True):
+                weight.assign(value)
+            expected = (ends[0] - ends[1]) / (2 * step)
+            assert sum(
+                (slope * along).sum() for slope, along in zip(slopes, along_gradient, strict=True)
+            ) == pytest.approx(expected, rel=0.03)
+
+    def test_trace_of_a_complete_map_needs_no_weights(self, links_of):
+        links = links_of("complete")
+        with tf.GradientTape() as tape:
+            value = tf.reduce_sum(links().gain_mean_db)
+        assert set(tape.gradient(value, links._scene.weights)) == {None}
+
+    @pytest.mark.parametrize("predictor", ["paper", "map"])
+    def test_weights_are_those_that_answer(self, predictor):
+        scene = scene_of("partial", predictor)
+        links = scene.links(TX_M, RX_M)
+        with tf.GradientTape() as tape:
+            found = links()
+            value = tf.add_n([tf.reduce_sum(getattr(found, name)) for name in OUTPUTS])
+        touched = {variable.ref() for variable in tape.watched_variables()}
+        assert {weight.ref() for weight in scene.weights} == touched
+        assert None not in tape.gradient(value, scene.weights)
+
+
+class TestSecondUse:
+    def test_map_from_a_file(self, tmp_path, links_of):
+        sp.export_scene(MAPS["partial"], tmp_path / "scene")
+        scene = sp.DifferentiableScene(
+            tmp_path / "scene", predictor="paper", trace_settings=TRACE, scene_settings=SCENE
+        )
+        assert_same(scene.links(TX_M, RX_M)(), links_of("partial", "paper")(), rtol=1e-6, atol=1e-9)
+
+    def test_process_ends_well_with_all_of_it_alive(self):
+        code = (
+            "import numpy as np, sionna_partial as sp\n"
+            "field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), 0.1)\n"
+            "scene = sp.DifferentiableScene(field, predictor='paper')\n"
+            "links = scene.links((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])\n"
+            "import tensorflow as tf\n"
+            "tx_m = tf.Variable(links.base.tx_m)\n"
+            "tape = tf.GradientTape(persistent=True)\n"
+            "with tape:\n"
+            "    found = links(tx_m=tx_m)\n"
+            "slope = tape.gradient(found.gain_mean_db, tx_m)\n"
+            "print(slope.shape)\n"
+        )
+        result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+        assert (result.returncode, result.stdout) == (0, "(3,)\n")
+        assert "leak" not in result.stderr.lower()
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("name", "value", "remedy"),
+        [
+            ("tx_m", [1.0, 2.0], r"give a tensor of shape \(3,\)\."),
+            ("tx_m", [[1.0, 2.0, 3.0]], r"give a tensor of shape \(3,\)\."),
+            ("tx_m", [1.0, float("nan"), 1.0], r"give numbers in \[-1e\+09, 1e\+09\]\."),
+            ("relative_permittivity", 2.0, r"give a tensor of shape \(1,\)\."),
+            ("relative_permittivity", [0.9], r"give numbers in \[1, 1e\+06\]\."),
+            ("conductivity_s_m", [-1.0], r"give numbers in \[0, 1e\+09\]\."),
+            ("thickness_m", [11.0], r"give numbers in \[0, 10\]\."),
+            ("frequency_hz", [28e9], r"give a tensor of shape \(\)\."),
+            ("frequency_hz", 28.0, r"give numbers in \[1e\+06, 1e\+12\]\."),
+        ],
+    )
+    def test_shape_and_range(self, name, value, remedy, links_of):
+        with pytest.raises(SettingsError, match=rf"{name} = .* is not allowed: {remedy}"):
+            links_of("partial", "paper")(**{name: value})
+
+    def test_within_a_function(self, links_of):
+        links = links_of("partial", "paper")
+        with pytest.raises(
+            SettingsError, match=r"tx_m = .* is not allowed: call links eagerly, not within tf\.function"
+        ):
+            tf.function(lambda tx_m: links(tx_m=tx_m).p_los, autograph=False)(tf.constant(TX_M))
+
+    def test_positions(self, links_of):
+        scene = links_of("partial", "paper")._scene
+        with pytest.raises(PositionError, match=r"tx has shape \(1, 3\): give one transmitter"):
+            scene.links(TX_M[None], RX_M)
+
+    def test_second_derivatives(self, links_of):
+        links, tx_m = links_of("partial", "paper"), tf.Variable(TX_M)
+        with tf.GradientTape() as outer:
+            with tf.GradientTape() as tape:
+                value = tf.reduce_sum(links(tx_m=tx_m).gain_mean_db)
+            slope = tape.gradient(value, tx_m)
+        with pytest.raises(LookupError, match="first derivatives only"):
+            outer.gradient(slope, tx_m)
+
+    def test_materials_are_named(self, links_of):
+        scene = links_of("partial", "paper")._scene
+        assert len(scene.materials) == len(links_of("partial", "paper").base.thickness_m) == 1
+        assert all(getattr(links_of("partial", "paper").base, name).shape == (1,) for name in MATERIAL_PARAMETERS)
+
+
+TX = np.array([1.1, 1.7, 1.4])
+
+
+@pytest.fixture(scope="module")
+def paths() -> PathSet:
+    return PathScene(small_room(), settings=sp.TraceSettings(max_depth=1)).paths(TX_M, PILLAR_RX_M)
+
+
+@pytest.fixture(scope="module")
+def empty() -> PathSet:
+    return PathScene(small_room(), settings=sp.TraceSettings(max_depth=1)).paths(TX_M, [])
+
+
+def variables(paths, *names):
+    return {name: tf.Variable(getattr(paths.base, name)) for name in names}
+
+
+def upstream(paths, seed=0):
+    """Return weights of the powers and of the vertices of paths, for a scalar of both."""
+    rng = np.random.default_rng(seed)
+    return rng.uniform(0.5, 1.5, len(paths)) / paths.power.sum(), rng.normal(size=paths.vertices_m.shape)
+
+
+class TestMovedPaths:
+    def test_values(self, paths):
+        there = {"tx_m": paths.base.tx_m + 0.01, "conductivity_s_m": np.array([0.3])}
+        power, vertices_m = moved_paths(paths, {name: tf.constant(value) for name, value in there.items()})
+        expected, expected_m = paths.at(replace(paths.base, **there))
+        assert (power.dtype, vertices_m.dtype) == (tf.float64, tf.float64)
+        np.testing.assert_array_equal(power, expected)
+        np.testing.assert_array_equal(vertices_m, np.nan_to_num(expected_m))
+        assert not vertices_m.numpy()[paths.interactions == 0].any()
+
+    def test_nothing_given_is_the_trace(self, paths):
+        power, vertices_m = moved_paths(paths, {})
+        np.testing.assert_array_equal(power, paths.power)
+        np.testing.assert_array_equal(vertices_m, np.nan_to_num(paths.vertices_m))
+
+    def test_gradient(self, paths):
+        of_power, of_vertices = upstream(paths)
+        given = variables(paths, *PARAMETERS)
+        with tf.GradientTape() as tape:
+            power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
+            value = tf.reduce_sum(power * of_power) + tf.reduce_sum(vertices_m * of_vertices)
+        found, slopes = tape.gradient(value, given), paths.slopes(paths.base)
+        power_by_tx, vertices_by_tx = paths.transmitter_slopes(paths.base)
+        expected = {name: of_power @ slopes[name] for name in PARAMETERS}
+        expected["tx_m"] = of_power @ power_by_tx + np.einsum("pdi,pdij->j", of_vertices, vertices_by_tx)
+        for name in PARAMETERS:
+            assert found[name].shape == getattr(paths.base, name).shape
+            np.testing.assert_allclose(np.ravel(found[name]), expected[name], rtol=1e-9, err_msg=name)
+            assert np.all(found[name].numpy() != 0.0)
+
+    def test_slopes_are_those_of_where_it_was_evaluated(self, paths):
+        tx_m = tf.Variable(paths.base.tx_m)
+        before = paths.base.tx_m.copy()
+        with tf.GradientTape() as tape:
+            value = tf.reduce_sum(moved_paths(paths, {"tx_m": tf.convert_to_tensor(tx_m)})[0])
+        tx_m.assign_add([0.3, -0.2, 0.1])
+        np.testing.assert_array_equal(paths.base.tx_m, before)
+        np.testing.assert_allclose(tape.gradient(value, tx_m), paths.transmitter_slopes(paths.base)[0].sum(axis=0))
+
+    @pytest.mark.parametrize("at_once", [True, False])
+    def test_jacobian(self, paths, at_once):
+        given = variables(paths, "tx_m", "thickness_m", "frequency_hz")
+        with tf.GradientTape(persistent=True) as tape:
+            power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
+        options = {"experimental_use_pfor": at_once}
+        found, slopes = tape.jacobian(power, given, **options), paths.slopes(paths.base)
+        assert {name: tuple(each.shape) for name, each in found.items()} == {
+            "tx_m": (len(paths), 3), "thickness_m": (len(paths), 1), "frequency_hz": (len(paths),)
+        }  # fmt: skip
+        for name, each in found.items():
+            np.testing.assert_allclose(np.reshape(each, slopes[name].shape), slopes[name], rtol=1e-12)
+        if at_once:
+            of_vertices = tape.jacobian(vertices_m, given["tx_m"], **options)
+            np.testing.assert_allclose(of_vertices, paths.transmitter_slopes(paths.base)[1], rtol=1e-12)
+
+    def test_a_part_of_the_paths(self, paths):
+        """TensorFlow hands back derivatives of single entries in another form."""
+        given = variables(paths, "tx_m", "conductivity_s_m")
+        with tf.GradientTape() as tape:
+            power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
+            value = tf.reduce_sum(tf.gather(power, [3, 5])) + 0.0 * tf.reduce_sum(tf.gather(vertices_m, [2]))
+        found, slopes = tape.gradient(value, given), paths.slopes(paths.base)
+        for name, each in found.items():
+            np.testing.assert_allclose(each, slopes[name][[3, 5]].sum(axis=0), rtol=1e-9)
+
+    def test_no_paths(self, empty):
+        given = variables(empty, *PARAMETERS)
+        with tf.GradientTape() as tape:
+            power, vertices_m = moved_paths(empty, {name: tf.identity(each) for name, each in given.items()})
+            value = tf.reduce_sum(power) + tf.reduce_sum(vertices_m)
+        assert (power.shape, vertices_m.shape[0]) == ((0,), 0)
+        assert not any(np.any(each) for each in tape.gradient(value, given).values())
+
+
+@pytest.fixture(scope="module")
+def rx_m():
+    return np.array([[5.6, 3.1, 1.2], [5.1, 0.62, 1.9], [4.4, 2.3, 0.7], [2.1, 0.4, 1.5], [1.4, 3.3, 2.1]])
+
+
+@pytest.fixture(scope="module")
+def partial():
+    """Return a map that is known up to a slanting line."""
+    x, y = np.meshgrid(np.arange(60), np.arange(40))
+    state = np.where(x + 0.4 * y > 38, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
+    return sp.PartialMap(state, 0.1)
+
+
+class TestMovedLengths:
+    def of(self, partial, rx_m, tx_m):
+        """Return lengths to receivers from where the transmitter is now."""
+        first = np.broadcast_to(TX, rx_m.shape)
+        exact_m = unobserved_lengths_m(partial, first, rx_m)
+        ends = tf.broadcast_to(tx_m, rx_m.shape), tf.constant(rx_m)
+        return exact_m, moved_lengths_m(SmoothLengths(partial, CellState.UNKNOWN), exact_m, (first, rx_m), ends)
+
+    def test_exact_where_it_was_traced(self, partial, rx_m):
+        exact_m, found_m = self.of(partial, rx_m, tf.constant(TX))
+        assert (exact_m > 0.5).tolist() == [True, True, True, False, False]
+        np.testing.assert_array_equal(found_m, exact_m)
+
+    def test_what_was_seen_stays_so(self, partial, rx_m):
+        tx_m = tf.constant(TX + np.array([3.4, 1.0, 0.0]))
+        assert (unobserved_lengths_m(partial, tx_m.numpy(), rx_m)[3:] > 0.3).all()
+        with tf.GradientTape() as tape:
+            tape.watch(tx_m)
+            found_m = self.of(partial, rx_m, tx_m)[1][3:]
+        assert found_m.numpy().tolist() == [0.0, 0.0]
+        assert tape.gradient(found_m, tx_m).numpy().tolist() == [0.0, 0.0, 0.0]
+
+    def test_follows_the_frontier(self, partial, rx_m):
+        """As the exact length does over a while, not in each cell."""
+        step = np.array([0.0, 0.3, 0.0])
+        _, found_m = self.of(partial, rx_m, tf.constant(TX + step))
+        np.testing.assert_allclose(found_m, unobserved_lengths_m(partial, TX + step, rx_m), atol=0.08)
+
+    def test_gradient_by_differences(self, partial, rx_m):
+        tx_m = tf.constant(TX)
+        with tf.GradientTape() as tape:
+            tape.watch(tx_m)
+            found_m = self.of(partial, rx_m, tx_m)[1]
+        jacobian = tape.jacobian(found_m, tx_m)
+        steps = 1e-5 * np.eye(3)
+        ends = [[self.of(partial, rx_m, tf.constant(TX + s * step))[1].numpy() for step in steps] for s in (1, -1)]
+        np.testing.assert_allclose(jacobian, np.transpose(np.subtract(*ends) / 2e-5), rtol=1e-4, atol=1e-7)
+        assert (np.abs(jacobian[:3, :2]).max(axis=1) > 0.01).all()
+
+    def test_both_ends_count(self, partial):
+        """A segment in the unknown is as long as it is."""
+        ends = [tf.Variable([[x, y, 1.5]], dtype=tf.float64) for x, y in ((5.2, 1.3), (5.7, 3.4))]
+        base = tuple(end.numpy() for end in ends)
+        lengths = SmoothLengths(partial, CellState.UNKNOWN)
+        with tf.GradientTape() as tape:
+            exact_m = unobserved_lengths_m(partial, *base)
+            found_m = moved_lengths_m(lengths, exact_m, base, tuple(map(tf.convert_to_tensor, ends)))
+        along = (base[1] - base[0]) / exact_m
+        for slope, sign in zip(tape.gradient(found_m, ends), (-1, 1), strict=True):
+            np.testing.assert_allclose(slope, sign * along, rtol=1e-9, atol=1e-12)
+
+    def test_steepest(self, partial):
+        """Where the exact length is larger by far than the smooth one, it grows `STEEPEST` times as fast."""
+        lengths = SmoothLengths(partial, CellState.UNKNOWN)
+        start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
+        smooth_m = lengths(start, end)
+        moved = tf.constant(end + np.array([0.25, 0.0, 0.0]))
+        grown_m = lengths(start, moved.numpy()) - smooth_m
+        assert grown_m > 0.2
+        for times, pace in ((0.5, 0.5), (2.0, 2.0), (3.9, 3.9), (4.1, STEEPEST), (100.0, STEEPEST)):
+            exact_m = times * smooth_m
+            found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), moved))
+            np.testing.assert_allclose(found_m, exact_m + pace * grown_m, rtol=1e-12)
+
+    def test_no_length_is_negative(self, partial):
+        lengths = SmoothLengths(partial, CellState.UNKNOWN)
+        start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
+        near = tf.constant(np.array([[1.5, 1.0, 1.5]]))
+        for times in (0.5, 1.0, 50.0):
+            exact_m = times * lengths(start, end)
+            found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), near))
+            assert found_m.numpy()[0] >= 0.0
+
+    def test_complete_map_and_no_segments(self):
+        complete = sp.PartialMap(np.pad(np.zeros((8, 8), dtype=np.uint8), 1, constant_values=1), 0.5)
+        lengths, nothing = SmoothLengths(complete, CellState.UNKNOWN), np.zeros((0, 3))
+        assert moved_lengths_m(lengths, np.zeros(0), (nothing, nothing), (tf.constant(nothing),) * 2).shape == (0,)
+        ends = np.array([[1.0, 1.0, 1.0]]), np.array([[99.0, 1.0, 1.0]])
+        assert moved_lengths_m(lengths, np.zeros(1), ends, tuple(map(tf.constant, ends))).numpy().tolist() == [0.0]
+
+    def test_second_derivatives_are_refused(self, partial, rx_m):
+        tx_m = tf.Variable(TX)
+        with tf.GradientTape() as outer:
+            with tf.GradientTape() as tape:
+                value = tf.reduce_sum(self.of(partial, rx_m, tf.convert_to_tensor(tx_m))[1] ** 2)
+            slope = tape.gradient(value, tx_m)
+        with pytest.raises(LookupError, match="first derivatives only"):
+            outer.gradient(slope, tx_m)
+
+
+THRESHOLD_DB = -100.0
+
+
+def random_parts(count=200, seed=0):
+    """Return probabilities, means and standard deviations (3, N), some links certain in state, gain or both."""
+    rng = np.random.default_rng(seed)
+    probabilities = rng.dirichlet(np.ones(3), count).T
+    probabilities[:, :30] = np.eye(3)[:, np.arange(30) % 3]
+    means_db = np.stack([np.full(count, GAIN_FLOOR_DB), *rng.uniform(-140.0, -60.0, (2, count))])
+    stds_db = np.stack([np.zeros(count), *rng.uniform(0.3, 20.0, (2, count))])
+    stds_db[:, ::4] = 0.0
+    return probabilities, means_db, stds_db
+
+
+def of(*parts):
+    return LinkDistribution.of_parts(*(tf.cast(part, tf.float64) for part in parts), ops=import_keras().ops)
+
+
+class TestOfParts:
+    def test_as_link_prediction(self):
+        parts = random_parts()
+        found, expected = of(*parts), LinkPrediction.of_parts(*parts)
+        assert [field.name for field in fields(found)] == [field.name for field in fields(expected)]
+        for field in fields(expected):
+            values = getattr(found, field.name)
+            assert values.dtype == tf.float64
+            np.testing.assert_allclose(values.numpy(), getattr(expected, field.name), rtol=1e-12, err_msg=field.name)
+
+    def test_slopes_by_differences(self):
+        parts = [part[:, 30:][:, np.arange(170) % 4 != 2] for part in random_parts()]
+        tensors = [tf.constant(part) for part in parts]
+        with tf.GradientTape(persistent=True) as tape:
+            tape.watch(tensors)
+            found = of(*tensors)
+        for name in ("gain_mean_db", "gain_std_db"):
+            for index, tensor in enumerate(tensors):
+                slopes = tape.gradient(getattr(found, name), tensor, unconnected_gradients="zero")
+                for row in range(3):
+                    step = 1e-5 * np.eye(3)[row][:, None]
+                    ends = [
+                        getattr(of(*(part + sign * step * (k == index) for k, part in enumerate(parts))), name)
+                        for sign in (1, -1)
+                    ]
+                    expected = (ends[0] - ends[1]).numpy() / 2e-5
+                    np.testing.assert_allclose(
+                        slopes[row], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max() + 1e-5
+                    )
+
+    def test_no_spread_has_no_slope(self):
+        """A square root has an infinite one at 0, which times 0 is NaN."""
+        certain, mean_db = tf.constant([[0.0], [1.0], [0.0]], tf.float64), tf.constant([[-80.0]] * 3, tf.float64)
+        with tf.GradientTape(persistent=True) as tape:
+            tape.watch(mean_db)
+            found = of(certain, mean_db, tf.zeros_like(mean_db))
+        assert found.gain_std_db.numpy().tolist() == [0.0]
+        assert tape.gradient(found.gain_std_db, mean_db).numpy().ravel().tolist() == [0.0, 0.0, 0.0]
+        assert tape.gradient(found.gain_mean_db, mean_db).numpy().ravel().tolist() == [0.0, 1.0, 0.0]
+
+
+class TestCoverage:
+    @pytest.mark.parametrize("softness_db", [0.0, 3.0])
+    def test_beside_scipy(self, softness_db):
+        parts = random_parts()
+        found = of(*parts).coverage(THRESHOLD_DB, softness_db).numpy()
+        spread = np.hypot(parts[2], softness_db)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            fractions = stats.norm.sf(THRESHOLD_DB, parts[1], spread)
+        fractions = np.where(spread > 0.0, fractions, parts[1] > THRESHOLD_DB)
+        np.testing.assert_allclose(found, (parts[0][1:] * fractions[1:]).sum(axis=0), rtol=1e-10, atol=1e-14)
+        assert ((found >= 0.0) & (found <= 1.0)).all()
+
+    def test_step_without_spread(self):
+        means_db = [[-150.0] * 3, [-99.0, -100.0, -101.0], [-150.0] * 3]
+        certain = of(np.repeat([[0.0], [1.0], [0.0]], 3, axis=1), means_db, np.zeros((3, 3)))
+        assert certain.coverage(THRESHOLD_DB).numpy().tolist() == [1.0, 0.0, 0.0]
+        np.testing.assert_allclose(certain.coverage(THRESHOLD_DB, 1.0), stats.norm.cdf([1.0, 0.0, -1.0]), rtol=1e-12)
+
+    @pytest.mark.parametrize("softness_db", [0.0, 3.0])
+    def test_slopes(self, softness_db):
+        """Those of the Gaussian density, and 0 where there is no spread; nowhere NaN, be the gain where it may."""
+        probabilities, means_db, stds_db = random_parts()
+        means_db[1, :4] = THRESHOLD_DB
+        tensors = [tf.constant(part) for part in (probabilities, means_db, stds_db)]
+        with tf.GradientTape() as tape:
+            tape.watch(tensors)
+            covered = of(*tensors).coverage(THRESHOLD_DB, softness_db)
+        of_probability, of_mean, of_std = (slope.numpy() for slope in tape.gradient(covered, tensors))
+        assert all(np.isfinite(slope).all() for slope in (of_probability, of_mean, of_std))
+        spread = np.hypot(stds_db, softness_db)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            density = np.where(spread > 0.0, stats.norm.pdf(THRESHOLD_DB, means_db, spread), 0.0)
+        np.testing.assert_allclose(of_mean[1:], (probabilities * density)[1:], rtol=1e-9, atol=1e-15)
+        assert not of_mean[0].any()
+        np.testing.assert_allclose(of_probability[1:] @ np.ones(200), of_fractions(means_db, spread), rtol=1e-9)
+
+
+def of_fractions(means_db, spread):
+    """Return the sum over links of the probability of a gain above the threshold, given LOS and given NLOS."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fractions = stats.norm.sf(THRESHOLD_DB, means_db, spread)
+    return np.where(spread > 0.0, fractions, means_db > THRESHOLD_DB)[1:].sum(axis=1)
