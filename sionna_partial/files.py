@@ -88,15 +88,16 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a library a path to write to, and move the file to `path` when all went well.
 
     The temporary path has the name of `path`, in a hidden folder beside it: side files of the library vanish with
-    that folder. Missing parent folders are made. On failure `path` is as it was before.
+    that folder. Missing parent folders are made. A link stays, and its file is replaced. On failure `path` is as it
+    was before.
     """
-    target = output_path(path)
+    name = output_path(path).name
+    target = Path(os.path.realpath(path))
     with _hidden_folder(target, target.parent) as hidden:
-        if target.is_dir():
-            raise _is_a_directory()
-        yield hidden / target.name
-        _sync(hidden / target.name)
-        os.replace(hidden / target.name, target)
+        _require_file(target)
+        yield hidden / name
+        _sync(hidden / name)
+        os.replace(hidden / name, target)
 
 
 @contextmanager
@@ -148,8 +149,7 @@ def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
         folder.mkdir()
         yield folder
         for file in folder.iterdir():
-            if (target / file.name).is_dir():
-                raise _output_error(target / file.name, _is_a_directory())
+            _require_file(target / file.name)
         _swap_entries(folder, target, hidden / "old")
 
 
@@ -239,8 +239,12 @@ def _output_error(target: Path, error: OSError) -> OutputError:
     return OutputError(f"path = '{target}' could not be written ({error.strerror or error}): {remedy}")
 
 
-def _is_a_directory() -> OSError:
-    return IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+def _require_file(path: Path) -> None:
+    """Raise an OutputError for a folder, pipe or device that would be replaced by a file."""
+    if path.is_dir():
+        raise _output_error(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
+    if path.exists() and not path.is_file():
+        raise OutputError(f"path = '{path}' is a pipe or a device: give the name of a file.")
 
 
 def _swap_entries(new: Path, target: Path, aside: Path) -> None:
