@@ -3,7 +3,7 @@
 import itertools
 import math
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, is_dataclass
 from numbers import Integral, Real
 from types import NoneType
@@ -99,9 +99,9 @@ def is_whole(value: object, low: int = 0) -> bool:
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= low
 
 
-def are_stages(value: object) -> bool:
+def are_stages(value: Any) -> bool:
     """Whether `value` has increasing whole numbers (of steps), or increasing fractions in [0, 1), one at least."""
-    stages = list(value) if isinstance(value, Iterable) and getattr(value, "ndim", 1) else []
+    stages = list(value) if isinstance(value, Sequence) or getattr(value, "ndim", 0) == 1 else []
     numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
     return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))

@@ -116,7 +116,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     all or none, and other files are kept. A folder with other content is refused.
     """
     target = output_path(path)
-    with _hidden_folder(target, target if target.is_dir() else target.parent) as hidden:
+    with _hidden_folder(target, target if os.path.isdir(target) else target.parent) as hidden:
         folder = hidden / "new"
         folder.mkdir()
         others = [entry for entry in target.iterdir() if entry != hidden] if target.is_dir() else []

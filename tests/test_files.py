@@ -76,6 +76,20 @@ def test_files_have_the_usual_permissions(tmp_path: Path) -> None:
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
+def test_links_stay_and_pipes_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "file")
+    with atomic_write(tmp_path / "link") as stream:
+        stream.write(b"new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "file").read_bytes() == b"new"
+    os.mkfifo(tmp_path / "pipe")
+    message = r"pipe' is a pipe or a device: give the name of a file"
+    with pytest.raises(OutputError, match=message), atomic_write(tmp_path / "pipe"):
+        pass
+    with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
+        (folder / "pipe").touch()
+
+
 def test_path_keeps_the_name_and_drops_side_files(tmp_path: Path) -> None:
     with atomic_path(tmp_path / "map.tif") as temporary:
         assert temporary.name == "map.tif"

@@ -241,6 +241,11 @@ def test_resolution_must_be_in_range(resolution_m):
         make_home(0, resolution_m=resolution_m)
 
 
+def test_locked_rooms_is_a_switch():
+    with pytest.raises(SettingsError, match=r"locked_rooms = 1 is not allowed: give True or False\."):
+        make_home(0, locked_rooms=1)
+
+
 def test_without_locked_rooms_all_is_within_reach_and_the_rest_is_the_same():
     apart = 0
     for seed in range(40):

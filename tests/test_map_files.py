@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from meshes import OBSERVED, room, surface_m2
 
 from sionna_partial.constants import CellState
-from sionna_partial.errors import MapError, OutputError
+from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
 from sionna_partial.maps.map_files import (
     load_map,
@@ -90,6 +90,19 @@ def test_scene_folder_reads_nothing_outside(tmp_path: Path, outside: str) -> Non
     folder = export(tmp_path / "scene", outside)
     with pytest.raises(MapError, match=f"image = '{outside}' is not allowed: the image of an exported scene lies in"):
         load_map(folder)
+
+
+def test_scene_folder_follows_no_link_to_the_outside(tmp_path: Path) -> None:
+    folder = export(tmp_path / "scene")
+    (folder / "map.pgm").rename(tmp_path / "outside.pgm")
+    (folder / "map.pgm").symlink_to(tmp_path / "outside.pgm")
+    with pytest.raises(MapError, match=r"image = 'map\.pgm' is not allowed: the image of an exported scene lies in"):
+        load_map(folder)
+
+
+def test_strict_is_a_switch(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
+        load_map(tmp_path, strict=1)  # type: ignore[arg-type]
 
 
 def test_folder_without_scene(tmp_path: Path) -> None:

@@ -73,7 +73,10 @@ class _Plain(yaml.SafeDumper):
     """Writes numbers and arrays of NumPy as those of Python."""
 
 
-_Plain.add_multi_representer(np.generic, lambda dumper, value: dumper.represent_data(value.item()))
+_Plain.add_multi_representer(
+    np.generic,  # type: ignore[type-abstract]
+    lambda dumper, value: dumper.represent_data(value.item()),
+)
 _Plain.add_multi_representer(np.ndarray, lambda dumper, value: dumper.represent_data(value.tolist()))
 
 

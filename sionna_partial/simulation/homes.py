@@ -143,6 +143,7 @@ def make_home(
     (True, 0.05)
     """
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
+    require(isinstance(locked_rooms, bool), "locked_rooms", locked_rooms, "give True or False.")
     if kind is not None:
         require_choice("kind", kind, STYLES)
     if resolution_m is not None:

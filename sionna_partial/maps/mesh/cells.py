@@ -25,7 +25,7 @@ DEFAULT_BAND_M = (1.0, 1.8)
 DEFAULT_RESOLUTION_M = 0.05
 """Edge of the cells of a mesh's map [m], as robots have them."""
 
-SMALLEST_M, HIGHEST_M = 1.0, 100.0
+SMALLEST_M, HIGHEST_M = 0.1, 100.0
 """Extent along x or y below which, and height above which, a mesh is in another unit than metres [m]."""
 
 RIM_M = 0.3
@@ -58,8 +58,8 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     Known cells with a surface in the height band are walls. Walls that run along lattice lines are in the cells above
     or to the right of them, or on the other side if those are unknown.
     """
-    _require_metres(mesh, reading.height_band_m)
     empty = _fitted_grid(mesh, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
+    _require_metres(mesh, reading.height_band_m)
     band_m = _band(mesh, reading.height_band_m)
     if reading.observed is None:
         known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
