@@ -2,33 +2,48 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterable
+import reprlib
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, is_dataclass
 from numbers import Integral, Real
 from types import NoneType
-from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from sionna_partial.errors import SettingsError
+from sionna_partial.errors import SettingsError, SionnaPartialError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 Progress = Callable[[float, str], None]
 """Called with the fraction of the work that is done, and a message."""
 
 _Settings = TypeVar("_Settings")
 
+_short = reprlib.Repr()
+_short.maxstring, _short.maxother, _short.maxlevel = 200, 200, 2
+
 
 def no_progress(fraction: float, message: str) -> None:
     """Report nothing."""
 
 
+def shown(value: object) -> str:
+    """Return a value as a short text of one line."""
+    try:
+        return " ".join(_short.repr(plain(value)).split())
+    except ValueError:  # whole numbers of thousands of digits
+        return f"a value of type {type(value).__name__}"
+
+
 def require(condition: bool, name: str, value: object, remedy: str) -> None:
     """Raise a SettingsError that names the setting, its value and the remedy unless `condition` holds."""
     if not condition:
-        raise SettingsError(f"{name} = {value!r} is not allowed: {remedy}")
+        raise SettingsError(f"{name} = {shown(value)} is not allowed: {remedy}")
 
 
 def require_number(name: str, value: object, low: float, high: float, *, open_low: bool = False) -> None:
     """Raise a SettingsError unless `value` is a finite number in [low, high], or (low, high] with `open_low`."""
-    number = float(value) if isinstance(value, Real) and not isinstance(value, bool) else math.nan
+    number = number_of(value)
     inside = (low < number if open_low else low <= number) and number <= high
     require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].")
 
@@ -39,14 +54,54 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
 
+def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
+    """Raise a SettingsError unless `value` is one of several words."""
+    words = tuple(choices)
+    require(isinstance(value, str) and value in words, name, value, f"choose one of {', '.join(words)}.")
+
+
+def plain(value: Any) -> Any:
+    """Return a scalar of NumPy as a number of Python, and anything else as it is."""
+    return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
+
+
+def number_of(value: object) -> float:
+    """Return the real number that a value is; NaN for anything else, which True and "1" are."""
+    number = plain(value)
+    try:
+        return float(number) if isinstance(number, Real) and not isinstance(number, bool) else math.nan
+    except OverflowError:
+        return math.nan
+
+
+def real_array(
+    name: str, values: Any, error: type[SionnaPartialError], remedy: str, kinds: str = "iuf"
+) -> "NDArray[Any]":
+    """Return an array of one of the dtype kinds; an `error` for ragged, masked, complex and other values."""
+    import numpy as np
+
+    parts = values if isinstance(values, list | tuple) else [values]
+    if any(np.ma.is_masked(part) for part in parts):
+        raise error(f"{name} has masked values, whose data would be read: fill them first, and {remedy}")
+    try:
+        array = np.asarray(values)
+        array = array.astype(np.float64) if array.dtype == object else array
+    except (TypeError, ValueError, OverflowError) as cause:
+        raise error(f"{name} = {shown(values)} is not numeric: {remedy}") from cause
+    if array.dtype.kind not in kinds:
+        what = f"has dtype {array.dtype}" if array.dtype.kind in "iufb" else f"= {shown(values)} is not numeric"
+        raise error(f"{name} {what}: {remedy}")
+    return array
+
+
 def is_whole(value: object, low: int = 0) -> bool:
     """Whether `value` is a whole number of `low` or more."""
     return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= low
 
 
-def are_stages(value: object) -> bool:
+def are_stages(value: Any) -> bool:
     """Whether `value` has increasing whole numbers (of steps), or increasing fractions in [0, 1), one at least."""
-    stages = list(value) if isinstance(value, Iterable) else []
+    stages = list(value) if isinstance(value, Sequence) or getattr(value, "ndim", 0) == 1 else []
     numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
     return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))
@@ -73,14 +128,15 @@ class Checked:
     """Base of dataclasses whose fields are checked against their annotations.
 
     Checked are ranges (`Annotated[float, Within(0, 1)]`, whole numbers for int), bool, Literal and dataclasses.
+    Numbers of NumPy become those of Python, so that settings can be written as JSON.
     """
 
     def __post_init__(self) -> None:
         for name, hint in get_type_hints(type(self), include_extras=True).items():
-            _check(name, getattr(self, name), hint)
+            object.__setattr__(self, name, _checked(name, plain(getattr(self, name)), hint))
 
 
-def _check(name: str, value: object, hint: Any) -> None:
+def _checked(name: str, value: Any, hint: Any) -> Any:
     arguments = get_args(hint)
     if get_origin(hint) is Annotated:
         number, allowed = arguments
@@ -88,9 +144,11 @@ def _check(name: str, value: object, hint: Any) -> None:
             require_whole(name, value, allowed.low, allowed.high)
         else:
             require_number(name, value, allowed.low, allowed.high, open_low=allowed.open_low)
-    elif get_origin(hint) is Literal:
-        require(value in arguments, name, value, f"choose one of {arguments}.")
+        return number(value)
+    if get_origin(hint) is Literal:
+        require_choice(name, value, arguments)
     elif hint is bool or arguments == (bool, NoneType):
         require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
     elif isinstance(hint, type) and is_dataclass(hint):
         require(isinstance(value, hint), name, value, f"give {hint.__name__}(...).")
+    return value

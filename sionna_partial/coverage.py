@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import require, require_number, settings_or_default
+from sionna_partial.checks import real_array, require, require_choice, require_number, settings_or_default
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
@@ -169,7 +169,7 @@ def predict_map(
     BackendError
         If LLVM or Sionna RT cannot be used.
     """
-    require(receivers in RECEIVERS, "receivers", receivers, f"give {' or '.join(map(repr, RECEIVERS))}.")
+    require_choice("receivers", receivers, RECEIVERS)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     trace_settings, scene_settings = checked_settings(
         partial,
@@ -237,10 +237,8 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
 
 
 def _transmitter(partial: PartialMap, tx: ArrayLike) -> Floats:
-    with suppress(ValueError):
-        if np.shape(tx) == (2,):
-            tx = np.append(np.asarray(tx, dtype=np.float64), DEFAULT_HEIGHT_M)
-    tx_m = partial.require_positions("tx", tx)
+    tx = real_array("tx", tx, PositionError, "give x, y and z in metres.")
+    tx_m = partial.require_positions("tx", np.append(tx, DEFAULT_HEIGHT_M) if tx.shape == (2,) else tx)
     if tx_m.ndim != 1:
         raise PositionError(f"tx has shape {tx_m.shape}: give one transmitter (3,), and call once for each.")
     return tx_m

@@ -85,10 +85,11 @@ def _encode_netcdf(coverage: xr.Dataset) -> bytes:
     for set_order in (creation.set_link_creation_order, creation.set_attr_creation_order):
         set_order(h5p.CRT_ORDER_TRACKED | h5p.CRT_ORDER_INDEXED)
     access.set_fapl_core(backing_store=False)
-    compressed = {name: {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
+    encoding: dict[str, dict[str, Any]] = {name: {"_FillValue": None} for name in ("x", "y")}
+    encoding |= {str(name): {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
     with h5py.File(h5f.create(b"coverage.nc", h5f.ACC_TRUNC, creation, access)) as memory:
         with h5netcdf.File(memory, "w") as netcdf:
-            coverage.dump_to_store(H5NetCDFStore(netcdf), encoding=compressed)
+            coverage.drop_encoding().dump_to_store(H5NetCDFStore(netcdf), encoding=encoding)
         memory.flush()
         return bytes(memory.id.get_file_image())
 

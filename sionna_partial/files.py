@@ -1,4 +1,4 @@
-"""Output that is written whole or not at all, and by one run at a time."""
+"""Files: input of bounded size; output that is written whole or not at all, and by one run at a time."""
 
 import errno
 import fcntl
@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 import socket
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -36,6 +37,45 @@ _REMEDIES = {
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
+def open_regular(
+    path: str | os.PathLike[str],
+    field: str,
+    error: type[SionnaPartialError],
+    most: int,
+    remedy: str = "give a smaller file.",
+) -> IO[bytes]:
+    """Open a regular file of at most `most` bytes; pipes and devices, which need not end, raise an `error`."""
+    try:
+        stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except (OSError, ValueError) as cause:
+        reason = getattr(cause, "strerror", None) or cause
+        raise error(f"{field} = '{path}' cannot be read ({reason}): check the path.") from cause
+    status, reason = os.fstat(stream.fileno()), ""
+    if not stat.S_ISREG(status.st_mode):
+        reason = "is a pipe or a device: give a file."
+    elif status.st_size > most:
+        reason = f"has more than {most:,} bytes: {remedy}"
+    if reason:
+        stream.close()
+        raise error(f"{field} = '{path}' {reason}")
+    return stream
+
+
+def read_bytes(
+    path: str | os.PathLike[str],
+    field: str,
+    error: type[SionnaPartialError],
+    most: int,
+    remedy: str = "give a smaller file.",
+) -> bytes:
+    """Return the content of a regular file of at most `most` bytes, or raise an `error` that names `field`."""
+    with open_regular(path, field, error, most, remedy) as stream:
+        try:
+            return stream.read(os.fstat(stream.fileno()).st_size + 1)
+        except OSError as cause:
+            raise error(f"{field} = '{path}' cannot be read ({cause.strerror}): check the disk.") from cause
+
+
 def output_path(path: object) -> Path:
     """Return a path to write to, or raise an OutputError if it is none."""
     if not isinstance(path, (str, os.PathLike)) or "\0" in os.fspath(path):
@@ -48,15 +88,16 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a library a path to write to, and move the file to `path` when all went well.
 
     The temporary path has the name of `path`, in a hidden folder beside it: side files of the library vanish with
-    that folder. Missing parent folders are made. On failure `path` is as it was before.
+    that folder. Missing parent folders are made. A link stays, and its file is replaced. On failure `path` is as it
+    was before.
     """
-    target = output_path(path)
+    name = output_path(path).name
+    target = Path(os.path.realpath(path))
     with _hidden_folder(target, target.parent) as hidden:
-        if target.is_dir():
-            raise _is_a_directory()
-        yield hidden / target.name
-        _sync(hidden / target.name)
-        os.replace(hidden / target.name, target)
+        _require_file(target)
+        yield hidden / name
+        _sync(hidden / name)
+        os.replace(hidden / name, target)
 
 
 @contextmanager
@@ -75,7 +116,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     all or none, and other files are kept. A folder with other content is refused.
     """
     target = output_path(path)
-    with _hidden_folder(target, target if target.is_dir() else target.parent) as hidden:
+    with _hidden_folder(target, target if os.path.isdir(target) else target.parent) as hidden:
         folder = hidden / "new"
         folder.mkdir()
         others = [entry for entry in target.iterdir() if entry != hidden] if target.is_dir() else []
@@ -108,8 +149,7 @@ def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
         folder.mkdir()
         yield folder
         for file in folder.iterdir():
-            if (target / file.name).is_dir():
-                raise _output_error(target / file.name, _is_a_directory())
+            _require_file(target / file.name)
         _swap_entries(folder, target, hidden / "old")
 
 
@@ -199,8 +239,12 @@ def _output_error(target: Path, error: OSError) -> OutputError:
     return OutputError(f"path = '{target}' could not be written ({error.strerror or error}): {remedy}")
 
 
-def _is_a_directory() -> OSError:
-    return IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+def _require_file(path: Path) -> None:
+    """Raise an OutputError for a folder, pipe or device that would be replaced by a file."""
+    if path.is_dir():
+        raise _output_error(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
+    if path.exists() and not path.is_file():
+        raise OutputError(f"path = '{path}' is a pipe or a device: give the name of a file.")
 
 
 def _swap_entries(new: Path, target: Path, aside: Path) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
-from sionna_partial.checks import Checked, Within, are_stages, is_whole, require, require_number
+from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
@@ -96,10 +96,8 @@ class Material(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("relative_permittivity", "conductivity_s_m", "thickness_m"):
-            object.__setattr__(self, name, float(getattr(self, name)))  # files hold no numbers of NumPy
-        known = ", ".join(ITU_BANDS_GHZ)
-        require(self.itu is None or self.itu in tuple(ITU_BANDS_GHZ), "itu", self.itu, f"choose one of {known}.")
+        if self.itu is not None:
+            require_choice("itu", self.itu, ITU_BANDS_GHZ)
 
     def require_frequency(self, frequency_hz: float) -> None:
         """Raise a SettingsError if the material's model does not cover `frequency_hz`."""
@@ -334,6 +332,7 @@ class DatasetSettings(Checked):
         require(enough, "links_per_home", self.links_per_home, remedy)
         remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
         require(isinstance(self.stages, tuple) and are_stages(self.stages), "stages", self.stages, remedy)
+        object.__setattr__(self, "stages", tuple(map(plain, self.stages)))
         mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
         remedy = "give SensorSettings(...), or 'mixed'."
         require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
@@ -412,8 +411,4 @@ class PlacementSettings(Checked):
     threshold_db: Annotated[float, Within(-150.0, 0.0, open_low=True)] = -100.0
     height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        require(is_whole(self.seed), "seed", self.seed, "give a whole number of 0 or more.")
+    seed: Annotated[int, Within(0, 2**63 - 1)] = 0

@@ -142,7 +142,7 @@ class TestReceiversAnywhere:
             np.testing.assert_array_equal(anywhere[name].to_numpy()[free], indoor[name].to_numpy()[free])
 
     def test_unknown_word(self, no_work):
-        message = r"receivers = 'outdoor' is not allowed: give 'indoor' or 'anywhere'\."
+        message = r"receivers = 'outdoor' is not allowed: choose one of indoor, anywhere\."
         with pytest.raises(SettingsError, match=message):
             predict_map(map_of(PICTURE), TX, receivers="outdoor")
 

@@ -46,6 +46,12 @@ def test_netcdf_is_read_without_xarrays_help(coverage, tmp_path):
         assert file["valid"][...].min() == 0
 
 
+def test_netcdf_saved_again_has_the_same_bytes(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.nc")
+    save_coverage(xr.load_dataset(tmp_path / "coverage.nc"), tmp_path / "again.nc")
+    assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "coverage.nc").read_bytes()
+
+
 def test_a_loaded_map_is_drawn_as_the_original(coverage, tmp_path):
     save_coverage(coverage, tmp_path / "coverage.nc")
     loaded = xr.load_dataset(tmp_path / "coverage.nc")

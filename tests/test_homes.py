@@ -231,7 +231,7 @@ def test_seed_must_be_a_whole_number(seed):
 
 
 def test_kind_must_be_known():
-    with pytest.raises(SettingsError, match=r"kind = 'castle' is not allowed: choose one of \('apartment', 'house'"):
+    with pytest.raises(SettingsError, match=r"kind = 'castle' is not allowed: choose one of apartment, house"):
         make_home(0, "castle")
 
 
@@ -239,6 +239,11 @@ def test_kind_must_be_known():
 def test_resolution_must_be_in_range(resolution_m):
     with pytest.raises(SettingsError, match=r"resolution_m = .* is not allowed: give a number in \[0\.01, 0\.2\]"):
         make_home(0, resolution_m=resolution_m)
+
+
+def test_locked_rooms_is_a_switch():
+    with pytest.raises(SettingsError, match=r"locked_rooms = 1 is not allowed: give True or False\."):
+        make_home(0, locked_rooms=1)
 
 
 def test_without_locked_rooms_all_is_within_reach_and_the_rest_is_the_same():

@@ -16,7 +16,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from meshes import OBSERVED, room, surface_m2
 
 from sionna_partial.constants import CellState
-from sionna_partial.errors import MapError, OutputError
+from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
 from sionna_partial.maps.map_files import (
     load_map,
@@ -90,6 +90,19 @@ def test_scene_folder_reads_nothing_outside(tmp_path: Path, outside: str) -> Non
     folder = export(tmp_path / "scene", outside)
     with pytest.raises(MapError, match=f"image = '{outside}' is not allowed: the image of an exported scene lies in"):
         load_map(folder)
+
+
+def test_scene_folder_follows_no_link_to_the_outside(tmp_path: Path) -> None:
+    folder = export(tmp_path / "scene")
+    (folder / "map.pgm").rename(tmp_path / "outside.pgm")
+    (folder / "map.pgm").symlink_to(tmp_path / "outside.pgm")
+    with pytest.raises(MapError, match=r"image = 'map\.pgm' is not allowed: the image of an exported scene lies in"):
+        load_map(folder)
+
+
+def test_strict_is_a_switch(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
+        load_map(tmp_path, strict=1)  # type: ignore[arg-type]
 
 
 def test_folder_without_scene(tmp_path: Path) -> None:
@@ -346,9 +359,14 @@ FUNCTIONS = {
     ("kind", "arrays", "options", "message"),
     [
         ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
-        ("array", ([["wall"]],), {}, "array has dtype <U4: give integers"),
-        ("array", ([[None]],), {}, "array has dtype object: give integers"),
-        ("array", ([[0, 1], [0]],), {}, "array is not a rectangular array: give a two-dimensional array (ny, nx)"),
+        ("array", ([["wall"]],), {}, "array = [['wall']] is not numeric: give integers"),
+        ("array", ([[None]],), {}, "array has dtype float64: give integers"),
+        (
+            "array",
+            ([[0, 1], [0]],),
+            {},
+            "array = [[0, 1], [0]] is not numeric: give integers, in a two-dimensional array",
+        ),
         ("array", ([0, 1],), {}, "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
         ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
         ("array", (np.zeros((0, 2), int),), {}, "array has shape (0, 2): give a two-dimensional array"),
@@ -361,6 +379,9 @@ FUNCTIONS = {
         ("occupancy", ([[0]],), {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
         ("occupancy", ([[0]],), {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
         ("occupancy", ([[0]],), {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
+        ("occupancy", ([[0]],), {"occupied_percent": 0.65, "free_percent": 0.25}, "such as 25 and 65"),
+        ("occupancy", ([[0]],), {"occupied_percent": None}, "occupied_percent = None are not allowed"),
+        ("slam", ([[0]], [[1]]), {"threshold": "0.5"}, "threshold = '0.5' is not allowed"),
         ("habitat", ([[0, 1]], [[1]]), {}, "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
         ("habitat", ([[True]], [[1]]), {}, "top_down has dtype bool: give integers"),
         ("habitat", ([[1]], [[0.5]]), {}, "fog_of_war has dtype float64: give integers"),
@@ -369,7 +390,7 @@ FUNCTIONS = {
         ("slam", ([[0, 1]], [[1]]), {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
         ("slam", ([[np.nan]], [[1]]), {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or"),
         ("slam", ([[0]], [[255]]), {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
-        ("slam", ([["a"]], [[1]]), {}, "obstacle has dtype <U1: give numbers"),
+        ("slam", ([["a"]], [[1]]), {}, "obstacle = [['a']] is not numeric: give numbers"),
         ("slam", ([[0]], [[1]]), {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
         ("slam", ([[0]], [[1]]), {"threshold": np.nan}, "threshold = nan is not allowed"),
     ],

@@ -85,7 +85,7 @@ class TestSceneMesh:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"vertices_m": "many"}, "vertices_m is not an array of numbers: give x, y, z in metres, (V, 3)."),
+            ({"vertices_m": "many"}, "vertices_m = 'many' is not numeric: give x, y, z in metres, (V, 3)."),
             ({"vertices_m": [[0, 0]]}, "vertices_m has shape (1, 2): give x, y, z in metres, (V, 3)."),
             ({"vertices_m": [[0, 0, np.nan]]}, "vertices_m[0] = (0.0, 0.0, nan) is not allowed: give finite numbers"),
             ({"vertices_m": [[0, 0, 0], [0, 1e9, 0]]}, "vertices_m[1] = (0.0, 1000000000.0, 0.0) is not allowed"),

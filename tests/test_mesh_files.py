@@ -140,6 +140,26 @@ def test_wrong_vertices(tmp_path: Path, z: str, last: int, message: str) -> None
         read_mesh(path)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "old", "new", "message"),
+    [
+        ("ply", "3 0 2 3\n", "", "it announces 6 vertices, faces and others, and has 5"),
+        ("ply", "face 2", "face 4", "it announces 8 vertices, faces and others, and has 6"),
+        ("ply", "face 2", "face 1", "it announces 5 vertices, faces and others, and has 6"),
+        ("stl", "endsolid", "", "it ends before its endsolid"),
+    ],
+)
+def test_cut_text(tmp_path: Path, suffix: str, old: str, new: str, message: str) -> None:
+    path = tmp_path / f"room.{suffix}"
+    path.write_text(PLY.format(z=0, last=3))
+    if suffix == "stl":
+        path.write_text(trimesh.exchange.stl.export_stl_ascii(room().to_mesh()))
+        read_mesh(path)
+    path.write_text(path.read_text()[::-1].replace(old[::-1], new[::-1], 1)[::-1])
+    with pytest.raises(MapError, match=rf"room\.{suffix}' is damaged or no .* mesh \({message}\): export it again"):
+        read_mesh(path)
+
+
 def test_points_alone(tmp_path: Path) -> None:
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
     with pytest.raises(MapError, match="holds 0 triangles: give a mesh with surfaces, not points or lines alone"):

@@ -172,7 +172,10 @@ class TestKnown:
         ),
         ({"height_band_m": 2}, "height_band_m = 2 is not allowed: give (low, high), z in metres"),
         ({"height_band_m": (0, np.inf)}, "height_band_m = (0, inf) is not allowed"),
-        ({"observed": "all"}, "observed is of type str: give the corners (M, 2) of a polygon without crossings"),
+        (
+            {"observed": "all"},
+            "observed = 'all' is not numeric: give the corners (M, 2) of a polygon without crossings",
+        ),
         ({"observed": [(0, 0), (1, 1)]}, "observed has shape (2, 2) or values that are not finite: give the corners"),
         ({"observed": [(0, 0), (1, 1), (np.nan, 1)]}, "observed has shape (3, 2) or values that are not finite"),
         ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "observed is no polygon (Self-intersection"),
@@ -186,6 +189,22 @@ class TestKnown:
 def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
     with pytest.raises(MapError, match=re.escape(message)):
         mesh_map(ROOM, MeshReading(**given))
+
+
+def test_observed_map_elsewhere() -> None:
+    with pytest.raises(MapError, match="observed holds no cell of the map"):
+        mesh_map(ROOM, MeshReading(observed=PartialMap(np.zeros((3, 3), int), 0.5, (100.0, 100.0))))
+    nothing = PartialMap(np.full((3, 3), UNKNOWN), 0.5, (100.0, 100.0))
+    assert (mesh_map(ROOM, MeshReading(observed=nothing)).state == UNKNOWN).all()
+
+
+@pytest.mark.parametrize(("factor", "end"), [(100, "or give the height_band_m of the walls"), (0.001, ")")])
+def test_other_units_than_metres(factor: float, end: str) -> None:
+    scaled = SceneMesh(ROOM.vertices_m * factor, ROOM.triangles, ROOM.material)
+    with pytest.raises(MapError, match=r"the mesh spans .* m: scale it to metres .*" + re.escape(end)):
+        mesh_map(scaled, MeshReading(resolution_m=1.0))
+    if factor > 1:
+        assert mesh_map(scaled, MeshReading(resolution_m=1.0, height_band_m=(1.0, 2.0))).state.any()
 
 
 def test_too_many_cells() -> None:

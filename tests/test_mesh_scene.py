@@ -151,6 +151,18 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
             '<bsdf type="radio-material" id="a"><float name="conductivity" value="much"/></bsdf>' + shape("cube"),
             "bsdf 'a' is no radio material (could not convert string to float: 'much'): correct it",
         ),
+        (
+            RADIO + shape("cube", moved("").replace("to_world", "toWorld")),
+            "<shape> 'it' has the property 'toWorld', which is not read: give the names of Mitsuba 3 (filename, to_wor",
+        ),
+        (
+            '<bsdf type="radio-material" id="a"><float name="relativePermittivity" value="2"/></bsdf>' + shape("cube"),
+            "<bsdf> 'a' has the property 'relativePermittivity', which is not read: give the names of Mitsuba 3 (type,",
+        ),
+        (
+            RADIO + shape("cube", moved('<translate X="1"/>')),
+            "has a to_world with <translate {'X': '1'}>, which",
+        ),
         (RADIO + shape("cube", moved("<lookat/>")), "shape 'it' has a to_world with <lookat {}>, which cannot be read"),
         (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
         (RADIO + shape("cube", moved('<rotate x="1"/>')), "has a to_world with <rotate {'x': '1'}>, which cannot"),

@@ -56,7 +56,7 @@ def test_equality(other: object) -> None:
 
 
 def test_ragged_state_is_refused() -> None:
-    with pytest.raises(MapError, match=r"state is not a rectangular array: give a two-dimensional array \(ny, nx\)\."):
+    with pytest.raises(MapError, match=r"state = .* is not numeric: give CellState integers"):
         PartialMap([[0], [0, 1]], 0.1)  # type: ignore[arg-type]
 
 
@@ -182,6 +182,15 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
         ({"resolution_m": None}, "resolution_m = None is not allowed"),
         ({"origin_m": (0.0,)}, "origin_m = (0.0,): give the (x, y) of the lower-left corner in metres"),
         ({"origin_m": 3.0}, "origin_m = 3.0: give the (x, y)"),
+        ({"origin_m": (0.0, (1.0, 2.0))}, "origin_m = (0.0, (1.0, 2.0)) is not numeric: give the (x, y)"),
+        ({"origin_m": (0.0, 10**400)}, "is not numeric: give the (x, y)"),
+        ({"resolution_m": True}, "resolution_m = True is not allowed: give a number of metres"),
+        ({"resolution_m": 10**5000}, "resolution_m = a value of type int is not allowed: give a number of metres"),
+        ({"interior_cells": True}, "interior_cells = True is not allowed: give the number of free cells, or None"),
+        ({"interior_cells": 10**20}, "interior_cells = 100000000000000000000 is not allowed"),
+        ({"state": np.ma.masked_array([[0, 1]], [[0, 1]])}, "state has masked values, whose data would be read: fill"),
+        ({"state": [np.ma.masked_array([0, 1], [0, 1])]}, "state has masked values, whose data would be read: fill"),
+        ({"state": [[1j]]}, "state = [[1j]] is not numeric: give CellState integers"),
         ({"origin_m": (0.0, np.inf)}, "origin_m = inf is not allowed: give a number of metres in [-1e+08, 1e+08]"),
         ({"wall_height_m": 0.0}, "wall_height_m = 0.0 is not allowed: give a number of metres in [0.1, 100]"),
         ({"material": "brick"}, "material is of type str: give a Material, or None for that of SceneSettings."),
@@ -220,6 +229,12 @@ def test_positions_may_be_free_or_unknown() -> None:
         ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),
         ((9, -3.25, 1.5), "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: m"),
         ((12.5, -3.25, 1.5), "is outside the map"),
+        (
+            np.ma.masked_array((10.75, -3.25, 1.5), [0, 0, 1]),
+            "tx has masked values, whose data would be read",
+        ),
+        (np.array([10.75, -3.25, 1.5 + 0j]), "is not numeric: give x, y, z in metres"),
+        ((True, False, True), "tx has dtype bool: give x, y, z in metres"),
         ((10.75, -4.1, 1.5), "is outside the map"),
         ((10.75, -2.4, 1.5), "is outside the map"),
         ((10.75, -3.25, 2.5), "tx = (10.75, -3.25, 2.5) is not between floor and ceiling (0 to 2.5 m): change its hei"),

@@ -21,7 +21,7 @@ from sionna_partial.errors import MapError, OutputError
 from sionna_partial.maps import ros_map
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
-from sionna_partial.maps.ros_map import turn_grid
+from sionna_partial.maps.ros_map import turn_grid, write_ros_map
 
 SHEET: dict[str, Any] = {
     "image": "map.pgm",
@@ -273,6 +273,7 @@ def test_origin_too_far(tmp_path: Path, value: list[float]) -> None:
         (b"\x00\x01\xff\xfe rubbish", "is not valid YAML"),
         (bytes(range(128, 256)) * 10, "is not valid YAML"),
         (b"P5\n3 1\n255\n\x00\xcd\xfe", "is not valid YAML"),
+        (b"image: a.pgm\nimage: b.pgm", r"is not valid YAML \(it has the key 'image' twice\)"),
         (b"a: 2020-99-99", r"is not valid YAML \(month must be"),
         (b"[" * 5000, "is not valid YAML"),
         (b"a: !!python/object/apply:os.system ['true']", "is not valid YAML"),
@@ -385,6 +386,25 @@ def test_written_map_to_the_letter(tmp_path: Path) -> None:
     }
     for strict in (False, True):
         assert load_map(tmp_path / "home.yaml", strict=strict) == PARTIAL
+
+
+def test_further_keys(tmp_path: Path) -> None:
+    partial, extra = PartialMap([[0, 1]], 0.5), {"score": np.float32(1.5), "steps": np.int64(3), "path": np.eye(2)}
+    write_ros_map(partial, tmp_path / "map.yaml", extra)
+    sheet = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    assert (sheet["score"], sheet["steps"], sheet["path"]) == (1.5, 3, [[1, 0], [0, 1]])
+    refused: list[tuple[object, str]] = [
+        ({"resolution": 0.5}, "holds 'resolution', which the map sets itself: give a mapping of further keys"),
+        ({"mesh": {}}, "holds 'mesh', which the map sets itself"),
+        ({3: 4}, "extra = {3: 4} has keys that are no text: give a mapping"),
+        (5, "extra = 5 has keys that are no text: give a mapping"),
+        ({"a": object()}, r"extra cannot be written as YAML \(.*\): give numbers, texts, lists and mappings"),
+        ({"a": "x" * 1_000_000}, "extra makes a YAML of .* bytes, more than 1,000,000: leave large values out"),
+    ]
+    for further, message in refused:
+        with pytest.raises(OutputError, match=message):
+            write_ros_map(partial, tmp_path / "other.yaml", further)  # type: ignore[arg-type]
+    assert not (tmp_path / "other.yaml").exists()
 
 
 @pytest.mark.parametrize("blocked", ["home.yaml", "home.pgm"])

@@ -21,7 +21,14 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.scene import FAR_M, build_scene, export_scene, write_mesh_scene, write_scene
+from sionna_partial.scene.scene import (
+    FAR_M,
+    build_scene,
+    export_scene,
+    scene_settings_of,
+    write_mesh_scene,
+    write_scene,
+)
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
 
 ROOM = """
@@ -34,6 +41,17 @@ ROOM = """
     ?#####.####?
     ????????????
 """
+
+
+def test_a_material_that_is_not_used_is_named(caplog: pytest.LogCaptureFixture) -> None:
+    brick, plan = SceneSettings(material=Material(itu="brick")), drawn(ROOM)
+    part = merged_mesh(np.eye(3), np.array([[0, 1, 2]]), np.array([0]), (Material(itu="wood"),))
+    build_scene(replace(plan, material=Material(itu="brick")), brick)
+    assert not caplog.messages
+    for own in (replace(plan, material=Material(itu="wood")), replace(plan, mesh=part)):
+        scene_settings_of(own, brick)
+    assert len(caplog.messages) == 2
+    assert all("is not used: the map or mesh has its own; leave it out" in each for each in caplog.messages)
 
 
 def covered(rectangles_m: NDArray[np.float64], partial: PartialMap) -> NDArray[np.int_]:

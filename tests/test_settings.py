@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sionna_partial.checks import shown
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import SettingsError
 from sionna_partial.settings import (
@@ -106,7 +107,8 @@ def test_switches(kind: type, name: str) -> None:
     assert getattr(kind(), name) is default
     for allowed in (True, False, default):
         assert getattr(kind(**{name: allowed}), name) is allowed
-    for value in (1, 0, "yes", np.bool_(True), *([] if default is None else [None])):
+    assert getattr(kind(**{name: np.bool_(True)}), name) is True
+    for value in (1, 0, "yes", *([] if default is None else [None])):
         expected = f"{name} = {value!r} is not allowed: give True or False."
         with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
             kind(**{name: value})
@@ -117,12 +119,12 @@ def test_scene_choices() -> None:
         SceneSettings(material="drywall")  # type: ignore[arg-type]
     for extent in ("observed", "map", "none"):
         assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]
-    expected = "floor_extent = 'all' is not allowed: choose one of ('observed', 'map', 'none')."
+    expected = "floor_extent = 'all' is not allowed: choose one of observed, map, none."
     with pytest.raises(SettingsError, match=re.escape(expected)):
         SceneSettings(floor_extent="all")  # type: ignore[arg-type]
     for outline in ("lines", "cells"):
         assert SceneSettings(outline=outline).outline == outline  # type: ignore[arg-type]
-    expected = "outline = 'walls' is not allowed: choose one of ('lines', 'cells')."
+    expected = "outline = 'walls' is not allowed: choose one of lines, cells."
     with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
         SceneSettings(outline="walls")  # type: ignore[arg-type]
 
@@ -197,7 +199,7 @@ class TestDatasetSettings:
         ],
     )
     def test_refused(self, name: str, value: object, remedy: str) -> None:
-        with pytest.raises(SettingsError, match=re.escape(f"{name} = {value!r} is not allowed: {remedy}")):
+        with pytest.raises(SettingsError, match=re.escape(f"{name} = {shown(value)} is not allowed: {remedy}")):
             DatasetSettings(**{name: value})
 
     def test_material_that_the_frequency_does_not_suit(self) -> None:
@@ -211,7 +213,7 @@ class TestPredictorSettings:
         [
             ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed"),
             ({"learning_rate": 0.0}, "learning_rate = 0.0 is not allowed: give a number in (0, 1]"),
-            ({"networks": "Map"}, "networks = 'Map' is not allowed: choose one of ('paper', 'paths', 'map')."),
+            ({"networks": "Map"}, "networks = 'Map' is not allowed: choose one of paper, paths, map."),
             ({"networks": None}, "networks = None is not allowed: choose one of"),
             ({"diffraction": 1}, "diffraction = 1 is not allowed: give True or False."),
             ({"passes": 0}, "passes = 0 is not allowed: give a whole number in [1, 1000000]."),

@@ -86,6 +86,8 @@ def _closed(home: PartialMap, name: str) -> PartialMap:
     x, y = home.origin_m
     origin_m = (x - home.resolution_m, y - home.resolution_m)
     closed = replace(home, state=np.pad(home.state, 1, constant_values=CellState.WALL), origin_m=origin_m)
+    if not (home.state == CellState.FREE).any():
+        raise MapError(f"home {name!r} has no free cell: give maps of whole homes, with rooms.")
     if not closed.is_complete:
         raise MapError(
             f"home {name!r} is not complete, a free cell touches an unknown one: give maps of whole homes, whose free "

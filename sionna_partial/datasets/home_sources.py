@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from sionna_partial.checks import is_whole, require
+from sionna_partial.checks import is_whole, require, shown
 from sionna_partial.errors import MapError
 from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.map_files import load_map
@@ -75,7 +75,9 @@ def _sources(home: Home) -> Iterator[HomeSource]:
             raise MapError(f"path = '{path}' is not there: give complete maps, or a folder with maps in it.")
         yield from _maps_at(path)
     else:
-        raise MapError(f"home = {home!r} is neither a seed nor a path: give a seed of make_home, or a complete map.")
+        raise MapError(
+            f"home = {shown(home)} is neither a seed nor a path: give a seed of make_home or a complete map."
+        )
 
 
 def _maps_at(path: Path) -> Iterator[HomeSource]:

@@ -1,5 +1,6 @@
 """Maps in and out: files, NumPy arrays, and the maps of simulators and SLAM."""
 
+import io
 import json
 import os
 import zipfile
@@ -12,11 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
+from sionna_partial.checks import number_of, require, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.files import SCENE_FILES, atomic_write, output_path
+from sionna_partial.files import SCENE_FILES, atomic_write, output_path, read_bytes
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-from sionna_partial.maps.mesh.files import MESH_SUFFIXES, read_mesh, read_mitsuba_scene
+from sionna_partial.maps.mesh.files import MAX_MESH_BYTES, MESH_SUFFIXES, read_mesh, read_mitsuba_scene
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map
 from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
@@ -89,7 +91,8 @@ def load_map(
         given and it is none.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise MapError(f"path = {path!r} is not a path: give {ACCEPTED}.")
+        raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}.")
+    require(isinstance(strict, bool), "strict", strict, "give True or False.")
     source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
     suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):
@@ -251,10 +254,11 @@ def map_from_occupancy(
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
         raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
-    if not 0 <= free_percent < occupied_percent <= 100:
-        given = f"free_percent = {free_percent!r} and occupied_percent = {occupied_percent!r}"
-        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100.")
-    state = states_from_percent(values, occupied_percent, free_percent)
+    free, occupied = number_of(free_percent), number_of(occupied_percent)
+    if not 0 <= free < occupied <= 100 or occupied <= 1:
+        given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
+        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
+    state = states_from_percent(values, occupied, free)
     return PartialMap(state, resolution_m, origin_m, wall_height_m)
 
 
@@ -352,8 +356,8 @@ def map_from_slam(
     for name, channel in channels.items():
         if not ((channel >= 0) & (channel <= 1)).all():
             raise MapError(f"{name} holds values outside [0, 1] (or NaN): give probabilities or booleans.")
-    if not 0 < threshold <= 1:
-        raise MapError(f"threshold = {threshold!r} is not allowed: give a number in (0, 1].")
+    if not 0 < number_of(threshold) <= 1:
+        raise MapError(f"threshold = {shown(threshold)} is not allowed: give a number in (0, 1].")
     state = np.where(channels["obstacle"] >= threshold, CellState.WALL, CellState.FREE)
     state = np.where(channels["explored"] >= threshold, state, CellState.UNKNOWN)
     return PartialMap(state.astype(np.uint8), resolution_m, origin_m, wall_height_m)
@@ -379,13 +383,14 @@ def _read_scene(source: Path, reading: MeshReading) -> PartialMap:
 
 def _read_npz(source: Path) -> PartialMap:
     try:
-        with zipfile.ZipFile(source) as archive:
+        content = io.BytesIO(read_bytes(source, "path", MapError, MAX_MESH_BYTES))
+        with zipfile.ZipFile(content) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
         if sizes.pop("state.npy") > MAX_CELLS + 1000:
             raise MapError(f"path = '{source}' holds more than {MAX_CELLS:,} cells: cut the map or coarsen it.")
         if max(sizes.values(), default=0) > _MESH_BYTES:
             raise MapError(f"path = '{source}' holds more than {MAX_TRIANGLES:,} triangles: cut or simplify the mesh.")
-        with np.load(source, allow_pickle=False) as content:
+        with np.load(content, allow_pickle=False) as content:
             state, resolution_m = content["state"], content["resolution_m"].item()
             origin_m, height_m = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None

@@ -3,13 +3,13 @@
 import itertools
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from sionna_partial.checks import is_whole, number_of, real_array, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
@@ -17,6 +17,9 @@ from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
 """Largest number of cells of a map: more is a unit error or a map that should be cut."""
+
+MAX_INTERIOR_CELLS = 2**53
+"""Largest number of free cells of a complete home: more is damage, and no file could hold it."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
@@ -78,14 +81,16 @@ class PartialMap:
     def __post_init__(self) -> None:
         object.__setattr__(self, "state", _checked_state(self.state))
         object.__setattr__(self, "resolution_m", _number("resolution_m", self.resolution_m, 1e-3, 10.0))
-        if np.shape(self.origin_m) != (2,):
-            raise MapError(f"origin_m = {self.origin_m!r}: give the (x, y) of the lower-left corner in metres.")
-        origin = tuple(_number("origin_m", value, -1e8, 1e8) for value in self.origin_m)
-        object.__setattr__(self, "origin_m", origin)
+        remedy = "give the (x, y) of the lower-left corner in metres."
+        origin = real_array("origin_m", self.origin_m, MapError, remedy)
+        if origin.shape != (2,):
+            raise MapError(f"origin_m = {shown(self.origin_m)}: {remedy}")
+        object.__setattr__(self, "origin_m", tuple(_number("origin_m", value, -1e8, 1e8) for value in origin))
         object.__setattr__(self, "wall_height_m", _number("wall_height_m", self.wall_height_m, 0.1, 100.0))
         cells = self.interior_cells
-        if cells is not None and not (isinstance(cells, Integral) and cells >= 0):
-            raise MapError(f"interior_cells = {cells!r} is not allowed: give the number of free cells, or None.")
+        if cells is not None and not (is_whole(cells) and cells <= MAX_INTERIOR_CELLS):
+            raise MapError(f"interior_cells = {shown(cells)} is not allowed: give the number of free cells, or None.")
+        object.__setattr__(self, "interior_cells", None if cells is None else int(cells))
         if not isinstance(self.mesh, SceneMesh | None):
             raise MapError(f"mesh is of type {type(self.mesh).__name__}: give a SceneMesh, or None for a plan.")
         if not isinstance(self.material, Material | None):
@@ -175,10 +180,7 @@ class PartialMap:
             For another shape, a value that is not finite, or a point outside the map, inside a wall, or not between
             floor and ceiling. Unknown cells are allowed (the paper asks for them).
         """
-        try:
-            points = np.asarray(points_m, dtype=np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise PositionError(f"{name} = {points_m!r} is not numeric: give x, y, z in metres.") from error
+        points = real_array(name, points_m, PositionError, "give x, y, z in metres.").astype(np.float64)
         if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
             raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
         x0, y0, x1, y1 = self.bounds_m
@@ -237,14 +239,9 @@ def require_map(name: str, value: object) -> None:
 
 def grid_array(name: str, values: ArrayLike, kinds: str, wanted: str = "integers") -> NDArray[Any]:
     """Return a two-dimensional array of one of the dtype kinds, or raise a MapError."""
-    try:
-        array = np.asarray(values)
-    except ValueError as error:
-        raise MapError(f"{name} is not a rectangular array: give a two-dimensional array (ny, nx).") from error
+    array = real_array(name, values, MapError, f"give {wanted}, in a two-dimensional array (ny, nx).", kinds)
     if array.ndim != 2 or array.size == 0:
         raise MapError(f"{name} has shape {array.shape}: give a two-dimensional array (ny, nx) with at least one cell.")
-    if array.dtype.kind not in kinds:
-        raise MapError(f"{name} has dtype {array.dtype}: give {wanted}.")
     return array
 
 
@@ -263,10 +260,7 @@ def _checked_state(values: ArrayLike) -> NDArray[np.uint8]:
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        number = float("nan")
+    number = number_of(value)
     if not low <= number <= high:
-        raise MapError(f"{name} = {value!r} is not allowed: give a number of metres in [{low:g}, {high:g}].")
+        raise MapError(f"{name} = {shown(value)} is not allowed: give a number of metres in [{low:g}, {high:g}].")
     return number

@@ -3,7 +3,6 @@
 import logging
 import math
 import os
-import reprlib
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, fields
@@ -16,12 +15,13 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import affine_transform, binary_dilation
 
+from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
-from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.files import atomic_write
-from sionna_partial.maps.mesh.files import read_bytes, read_exported_mesh
+from sionna_partial.errors import MapError, OutputError, SettingsError
+from sionna_partial.files import atomic_write, open_regular, read_bytes
+from sionna_partial.maps.mesh.files import read_exported_mesh
 from sionna_partial.maps.mesh.mesh import material_records
-from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, frontier_cells
+from sionna_partial.maps.partial_map import MAX_CELLS, MAX_INTERIOR_CELLS, MapWarning, PartialMap, frontier_cells
 from sionna_partial.settings import Material
 
 logger = logging.getLogger(__name__)
@@ -40,11 +40,11 @@ OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 MAX_YAML_BYTES = 1_000_000
 """Largest map YAML that is read: more is another file [bytes]."""
 
+MAX_IMAGE_BYTES = 16 * MAX_CELLS
+"""Largest map image that is read [bytes]."""
+
 MAX_YAW_RAD = 6.2832
 """Largest yaw of a map's origin: one turn, as people round it; more is meant in degrees [rad]."""
-
-_short = reprlib.Repr()
-_short.maxstring, _short.maxother, _short.maxlevel = 200, 200, 2
 
 
 class _Sheet(NamedTuple):
@@ -56,6 +56,28 @@ class _Sheet(NamedTuple):
     negate: bool
     occupied_thresh: float
     free_thresh: float
+
+
+class _EachKeyOnce(yaml.SafeLoader):
+    """Refuses a mapping that has a key twice, of which YAML keeps the last."""
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
+        twice = next((key for index, key in enumerate(keys) if key in keys[:index]), None)
+        if twice is not None:
+            raise yaml.YAMLError(f"it has the key {twice!r} twice")
+        return super().construct_mapping(node, deep)
+
+
+class _Plain(yaml.SafeDumper):
+    """Writes numbers and arrays of NumPy as those of Python."""
+
+
+_Plain.add_multi_representer(
+    np.generic,  # type: ignore[type-abstract]
+    lambda dumper, value: dumper.represent_data(value.item()),
+)
+_Plain.add_multi_representer(np.ndarray, lambda dumper, value: dumper.represent_data(value.tolist()))
 
 
 class _Pixels(NamedTuple):
@@ -82,7 +104,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     origin = _origin(path, _required(path, raw, "origin"))
     height_m = _number(path, {"wall_height": DEFAULT_WALL_HEIGHT_M, **raw}, "wall_height", 0.1, 100.0, "metres")
     interior = raw.get("interior_cells")
-    if interior is not None and (not isinstance(interior, int) or isinstance(interior, bool) or interior < 0):
+    if interior is not None and not (is_whole(interior) and interior <= MAX_INTERIOR_CELLS):
         raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
     material = _material(path, raw.get("material"))
     pixels = _read_pixels(sheet)
@@ -116,17 +138,38 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         sheet["interior_cells"] = int(partial.interior_cells)
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
-    sheet |= extra or {}
     if partial.mesh is not None:
         sheet["mesh"] = {"height_range": [*partial.height_range_m], "materials": material_records(partial.mesh)}
+    content = _yaml_text(sheet, {} if extra is None else extra)
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     ny, nx = partial.shape
     with atomic_write(path, "w") as text, atomic_write(image) as picture:
-        yaml.safe_dump(sheet, text, sort_keys=False, default_flow_style=None)
-        text.flush()
+        text.write(content)
         picture.write(b"P5\n%d %d\n255\n" % (nx, ny))
         picture.write(np.flipud(shades[partial.state]).tobytes())
+
+
+def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
+    """Return the YAML of a map with further keys, which can be read again as they are."""
+    names = [] if not isinstance(extra, Mapping) else [*extra]
+    own = sorted({*sheet, "interior_cells", "material", "mesh"}.intersection(map(str, names)))
+    if own or names != [name for name in names if isinstance(name, str)] or not isinstance(extra, Mapping):
+        what = f"holds {own[0]!r}, which the map sets itself" if own else "has keys that are no text"
+        raise OutputError(f"extra = {shown(extra)} {what}: give a mapping of further keys.")
+    try:
+        text: str = yaml.dump({**sheet, **extra}, Dumper=_Plain, sort_keys=False, default_flow_style=None)
+        size = len(text.encode())
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise OutputError(
+            f"extra cannot be written as YAML ({reason}): give numbers, texts, lists and mappings."
+        ) from error
+    if size > MAX_YAML_BYTES:
+        raise OutputError(
+            f"extra makes a YAML of {size:,} bytes, more than {MAX_YAML_BYTES:,}: leave large values out."
+        )
+    return text
 
 
 def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
@@ -179,7 +222,7 @@ def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, f
 
 
 def _refuse(sheet: Path, field: str, value: object, remedy: str) -> MapError:
-    return MapError(f"{sheet}: {field} = {_short.repr(value)} is not allowed: {remedy}")
+    return MapError(f"{sheet}: {field} = {shown(value)} is not allowed: {remedy}")
 
 
 def _read_sheet(path: Path, raw: Mapping[Any, Any], *, confined: bool) -> _Sheet:
@@ -207,12 +250,15 @@ def _material(path: Path, value: object) -> Material | None:
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
     try:
-        raw = yaml.safe_load(read_bytes(path, MAX_YAML_BYTES, "give the YAML of a ROS map."))
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        loader = _EachKeyOnce(read_bytes(path, "path", MapError, MAX_YAML_BYTES, "give the YAML of a ROS map."))
+        raw = loader.get_single_data()
+    except MapError:
+        raise
+    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
         reason = " ".join(str(error).split())[:200]
         raise MapError(f"path = '{path}' is not valid YAML ({reason}): correct it or save the map again.") from error
     if not isinstance(raw, dict):
-        what = f"holds {_short.repr(raw)} in place of keys such as image, resolution and origin"
+        what = f"holds {shown(raw)} in place of keys such as image, resolution and origin"
         raise MapError(f"path = '{path}' {what}: give the YAML that a ROS map_saver wrote.")
     return raw
 
@@ -234,8 +280,8 @@ def _number(path: Path, raw: Mapping[Any, Any], key: str, low: float, high: floa
 def _float(value: object) -> float:
     """Return the number that is meant, NaN for none. YAML 1.1 takes 5e-2 for a text."""
     try:
-        return math.nan if isinstance(value, bool) else float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
+        return float(value) if isinstance(value, str) else number_of(value)
+    except ValueError:
         return math.nan
 
 
@@ -252,9 +298,10 @@ def _origin(path: Path, value: object) -> tuple[float, float, float]:
 def _image_path(path: Path, value: object, *, confined: bool) -> Path:
     if not isinstance(value, str) or not value or "\0" in value:
         raise _refuse(path, "image", value, "give the file name of the map image.")
-    if confined and (Path(value).is_absolute() or ".." in Path(value).parts):
-        raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
     image = path.parent / value
+    outside = Path(value).is_absolute() or not image.resolve().is_relative_to(path.parent.resolve())
+    if confined and (outside or ".." in Path(value).parts):
+        raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
     if not os.path.isfile(image):
         raise _refuse(path, "image", value, f"there is no file '{image}'; put the image there or correct the name.")
     return image
@@ -276,13 +323,17 @@ def _read_pixels(sheet: _Sheet) -> _Pixels:
 
 def _decode(sheet: _Sheet) -> Image.Image:
     try:
-        with warnings.catch_warnings():
+        with (
+            open_regular(sheet.image, f"{sheet.source}: image", MapError, MAX_IMAGE_BYTES) as stream,
+            warnings.catch_warnings(),
+        ):
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(sheet.image, formats=("PPM", "PNG", "BMP"))
-        with image:
+            image = Image.open(stream, formats=("PPM", "PNG", "BMP"))
             too_large = image.width * image.height > MAX_CELLS
             if not too_large:
                 image.load()
+    except MapError:
+        raise
     except Image.DecompressionBombError:
         too_large = True
     except Exception as error:  # decoders fail in many ways on damaged files

@@ -1,5 +1,6 @@
 """PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one module that writes scenes."""
 
+import logging
 import os
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
@@ -23,6 +24,8 @@ from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
 from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+
+_log = logging.getLogger(__name__)
 
 SHAPES = ("walls", "floor", "ceiling")
 """Shapes of an exported floor plan in the order in which faces are counted; those that are empty are left out."""
@@ -92,7 +95,15 @@ class SceneGeometry:
 def scene_settings_of(partial: PartialMap, settings: SceneSettings | None, name: str = "settings") -> SceneSettings:
     """Return the settings of a map's scene, called `name` in messages, with the map's own material, if it has one."""
     settings = settings_or_default(name, settings, SceneSettings)
-    return settings if partial.material is None else replace(settings, material=partial.material)
+    default = partial.material or settings.material
+    used = {default} if partial.mesh is None else partial.mesh.used_materials(default)
+    if used and settings.material not in (Material(), *used):
+        _log.warning(
+            "material = %s of the scene settings is not used: the map or mesh has its own; leave it out, or set that "
+            "of the map with dataclasses.replace",
+            settings.material,
+        )
+    return replace(settings, material=default)
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
@@ -166,7 +177,8 @@ def export_scene(
     (['map.pgm', 'map.yaml', 'meshes', 'scene.xml'], True)
     """
     require_map("partial", partial)
-    material = scene_settings_of(partial, settings).material
+    settings = scene_settings_of(partial, settings)
+    material = settings.material
     if partial.mesh is None:
         materials = {material}
         far = max(abs(value) for value in partial.bounds_m) > FAR_M

@@ -21,10 +21,10 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
-from sionna_partial.checks import is_whole, require, require_number
+from sionna_partial.checks import is_whole, require, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import HOME_KINDS, HomeKind
+from sionna_partial.settings import HomeKind
 from sionna_partial.simulation.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
 from sionna_partial.simulation.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
 
@@ -143,7 +143,9 @@ def make_home(
     (True, 0.05)
     """
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
-    require(kind is None or kind in STYLES, "kind", kind, f"choose one of {HOME_KINDS} or None.")
+    require(isinstance(locked_rooms, bool), "locked_rooms", locked_rooms, "give True or False.")
+    if kind is not None:
+        require_choice("kind", kind, STYLES)
     if resolution_m is not None:
         require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)

@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
@@ -23,6 +24,9 @@ DEFAULT_BAND_M = (1.0, 1.8)
 
 DEFAULT_RESOLUTION_M = 0.05
 """Edge of the cells of a mesh's map [m], as robots have them."""
+
+SMALLEST_M, HIGHEST_M = 0.1, 100.0
+"""Extent along x or y below which, and height above which, a mesh is in another unit than metres [m]."""
 
 RIM_M = 0.3
 """Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
@@ -38,8 +42,8 @@ class MeshReading:
     up: str | None = None
 
     def __post_init__(self) -> None:
-        if self.up not in (None, "z", "y"):
-            raise MapError(f'up = {self.up!r} is not allowed: choose "z" or "y".')
+        if self.up is not None and not (isinstance(self.up, str) and self.up in ("z", "y")):
+            raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
 
     def require_unused(self, path: Path, what: str) -> None:
         """Raise a MapError if anything has been given, for a file that is no mesh but `what`."""
@@ -55,6 +59,7 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     or to the right of them, or on the other side if those are unknown.
     """
     empty = _fitted_grid(mesh, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
+    _require_metres(mesh, reading.height_band_m)
     band_m = _band(mesh, reading.height_band_m)
     if reading.observed is None:
         known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
@@ -68,6 +73,16 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     state[_rims(state, empty.resolution_m)] = CellState.UNKNOWN
     partial = replace(empty, state=state, mesh=mesh)
     return partial if reading.observed is None else cut_to_known(partial)
+
+
+def _require_metres(mesh: SceneMesh, height_band_m: object) -> None:
+    """Raise a MapError for a mesh that seems to be in another unit."""
+    x, y, z = (float(extent) for extent in np.ptp(mesh.bounds_m, axis=0))
+    if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
+        raise MapError(
+            f"the mesh spans {x:g} x {y:g} x {z:g} m: scale it to metres (0.01 for centimetres, 1000 for kilometres)"
+            + (", or give the height_band_m of the walls if it is so high." if z > HIGHEST_M else ".")
+        )
 
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
@@ -133,24 +148,22 @@ def _observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> NDAr
         _, column = observed.cell_index(np.stack([x, np.zeros(nx)], axis=1))
         row, _ = observed.cell_index(np.stack([np.zeros(ny), y], axis=1))
         row, column = (np.clip(index + 1, 0, size - 1) for index, size in zip((row, column), known.shape, strict=True))
-        return known[np.ix_(row, column)]
-    polygon = _polygon(observed)
-    cells = np.stack([shapely.contains_xy(polygon, x, height) for height in y])
-    if not cells.any():
+        cells, is_empty = known[np.ix_(row, column)], not known.any()
+    else:
+        polygon, is_empty = _polygon(observed), False
+        cells = np.stack([shapely.contains_xy(polygon, x, height) for height in y])
+    if not cells.any() and not is_empty:
         x0, y0, x1, y1 = empty.bounds_m
         raise MapError(
-            f"observed holds no cell of the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m: give "
-            "corners in the world axes of the mesh, in metres."
+            f"observed holds no cell of the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m: give it in "
+            "the world axes of the mesh, in metres."
         )
     return cells
 
 
 def _polygon(observed: ArrayLike) -> Any:
     remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres, or a PartialMap."
-    try:
-        corners = np.asarray(observed, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise MapError(f"observed is of type {type(observed).__name__}: {remedy}") from error
+    corners = real_array("observed", observed, MapError, remedy).astype(np.float64)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise MapError(f"observed has shape {corners.shape} or values that are not finite: {remedy}")
     polygon = shapely.Polygon(corners)

@@ -4,12 +4,14 @@ Mitsuba would follow includes and paths out of the scene's folder, aborts on ind
 `tracing` alone: an XML of others is parsed here (defusedxml), and its meshes are checked before Mitsuba sees them.
 """
 
+import io
 import json
 import math
 import os
+import re
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.files import read_bytes
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
@@ -30,6 +33,8 @@ MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
 
 MAX_MESH_BYTES = 2_000_000_000
 """Largest mesh file that is read [bytes]: more should be cut or simplified first."""
+
+CUT = "cut or simplify the mesh."
 
 MAX_XML_BYTES = 100_000_000
 """Largest scene file that is read [bytes]."""
@@ -42,6 +47,13 @@ DEFAULT_THICKNESS_M = 0.1
 
 SHAPE_TYPES = ("ply", "obj", "rectangle", "cube")
 """Types of shapes of a Mitsuba scene that are read."""
+
+SHAPE_PROPERTIES = ("filename", "to_world", "face_normals", "flip_normals", "flip_tex_coords")
+MATERIAL_PROPERTIES = (
+    *("type", "thickness", "relative_permittivity", "conductivity", "scattering_coefficient", "xpd_coefficient"),
+    *("scattering_pattern", "alpha_r", "alpha_i", "lambda_", "color"),
+)
+"""Properties of shapes and radio materials that change nothing else than is read of them."""
 
 _CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
 _SIDES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
@@ -60,7 +72,8 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
 
     def get(self, name: str) -> bytes:
         """Return the content of a file."""
-        return confined_path(Path(self.parent), name, f"'{self.file_path}' asks for the file").read_bytes()
+        path = confined_path(Path(self.parent), name, f"'{self.file_path}' asks for the file")
+        return read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
 
 
 def read_mesh(path: Path, up: str | None = None) -> SceneMesh:
@@ -72,18 +85,6 @@ def read_mesh(path: Path, up: str | None = None) -> SceneMesh:
     if up == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     return _joined(path, [(vertices, triangles)], [0], (None,))
-
-
-def read_bytes(path: Path, most: int, remedy: str) -> bytes:
-    """Return the content of a file of at most so many bytes."""
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(most + 1)
-    except OSError as error:
-        raise MapError(f"path = '{path}' cannot be read ({error.strerror}): check the path.") from error
-    if len(content) > most:
-        raise MapError(f"path = '{path}' has more than {most:,} bytes: {remedy}")
-    return content
 
 
 def confined_path(folder: Path, name: str, what: str) -> Path:
@@ -98,16 +99,16 @@ def confined_path(folder: Path, name: str, what: str) -> Path:
 
 def _read_triangles(path: Path, kind: str) -> Triangles:
     """Read the triangles of a mesh file in the axes of the file; nodes of a scene are placed by their transforms."""
+    content = read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
     try:
-        if path.stat().st_size > MAX_MESH_BYTES:
-            raise MapError(f"path = '{path}' has more than {MAX_MESH_BYTES:,} bytes: cut or simplify the mesh.")
         if kind == "gltf":
-            json.loads(path.read_bytes())  # trimesh would look for another file
-        with path.open("rb") as stream, warnings.catch_warnings():
+            json.loads(content)  # trimesh would look for another file
+        stream, resolver = io.BytesIO(content), _Neighbours(os.fspath(path))
+        with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # damage ends in the error below
-            resolver = _Neighbours(os.fspath(path))
             scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, skip_materials=True)
             parts = [*_placed_parts(path, scene)]
+        _require_whole(kind, content, sum(len(triangles) for _, triangles in parts))
     except MapError:
         raise
     except Exception as error:  # decoders fail in many ways on damaged files
@@ -119,6 +120,22 @@ def _read_triangles(path: Path, kind: str) -> Triangles:
         count = f"{len(triangles):,} triangles, more than {MAX_TRIANGLES:,}"
         raise MapError(f"path = '{path}' holds {count}: cut or simplify it.")
     return vertices, triangles
+
+
+def _require_whole(kind: str, content: bytes, triangles: int) -> None:
+    """Raise a ValueError if a file ends before, or after, what it announces: trimesh takes what is there."""
+    is_text = kind == "stl" and content[:5].lower() == b"solid" and b"facet" in content[:1000]
+    if is_text and not content.rstrip().splitlines()[-1].strip().startswith(b"endsolid"):
+        raise ValueError("it ends before its endsolid")
+    if kind != "ply":
+        return
+    header, _, body = content.partition(b"end_header")
+    counts = {name: int(count) for name, count in re.findall(rb"^element\s+(\w+)\s+(\d+)", header, re.MULTILINE)}
+    lines = sum(map(bool, map(bytes.strip, body.splitlines()))) if b"format ascii" in header else None
+    if lines not in (None, sum(counts.values())):
+        raise ValueError(f"it announces {sum(counts.values())} vertices, faces and others, and has {lines}")
+    if triangles < counts.get(b"face", 0):
+        raise ValueError(f"it announces {counts[b'face']} faces, and has {triangles}")
 
 
 def _placed_parts(path: Path, scene: Any) -> Iterator[Triangles]:
@@ -207,7 +224,7 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
 
 def _read_shapes(path: Path) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
     """Read a scene file and its shapes; a document type, which entities need, and other files are refused."""
-    content = read_bytes(path, MAX_XML_BYTES, "split the scene.")
+    content = read_bytes(path, "path", MapError, MAX_XML_BYTES, "split the scene.")
     try:
         root: ET.Element = defusedxml.ElementTree.fromstring(content, forbid_dtd=True)
     except defusedxml.DefusedXmlException as error:
@@ -230,6 +247,7 @@ def _read_shapes(path: Path) -> tuple[ET.Element, list[tuple[ET.Element, Triangl
 def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
     """Triangles of a shape, with its to_world: each step of that acts on the outcome of those before it."""
     kind, matrix = str(shape.get("type")), np.eye(4)
+    _require_known(path, shape, SHAPE_PROPERTIES)
     if kind in _SHAPES:
         vertices, triangles = _SHAPES[kind]
     else:
@@ -248,6 +266,8 @@ def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
 
 def _step(step: ET.Element) -> NDArray[np.float64]:
     """Matrix (4, 4) of one step of a to_world."""
+    if not {*step.attrib} <= {"value", "x", "y", "z", "angle"}:
+        raise ValueError(step.attrib)
     value = np.array([float(word) for word in step.get("value", "").replace(",", " ").split()])
     if step.tag == "matrix":
         return value.reshape(4, 4)
@@ -269,6 +289,14 @@ def _name(element: ET.Element) -> str:
 def _property(element: ET.Element, name: str) -> str | None:
     found = element.find(f"*[@name='{name}'][@value]")
     return None if found is None else found.get("value")
+
+
+def _require_known(path: Path, element: ET.Element, names: Collection[str]) -> None:
+    """Raise a MapError for a property by another name than Mitsuba 3 and Sionna RT have, such as toWorld."""
+    for each in element:
+        if each.tag not in ("bsdf", "ref", "emitter") and each.get("name") not in names:
+            what = f"<{element.tag}> {_name(element)!r} has the property {each.get('name')!r}, which is not read"
+            raise MapError(f"path = '{path}': {what}: give the names of Mitsuba 3 ({', '.join(names)}).")
 
 
 def _material_of(path: Path, shape: ET.Element, named: Mapping[str | None, Material | None]) -> Material | None:
@@ -293,8 +321,10 @@ def _material(path: Path, bsdf: ET.Element) -> Material | None:
     try:
         thickness_m = float(_property(bsdf, "thickness") or DEFAULT_THICKNESS_M)
         if kind == "itu-radio-material":
+            _require_known(path, bsdf, MATERIAL_PROPERTIES)
             return Material(itu=itu or "", thickness_m=thickness_m)
         if kind == "radio-material":
+            _require_known(path, bsdf, MATERIAL_PROPERTIES)
             permittivity = float(_property(bsdf, "relative_permittivity") or 1.0)
             return Material(permittivity, float(_property(bsdf, "conductivity") or 0.0), thickness_m)
     except (SettingsError, ValueError) as error:

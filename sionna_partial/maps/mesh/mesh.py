@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cut import SEAM_M, close_seams, cut_triangles, merge_points
@@ -147,10 +148,7 @@ def equal_fields(one: Any, other: Any) -> bool:
 
 
 def _vertices(values: ArrayLike) -> NDArray[np.float64]:
-    try:
-        vertices = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise MapError("vertices_m is not an array of numbers: give x, y, z in metres, (V, 3).") from error
+    vertices = real_array("vertices_m", values, MapError, "give x, y, z in metres, (V, 3).").astype(np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MapError(f"vertices_m has shape {vertices.shape}: give x, y, z in metres, (V, 3).")
     wrong = ~(np.abs(vertices) <= MAX_COORDINATE_M).all(axis=1)
@@ -165,8 +163,8 @@ def _vertices(values: ArrayLike) -> NDArray[np.float64]:
 
 def _indices(name: str, values: ArrayLike, row: tuple[int, ...], count: int, target: str) -> NDArray[np.int64]:
     """Return indices (F, *row) into `count` items, or raise a MapError."""
-    indices = np.array(values)
     wanted = "(F, 3)" if row else "(F,)"
+    indices = real_array(name, values, MapError, f"give integers {wanted}.")
     if indices.ndim != 1 + len(row) or indices.shape[1:] != row or indices.dtype.kind not in "iu":
         raise MapError(f"{name} is {indices.dtype} of shape {indices.shape}: give integers {wanted}.")
     wrong = (indices < 0) | (indices >= count)
@@ -179,9 +177,9 @@ def _indices(name: str, values: ArrayLike, row: tuple[int, ...], count: int, tar
 
 
 def _materials(values: tuple[Material | None, ...]) -> tuple[Material | None, ...]:
+    if not isinstance(values, list | tuple) or not all(isinstance(each, Material | None) for each in values):
+        raise MapError(f"materials = {shown(values)} is not allowed: give Material(...) or None for each.")
     materials = tuple(values)
-    if not all(material is None or isinstance(material, Material) for material in materials):
-        raise MapError(f"materials = {values!r} is not allowed: give Material(...) or None for each.")
     if len(materials) > MAX_MATERIALS:
         raise MapError(
             f"materials has {len(materials)} entries, more than {MAX_MATERIALS}: give like ones the same material."
@@ -207,10 +205,8 @@ def _height_range(given: tuple[float, float] | None, vertices_m: NDArray[np.floa
 
 def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
     """Return two heights as numbers, or raise a MapError."""
-    try:
-        low, high = (float(value) for value in given)
-    except (TypeError, ValueError):
-        low, high = np.nan, np.nan
-    if not -MAX_COORDINATE_M <= low < high <= MAX_COORDINATE_M:
-        raise MapError(f"{name} = {given!r} is not allowed: give (low, high), z in metres, low < high.")
-    return low, high
+    remedy = "give (low, high), z in metres, low < high."
+    pair = real_array(name, given, MapError, remedy)
+    if pair.shape != (2,) or not -MAX_COORDINATE_M <= pair[0] < pair[1] <= MAX_COORDINATE_M:
+        raise MapError(f"{name} = {shown(given)} is not allowed: {remedy}")
+    return float(pair[0]), float(pair[1])

@@ -1,0 +1,5 @@
+must_refuse(lambda: sp.export_scene(room(), "a" * 5000))
+must_refuse(lambda: sp.save_map(room(), "a" * 5000 + ".npz"))
+must_refuse(lambda: sp.save_map(room(), "/dev/null/map.npz"))
+(folder / "device.npz").symlink_to("/dev/null")
+must_refuse(lambda: sp.save_map(room(), folder / "device.npz"))
