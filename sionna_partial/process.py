@@ -126,7 +126,7 @@ def _locked(folder: Path, *, must: bool = False) -> Iterator[None]:
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return numba's decorator; what it compiles is cached where that can be, in a folder of temporary files at last."""
+    """Return numba's decorator; code is cached where that can be, at last in a temporary folder."""
     from numba import config
     from numba import njit as compiled
 

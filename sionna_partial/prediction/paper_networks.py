@@ -106,13 +106,12 @@ OUTPUT_WIDTHS = {
 }
 """Number of values for each link of every network, by name."""
 
-
 _BACKEND, _DATA_FORMAT = "tensorflow", "channels_last"
 """Settings of Keras that our networks are made for."""
 
 
 def import_keras() -> ModuleType:
-    """Import Keras on TensorFlow, after the libLLVM that has to come before; raise a BackendError for another backend."""
+    """Import Keras, after the libLLVM that has to come before TensorFlow; another backend raises a BackendError."""
     load_llvm()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "0")
@@ -121,7 +120,6 @@ def import_keras() -> ModuleType:
         try:
             with signals_held():
                 import keras
-                import tensorflow as _
         except ImportError as error:
             raise BackendError(f"Keras cannot be imported ({error}): set KERAS_BACKEND={_BACKEND}.") from error
         asked = keras.config.backend()
