@@ -102,8 +102,9 @@ def require_like(
 
 
 def _read_traces(folder: Path) -> LinkTraces:
-    trace = read_index(folder)["settings"]["trace"]
+    index = read_index(folder)
     try:
+        trace = index["settings"]["trace"]
         return LinkTraces(float(trace["frequency_hz"]), trace["diffraction"] is not False)
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         path = folder / INDEX_FILE

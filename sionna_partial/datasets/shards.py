@@ -179,7 +179,7 @@ def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(folder, (str, os.PathLike)):
         raise PredictorError(f"folder = {folder!r} is no path: give a folder that `sionna-partial dataset` wrote.")
     path = Path(folder) / INDEX_FILE
-    if not path.exists():
+    if not os.path.exists(path):
         raise PredictorError(
             f"folder = '{folder}' is no data set, it has no {INDEX_FILE}: give a folder that `sionna-partial dataset` "
             "wrote."
@@ -188,7 +188,6 @@ def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
         index: dict[str, Any] = json.loads(read_bytes(path, "path", PredictorError, _MAX_BYTES))
         if not all(isinstance(home["name"], str) for home in index["homes"]):
             raise TypeError("names of homes are not text")
-        json.dumps(index["settings"]["trace"])
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error
     return index
