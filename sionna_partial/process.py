@@ -83,8 +83,8 @@ def signals_held() -> Iterator[None]:
     finally:
         for number, handler in held.items():
             signal.signal(number, handler)
-        for number, frame in came[:1]:
-            held[signal.Signals(number)](number, frame)
+        for first, frame in came[:1]:
+            held[signal.Signals(first)](first, frame)
 
 
 @contextmanager
