@@ -34,14 +34,15 @@ def cleaned_up(cleanup: Callable[[], object]) -> Iterator[None]:
         yield
     finally:
         cleanup()
-        _cleanups.remove(cleanup)
+        with suppress(ValueError):
+            _cleanups.remove(cleanup)
 
 
 def end_process(code: int) -> None:
     """Clean up, and end without unwinding: native code that is interrupted would abort."""
-    for cleanup in _cleanups[::-1]:
+    while _cleanups:  # first what stops other threads, which may add some
         with suppress(Exception):
-            cleanup()
+            _cleanups.pop(0)()
     os._exit(code)
 
 

@@ -58,16 +58,20 @@ app = typer.Typer(
 def main() -> None:
     """Run the command line (entry point `sionna-partial`)."""
     end_at_signals()
+    code: object = 0
     try:
-        try:
-            app(prog_name="sionna-partial")
-        finally:
-            if sys.stdout:
-                sys.stdout.flush()
-    except OSError as error:  # Python would fail again at its end
+        app(prog_name="sionna-partial")
+    except SystemExit as end:
+        code = end.code
+    try:
+        if sys.stdout:
+            sys.stdout.flush()
+    except OSError as error:
+        code = code or 2
         with suppress(OSError):
             os.write(2, f"error: the output cannot be written ({error.strerror or error}).\n".encode())
-        end_process(2)
+    logging.shutdown()
+    end_process(code if isinstance(code, int) else 0 if code is None else 1)  # native libraries may abort at the end
 
 
 def _print_version(wanted: bool) -> None:

@@ -27,6 +27,7 @@ from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
+from sionna_partial.process import cleaned_up
 from sionna_partial.settings import DatasetSettings
 
 HomeProgress = Callable[[int, int, str], None]
@@ -274,11 +275,9 @@ def _connected(scheduler: str | None, workers: int) -> Iterator[Client]:
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
+        cleaned_up(stop_homes),
     ):
-        try:
-            yield client
-        finally:
-            stop_homes()
+        yield client
 
 
 def _remote_client(scheduler: str) -> Client:
