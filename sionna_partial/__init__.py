@@ -8,6 +8,8 @@ import ast
 from importlib import import_module
 from pathlib import Path
 
+from sionna_partial.process import signals_held as _signals_held
+
 __version__ = "0.1.0"
 
 _MODULE_OF = {
@@ -22,7 +24,8 @@ __all__ = sorted([*_MODULE_OF, "__version__"])
 def __getattr__(name: str) -> object:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value: object = getattr(import_module(_MODULE_OF[name]), name)
+    with _signals_held():
+        value: object = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value
     return value
 

@@ -51,6 +51,9 @@ are predicted together [bytes]; `benchmarks/scale.py` measures it."""
 _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 """Number of receivers that are predicted together."""
 
+_LEAST_DEPTH = 2
+"""Interactions from which on a trace is like those of the training."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -186,7 +189,7 @@ def predict_map(
         loaded = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
         model = None if complete else loaded
     if model is not None:
-        _warn_of_other_traces(model, trace_settings)
+        _warn_of_other_traces(model, trace_settings, scene_settings)
     needs_context = model is not None and model.settings.networks != "paper"
     report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
@@ -244,13 +247,17 @@ def _transmitter(partial: PartialMap, tx: ArrayLike) -> Floats:
     return tx_m
 
 
-def _warn_of_other_traces(model: Predictor, settings: TraceSettings) -> None:
+def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
     """Warn if a predictor is used on traces of another kind than it was trained on."""
     trained = model.settings
     if not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
         then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
     elif trained.diffraction != settings.diffraction:
         then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
+    elif settings.max_depth < _LEAST_DEPTH:
+        then, now = (f"with max_depth = {depth}" for depth in (TraceSettings.max_depth, settings.max_depth))
+    elif scene_settings.material.itu == "metal":
+        then, now = "on walls that transmit", "on walls of metal"
     else:
         return
     message = "predictor %r was trained %s, and is used %s: its predictions of unobserved links are biased"

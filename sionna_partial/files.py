@@ -3,23 +3,25 @@
 import errno
 import fcntl
 import os
-import secrets
-import shutil
 import socket
 import stat
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
 from sionna_partial.errors import OutputError, SionnaPartialError
+from sionna_partial.process import own_folder, signals_held
 
 SCENE_FILES = ("scene.xml", "map.yaml")
 """Files by which an exported scene folder is recognised."""
 
 LOCK_FILE = ".lock"
 """File in a locked folder that names the process that writes there."""
+
+HIDDEN, TEMPORARY = ".tmp-sionna_partial_", "sionna_partial_"
+"""Beginnings of the names of hidden folders beside outputs, and of those in the folder of temporary files."""
 
 _REMEDIES = {
     errno.EACCES: "choose a folder that you may write to, or change its permissions.",
@@ -156,16 +158,17 @@ def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
     """Open a folder for files that libraries exchange, and remove it in the end."""
+    folder: Path | None = None
     try:
-        with tempfile.TemporaryDirectory(prefix="sionna_partial_") as folder:
-            yield Path(folder)
+        with own_folder(Path(tempfile.gettempdir()), TEMPORARY) as folder:
+            yield folder
     except OSError as error:
-        cause = error.__cause__ if isinstance(error, OutputError) else error
-        if not isinstance(cause, OSError) or cause.errno not in _REMEDIES:
+        cause = error.__cause__ if isinstance(error, OutputError) and str(folder) in str(error) else error
+        if isinstance(cause, SionnaPartialError) or not isinstance(cause, OSError):
             raise
         raise OutputError(
-            f"no temporary file could be written ({cause.strerror}): free some space in the folder of temporary "
-            "files, or set TMPDIR to one that you may write to."
+            f"no temporary file could be written ({cause.strerror or cause}): free some space in the folder of "
+            "temporary files, or set TMPDIR to one that you may write to."
         ) from error
 
 
@@ -216,22 +219,15 @@ def _hidden_folder(target: Path, parent: Path) -> Iterator[Path]:
 
     Errors of the system become OutputErrors that name `target`.
     """
-    made: list[Path] = []
-    hidden = parent / f".tmp-{secrets.token_hex(8)}"
+    hidden: Path | None = None
     try:
-        made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
-        hidden.mkdir(parents=True)
-        yield hidden
+        with own_folder(parent, HIDDEN) as hidden:
+            yield hidden
     except OSError as error:
         cause = error.__cause__ if isinstance(error, OutputError) and str(hidden) in str(error) else error
         if isinstance(cause, OSError) and not isinstance(cause, SionnaPartialError):
             raise _output_error(target, cause) from error
         raise
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
-        for folder in made:
-            with suppress(OSError):
-                folder.rmdir()
 
 
 def _output_error(target: Path, error: OSError) -> OutputError:
@@ -250,7 +246,7 @@ def _require_file(path: Path) -> None:
 def _swap_entries(new: Path, target: Path, aside: Path) -> None:
     """Move every entry of `new` into `target`, those that were there to `aside`; undo everything on failure."""
     aside.mkdir()
-    with ExitStack() as undo:
+    with signals_held(), ExitStack() as undo:
         for name in sorted(entry.name for entry in new.iterdir()):
             if os.path.lexists(target / name):
                 os.replace(target / name, aside / name)

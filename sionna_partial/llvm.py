@@ -41,13 +41,29 @@ class LlvmLibrary:
     source: str
 
 
-@functools.cache
 def load_llvm() -> LlvmLibrary:
     """Load the LLVM library that `DRJIT_LIBLLVM_PATH` names, or pip's; later calls return what the first one loaded.
 
     Call it before importing mitsuba, drjit or sionna; whether TensorFlow was imported before does not matter. Raises a
-    BackendError that says what to do if there is no library, or none that works.
+    BackendError that says what to do if there is no library, or none that works; if the process is a fork of one that
+    loaded it; or if its working directory was deleted, on which native libraries abort.
     """
+    library, process = _loaded_library()
+    if process != os.getpid():
+        raise BackendError(
+            f"process {os.getpid()} is a fork of process {process}, which has started Dr.Jit or TensorFlow: they do "
+            "not run in forks; start processes with multiprocessing.get_context('spawn')."
+        )
+    try:
+        os.getcwd()
+    except OSError as error:
+        raise BackendError("the working directory was deleted: change to one that is there (cd).") from error
+    return library
+
+
+@functools.cache
+def _loaded_library() -> tuple[LlvmLibrary, int]:
+    """Load the library; return it, and the process that did."""
     named = os.environ.get(PATH_VARIABLE)
     path = _started_library() or (_named_library(named) if named else _pip_library())
     try:
@@ -58,7 +74,7 @@ def load_llvm() -> LlvmLibrary:
         fault = f"LLVM {version} is older than {OLDEST_MAJOR} and cannot compile path kernels"
         raise BackendError(f"{PATH_VARIABLE} = '{path}' cannot be used ({fault}): {_UNSET}.")
     os.environ[PATH_VARIABLE] = str(path)
-    return LlvmLibrary(path, version, PATH_VARIABLE if named else PIP_PACKAGE)
+    return LlvmLibrary(path, version, PATH_VARIABLE if named else PIP_PACKAGE), os.getpid()
 
 
 def _started_library() -> Path | None:

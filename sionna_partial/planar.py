@@ -1,8 +1,9 @@
 """Geometry in the plane that maps and traces share."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sionna_partial.process import njit
 
 
 def cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -284,18 +284,27 @@ def test_the_predictor_gets_context_and_windows(fakes, monkeypatch):
     np.testing.assert_allclose(phi.context.tx_m, np.tile([*TX, 1.5], (len(receivers), 1)))
 
 
-def test_a_predictor_trained_at_another_frequency_is_warned_about(fakes, caplog):
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"trace_settings": TraceSettings(frequency_hz=60e9)}, "at 28 GHz, and is used at 60 GHz: its"),
+        (
+            {"trace_settings": TraceSettings(diffraction=False)},
+            "with diffraction, and is used without diffraction: its",
+        ),
+        ({"trace_settings": TraceSettings(max_depth=1)}, "with max_depth = 6, and is used with max_depth = 1: its"),
+        (
+            {"scene_settings": SceneSettings(material=Material(itu="metal"))},
+            "on walls that transmit, and is used on walls of metal: its",
+        ),
+    ],
+)
+def test_a_predictor_trained_on_other_traces_is_warned_about(fakes, caplog, settings, words):
     predict_map(map_of(PICTURE), TX, spacing_m=0.5)
     assert not caplog.messages
-    predict_map(map_of(PICTURE), TX, spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=60e9))
+    predict_map(map_of(PICTURE), TX, spacing_m=0.5, **settings)
     (message,) = caplog.messages
-    assert message.startswith("predictor 'fake' was trained at 28 GHz, and is used at 60 GHz")
-
-
-def test_a_predictor_trained_with_diffraction_is_warned_about_without(fakes, caplog):
-    predict_map(map_of(PICTURE), TX, spacing_m=0.5, trace_settings=TraceSettings(diffraction=False))
-    (message,) = caplog.messages
-    assert message.startswith("predictor 'fake' was trained with diffraction, and is used without diffraction: its")
+    assert message.startswith(f"predictor 'fake' was trained {words}")
 
 
 def test_settings_reach_the_tracer_and_the_attributes(fakes):

@@ -20,7 +20,10 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
-    "foundations": ("constants", "errors", "checks", "settings", "resources", "files", "planar", "cores", "llvm"),
+    "foundations": (
+        *("constants", "errors", "checks", "settings", "resources"),
+        *("process", "files", "planar", "cores", "llvm"),
+    ),
     "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),

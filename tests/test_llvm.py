@@ -164,4 +164,4 @@ def test_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(llvm.PATH_VARIABLE, raising=False)
     monkeypatch.setattr(metadata, "distribution", missing)
     with pytest.raises(BackendError, match=r'^No LLVM library is installed: run pip install "karellen-llvm-core>='):
-        load_llvm.__wrapped__()
+        llvm._loaded_library.__wrapped__()

@@ -14,9 +14,11 @@ import pytest
 from dataset_fakes import fake_links
 from link_tables import assert_same
 
+from sionna_partial.datasets import shards
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.datasets.shards import (
     FORMAT,
+    file_stem,
     read_dataset,
     read_shard,
     shard_metadata,
@@ -89,7 +91,7 @@ class TestShard:
 
 class TestDamaged:
     def test_missing(self, tmp_path: Path) -> None:
-        with pytest.raises(PredictorError, match=r"no\.parquet' is not there: give a shard"):
+        with pytest.raises(PredictorError, match=r"no\.parquet' cannot be read \(No such file"):
             read_shard(tmp_path / "no.parquet")
 
     @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
@@ -142,8 +144,10 @@ class TestDamaged:
         [
             ({"partial": None}, "NoneType"),
             ({"partial": []}, "tuple index out of range"),
-            ({"complete": {"villa": {}}}, "cells"),
-            ({"complete": {"villa": {"cells": "AAAA"}}}, "Error -3"),
+            ({"complete": {"villa": {}}}, "shape"),
+            ({"complete": {"villa": {"cells": "AAAA", **PLAIN}}}, "Error -3"),
+            ({"complete": {"villa": {"cells": packed(b"\0" * 7), **PLAIN}}}, "reshape"),
+            ({"complete": {"villa": {"shape": [20_000, 20_000]}}}, "more than 100,000,000"),
             ({"complete": {"villa": {"cells": packed(b"\0" * 5), **PLAIN}}}, "reshape"),
             ({"complete": {"villa": {"cells": packed(b"\7" * 6), **PLAIN}}}, "state has values 7 to 7"),
         ],
@@ -155,12 +159,24 @@ class TestDamaged:
         with pytest.raises(PredictorError, match=rf"is damaged, or no Parquet file \(.*{words}"):
             read_shard(shard)
 
+    def test_too_many_links(self, shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(shards, "_MAX_LINKS", 1)
+        with pytest.raises(PredictorError, match="has more than 1 links: give a shard of one home"):
+            read_shard(shard)
+
     def test_no_maps(self, shard: Path) -> None:
         table = pq.read_table(shard)
         metadata = {name: text for name, text in table.schema.metadata.items() if name != b"sionna_partial.maps"}
         pq.write_table(table.replace_schema_metadata(metadata), shard)
         with pytest.raises(PredictorError, match=r"is damaged, or no Parquet file \('maps'\)"):
             read_shard(shard)
+
+
+def test_names_of_files_are_short() -> None:
+    long = [f"{'ä' * 150}{end}" for end in "ab"]
+    assert file_stem("villa") == "villa"
+    assert len({file_stem(name) for name in long}) == 2
+    assert all(len(file_stem(name).encode()) < 200 for name in long)
 
 
 class TestDataset:

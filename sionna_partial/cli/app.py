@@ -2,7 +2,9 @@
 
 import logging
 import os
+import sys
 import warnings
+from contextlib import suppress
 from typing import Annotated, Any
 
 import typer
@@ -14,6 +16,7 @@ from sionna_partial.cli.options import TransmitterCommand
 from sionna_partial.cli.planning import calibrate, place
 from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
 from sionna_partial.errors import SionnaPartialError
+from sionna_partial.process import end_at_signals, end_process
 
 
 class _ErrorLineGroup(TyperGroup):
@@ -25,7 +28,14 @@ class _ErrorLineGroup(TyperGroup):
             return super().invoke(ctx)
         except SionnaPartialError as error:
             typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(2) from None
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            where = f"'{error.filename}'" if error.filename else "a file, or the output"
+            typer.echo(f"error: {where} cannot be used ({error.strerror or error}): check path and disk.", err=True)
+        except MemoryError as error:
+            typer.echo(f"error: memory ran out ({error}): close other programs, or give a smaller job.", err=True)
+        raise typer.Exit(2)
 
 
 class _WarningLine(logging.Handler):
@@ -47,7 +57,21 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line (entry point `sionna-partial`)."""
-    app(prog_name="sionna-partial")
+    end_at_signals()
+    code: object = 0
+    try:
+        app(prog_name="sionna-partial")
+    except SystemExit as end:
+        code = end.code
+    try:
+        if sys.stdout:
+            sys.stdout.flush()
+    except OSError as error:
+        code = code or 2
+        with suppress(OSError):
+            os.write(2, f"error: the output cannot be written ({error.strerror or error}).\n".encode())
+    logging.shutdown()
+    end_process(code if isinstance(code, int) else 0 if code is None else 1)  # native libraries may abort at the end
 
 
 def _print_version(wanted: bool) -> None:
@@ -64,6 +88,7 @@ def _prepare(
 ) -> None:
     """Predict radio coverage from a robot's partial map."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    os.environ["MPLBACKEND"] = "agg"  # pictures are files, whatever the variable was
     logging.getLogger("sionna_partial").addHandler(_WarningLine(logging.WARNING))
     warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 
-from sionna_partial.checks import require_number, require_whole, settings_or_default
+from sionna_partial.checks import require, require_number, require_whole, settings_or_default
 from sionna_partial.datasets.home_process import (
     HomeResult,
     HomeTask,
@@ -24,9 +24,10 @@ from sionna_partial.datasets.home_process import (
     stop_homes,
 )
 from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
-from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER
+from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
+from sionna_partial.process import cleaned_up
 from sionna_partial.settings import DatasetSettings
 
 HomeProgress = Callable[[int, int, str], None]
@@ -118,6 +119,7 @@ def build_dataset(
     start = time.monotonic()
     settings = settings_or_default("settings", settings, DatasetSettings)
     require_number("home_time_limit_s", home_time_limit_s, 0.0, 1e6, open_low=True)
+    require(scheduler is None or isinstance(scheduler, str), "scheduler", scheduler, "give an address or a file.")
     if workers is not None:
         require_whole("workers", workers, 1, 1000)
         if scheduler is not None:
@@ -213,7 +215,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
         return
     try:
         differences = list(_differences(json.loads(path.read_text(encoding="utf-8")), index))
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise OutputError(f"'{path}' is damaged ({error}): choose a new folder.") from error
     if differences:
         name, before, now = differences[0]
@@ -251,7 +253,7 @@ def _leaves(tree: object, name: str) -> Iterator[tuple[str, object]]:
 
 
 def _failure_path(folder: Path, name: str) -> Path:
-    return folder / FAILED_FOLDER / f"{name}.json"
+    return folder / FAILED_FOLDER / f"{file_stem(name)}.json"
 
 
 @contextmanager
@@ -273,11 +275,9 @@ def _connected(scheduler: str | None, workers: int) -> Iterator[Client]:
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
+        cleaned_up(stop_homes),
     ):
-        try:
-            yield client
-        finally:
-            stop_homes()
+        yield client
 
 
 def _remote_client(scheduler: str) -> Client:
@@ -287,7 +287,7 @@ def _remote_client(scheduler: str) -> Client:
         raise BackendError(f"scheduler = {scheduler!r} is not there: give the file that dask scheduler writes.")
     try:
         return Client(**where, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError) as error:
+    except Exception as error:  # dask fails in many ways on damaged files
         raise BackendError(
             f"scheduler = {scheduler!r} does not answer ({error}): give the address that dask scheduler prints, such "
             "as tcp://host:8786, or its scheduler file."

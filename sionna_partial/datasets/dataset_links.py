@@ -1,14 +1,14 @@
 """Links of data sets, how they were traced, and the check that a predictor was trained on such links."""
 
-import json
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
 from sionna_partial.datasets.link_table import LinkTable
-from sionna_partial.datasets.shards import INDEX_FILE, read_dataset
+from sionna_partial.datasets.shards import INDEX_FILE, read_dataset, read_index
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import NetworkKind, PredictorSettings
@@ -50,11 +50,11 @@ def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
     else:
         folders = _folders(dataset)
         tables = [read_dataset(folder) for folder in folders]
-        traces = _read_traces(folders[0] / INDEX_FILE)
+        traces = _read_traces(folders[0])
         homes: dict[str, PartialMap] = {}
         for folder, table in zip(folders, tables, strict=True):
             remedy = "give data sets that were traced alike."
-            require_like(_read_traces(folder / INDEX_FILE), traces, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
+            require_like(_read_traces(folder), traces, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
             for name, home in table.complete_maps.items():
                 if homes.setdefault(name, home) != home:
                     raise PredictorError(
@@ -74,7 +74,11 @@ def _folders(dataset: str | PathLike[str] | Sequence[str | PathLike[str]]) -> li
             f"dataset = {dataset!r} is not allowed: give a LinkTable, or one or more folders that "
             "`sionna-partial dataset` wrote."
         )
-    return [Path(each) for each in folders]
+    paths = [Path(each) for each in folders]
+    twice = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
+    if twice:
+        raise PredictorError(f"dataset has '{twice[0]}' twice, whose links would count twice: give it once.")
+    return paths
 
 
 def settings_for(
@@ -97,9 +101,11 @@ def require_like(
         raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
 
 
-def _read_traces(index: Path) -> LinkTraces:
+def _read_traces(folder: Path) -> LinkTraces:
+    index = read_index(folder)
     try:
-        trace = json.loads(index.read_text(encoding="utf-8"))["settings"]["trace"]
+        trace = index["settings"]["trace"]
         return LinkTraces(float(trace["frequency_hz"]), trace["diffraction"] is not False)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise PredictorError(f"'{index}' is damaged ({error!r}): build the data set again in a new folder.") from error
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        path = folder / INDEX_FILE
+        raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error

@@ -27,7 +27,9 @@ from sionna_partial.datasets.home_links import home_links, home_sensor
 from sionna_partial.datasets.home_sources import HomeSource
 from sionna_partial.datasets.shards import INDEX_FILE, shard_metadata, shard_path, write_shard
 from sionna_partial.errors import BackendError, OutputError, PredictorError, SionnaPartialError
+from sionna_partial.files import temporary_folder
 from sionna_partial.llvm import load_llvm
+from sionna_partial.process import cleaned_up, end_process
 from sionna_partial.settings import DatasetSettings
 
 ATTEMPTS = 3
@@ -163,8 +165,9 @@ class _HomeProcess:
     def __init__(self) -> None:
         self._link, far_end = Pipe()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
-        self._scratch = tempfile.TemporaryDirectory(prefix="sionna_partial_", ignore_cleanup_errors=True)
-        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": self._scratch.name}
+        self._scratch = contextlib.ExitStack()
+        scratch = self._scratch.enter_context(temporary_folder())
+        own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": str(scratch)}
         with far_end:
             descriptor = far_end.fileno()
             code = f"from sionna_partial.datasets.home_process import serve; serve({descriptor})"
@@ -176,6 +179,7 @@ class _HomeProcess:
                 pass_fds=[descriptor],
                 env=os.environ | ONE_THREAD | own,
             )
+        self._scratch.enter_context(cleaned_up(self.kill))
         _alive.add(self)
 
     @property
@@ -212,7 +216,7 @@ class _HomeProcess:
         self.kill()
         self._link.close()
         self._log.close()
-        self._scratch.cleanup()
+        self._scratch.close()
         if self._process.stdin:
             self._process.stdin.close()
 
@@ -275,4 +279,4 @@ def _fault_of_libraries() -> str:
 def _end_with_worker() -> None:
     """Wait for the worker's end of a pipe to close, which it does when the worker dies."""
     os.read(sys.stdin.fileno(), 1)
-    os._exit(1)
+    end_process(1)

@@ -47,6 +47,8 @@ def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
 
     A map has the name of its file, or of its folder if the file is called map or scene.
     """
+    if not isinstance(homes, Iterable) or isinstance(homes, (str, bytes)):
+        raise MapError(f"homes = {homes!r} is no list: give seeds of make_home, or paths of complete maps, in a list.")
     sources: dict[str, HomeSource] = {}
     for home in homes:
         for source in _sources(home):
@@ -71,7 +73,7 @@ def _sources(home: Home) -> Iterator[HomeSource]:
         yield HomeSource(f"make_home({seed}, {kind})" if kind else f"make_home({seed})", seed, kind)
     elif isinstance(home, (str, os.PathLike)):
         path = Path(os.path.abspath(home))
-        if not path.exists():
+        if not os.path.exists(path):
             raise MapError(f"path = '{path}' is not there: give complete maps, or a folder with maps in it.")
         yield from _maps_at(path)
     else:

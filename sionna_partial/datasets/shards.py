@@ -1,6 +1,7 @@
 """LinkTable <-> Parquet: one shard for each home of a data set."""
 
 import base64
+import hashlib
 import io
 import json
 import os
@@ -16,7 +17,7 @@ import pyarrow.parquet as pq
 
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
-from sionna_partial.files import atomic_write
+from sionna_partial.files import atomic_write, open_regular, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
@@ -27,6 +28,12 @@ INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
 
 FORMAT = "sionna-partial links 2"
 """Name and version of the shards' format, in their metadata."""
+
+_MAX_LINKS, _MAX_CELLS, _MAX_BYTES = 10_000_000, 100_000_000, 4_000_000_000
+"""Links of a home, cells of its maps and bytes of its shard, which may not be more."""
+
+_MAX_NAME_BYTES = 200
+"""Length of the names of homes from which files have a shorter one [bytes]; file systems allow 255."""
 
 _PREFIX = "sionna_partial."
 
@@ -94,7 +101,10 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
     """Read the links of a shard."""
     notes = shard_metadata(path)
     try:
-        table = pq.ParquetFile(path, page_checksum_verification=True).read()
+        file = pq.ParquetFile(path, page_checksum_verification=True)
+        if file.metadata.num_rows > _MAX_LINKS:
+            raise PredictorError(f"path = '{path}' has more than {_MAX_LINKS:,} links: give a shard of one home.")
+        table = file.read()
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
     columns = {name: table[name].to_numpy() for name in table.column_names}
@@ -106,13 +116,13 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
 
 def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
     """Read what `write_shard` noted beside the links, without the links."""
-    if not Path(path).is_file():
-        raise PredictorError(f"path = '{path}' is not there: give a shard of a data set.")
+    with open_regular(path, "path", PredictorError, _MAX_BYTES):
+        pass
     try:
         schema = pq.read_schema(path)
         texts = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items()}
         notes = {key.removeprefix(_PREFIX): json.loads(text) for key, text in texts.items() if key.startswith(_PREFIX)}
-    except (OSError, ValueError, pa.ArrowException) as error:
+    except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
     if notes.get("format") != FORMAT or [(each.name, each.type) for each in schema] != [
         (each.name, each.type) for each in _FIELDS
@@ -153,16 +163,7 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
     >>> links.gain_db.shape
     (16,)
     """
-    index = Path(folder) / INDEX_FILE
-    try:
-        known = [home["name"] for home in json.loads(index.read_text(encoding="utf-8"))["homes"]]
-    except FileNotFoundError as error:
-        raise PredictorError(
-            f"folder = '{folder}' is no data set, it has no {INDEX_FILE}: give a folder that `sionna-partial dataset` "
-            "wrote."
-        ) from error
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise PredictorError(f"'{index}' is damaged ({error}): build the data set again in a new folder.") from error
+    known = [home["name"] for home in read_index(folder)["homes"]]
     built = [name for name in known if shard_path(folder, name).is_file()]
     wanted = built if homes is None else list(homes)
     missing = [name for name in wanted if name not in built]
@@ -173,9 +174,36 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
     return LinkTable.concatenate(read_shard(shard_path(folder, name)) for name in wanted)
 
 
+def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read what `dataset.json` of a data set has: settings, homes and versions."""
+    if not isinstance(folder, (str, os.PathLike)):
+        raise PredictorError(f"folder = {folder!r} is no path: give a folder that `sionna-partial dataset` wrote.")
+    path = Path(folder) / INDEX_FILE
+    if not os.path.exists(path):
+        raise PredictorError(
+            f"folder = '{folder}' is no data set, it has no {INDEX_FILE}: give a folder that `sionna-partial dataset` "
+            "wrote."
+        )
+    try:
+        index: dict[str, Any] = json.loads(read_bytes(path, "path", PredictorError, _MAX_BYTES))
+        if not all(isinstance(home["name"], str) for home in index["homes"]):
+            raise TypeError("names of homes are not text")
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error
+    return index
+
+
 def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
     """Return the path of a home's shard in a data set."""
-    return Path(folder) / SHARDS_FOLDER / f"{name}.parquet"
+    return Path(folder) / SHARDS_FOLDER / f"{file_stem(name)}.parquet"
+
+
+def file_stem(name: str) -> str:
+    """Return the name of a home, cut where it is too long for the name of a file, and told apart by its hash."""
+    content = name.encode(errors="surrogateescape")
+    if len(content) <= _MAX_NAME_BYTES:
+        return name
+    return f"{content[:150].decode(errors='ignore')}-{hashlib.sha256(content).hexdigest()[:16]}"
 
 
 def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
@@ -215,10 +243,14 @@ def _packed(partial: PartialMap) -> dict[str, object]:
 
 
 def _unpacked(entry: Any) -> PartialMap:
-    cells = np.frombuffer(zlib.decompress(base64.b64decode(entry["cells"])), dtype=np.uint8)
+    rows, columns = map(int, entry["shape"])
+    if not 0 < rows * columns <= _MAX_CELLS:
+        raise PredictorError(f"a map of {rows:,} x {columns:,} cells is more than {_MAX_CELLS:,}")
+    inflated = zlib.decompressobj().decompress(base64.b64decode(entry["cells"]), rows * columns + 1)
+    cells = np.frombuffer(inflated, dtype=np.uint8)
     rest = {name: entry[name] for name in ("resolution_m", "wall_height_m", "interior_cells")}
     material = Material(**entry["material"]) if "material" in entry else None
-    return PartialMap(cells.reshape(entry["shape"]), origin_m=tuple(entry["origin_m"]), material=material, **rest)
+    return PartialMap(cells.reshape(rows, columns), origin_m=tuple(entry["origin_m"]), material=material, **rest)
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:

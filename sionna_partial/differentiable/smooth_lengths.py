@@ -1,13 +1,13 @@
 """Lengths of segments in cells of one kind, smooth in their ends: what derivatives of d_unobs need."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.unobserved import Bools, Floats, Segment, enter_grid, leave_cells, segment_between
+from sionna_partial.process import njit
 
 _BORDER_CELLS = 1e-6
 """Distance within which a segment runs along the border of patches [cells]."""

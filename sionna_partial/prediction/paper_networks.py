@@ -22,10 +22,11 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
-from sionna_partial.errors import PredictorError
+from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.unobserved import Bools, Floats
+from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
@@ -105,14 +106,30 @@ OUTPUT_WIDTHS = {
 }
 """Number of values for each link of every network, by name."""
 
+_BACKEND, _DATA_FORMAT = "tensorflow", "channels_last"
+"""Settings of Keras that our networks are made for."""
+
 
 def import_keras() -> ModuleType:
-    """Import Keras, after the libLLVM that has to come before TensorFlow."""
+    """Import Keras, after the libLLVM that has to come before TensorFlow; another backend raises a BackendError."""
     load_llvm()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "0")
-    import keras
-
+    asked = os.environ.get("KERAS_BACKEND", _BACKEND)
+    if asked == _BACKEND:
+        try:
+            with signals_held():
+                import keras
+        except ImportError as error:
+            raise BackendError(f"Keras cannot be imported ({error}): set KERAS_BACKEND={_BACKEND}.") from error
+        asked = keras.config.backend()
+    if asked != _BACKEND:
+        raise BackendError(f"the backend of Keras is {asked!r}: set KERAS_BACKEND={_BACKEND} before Keras is imported.")
+    if keras.config.image_data_format() != _DATA_FORMAT:
+        raise BackendError(
+            f"image_data_format = {keras.config.image_data_format()!r} is not supported: "
+            f"call keras.config.set_image_data_format({_DATA_FORMAT!r})."
+        )
     return keras
 
 

@@ -13,9 +13,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write, temporary_folder
+from sionna_partial.files import atomic_write, read_bytes, temporary_folder
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
 from sionna_partial.prediction.paper_networks import FEATURES, OUTPUT_WIDTHS, import_keras, own_input
 
@@ -28,6 +30,9 @@ FORMAT = "sionna_partial predictor 2"
 SUFFIX = ".keras"
 
 _MAX_BYTES = 64_000_000
+_MAX_CONFIG_BYTES, _MAX_SIZE = 1_000_000, 512
+"""Bytes of the configuration of a model, and the largest number in it; ours have 150,000 and 112."""
+
 _FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _CLASSES = {
     *("Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"),
@@ -95,7 +100,7 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
             f"path = '{path}' has SHA-256 {digest(archive)}, but its card says {card['sha256']!r}: the file is "
             "truncated, was changed, or belongs to another card; copy both files again, or train anew."
         )
-    _require_stock_classes(path, archive)
+    _require_our_kind(path, archive)
     return _unpack(path, archive), archive, card
 
 
@@ -105,17 +110,8 @@ def _require_suffix(path: Path) -> None:
 
 
 def _read(path: Path) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            content = stream.read(_MAX_BYTES + 1)
-    except OSError as error:
-        raise PredictorError(
-            f"path = '{path}' cannot be read ({error.strerror}): a predictor is a {SUFFIX} file and a .json file of "
-            "the same name beside it; check the path, or train a predictor and save it there."
-        ) from error
-    if len(content) > _MAX_BYTES:
-        raise PredictorError(f"path = '{path}' has more than {_MAX_BYTES:,} bytes: this is no predictor of ours.")
-    return content
+    remedy = f"a predictor is a {SUFFIX} file and a .json file of the same name beside it; train one and save it there."
+    return read_bytes(path, "path", PredictorError, _MAX_BYTES, remedy)
 
 
 def _read_card(path: Path) -> dict[str, Any]:
@@ -135,13 +131,15 @@ def _read_card(path: Path) -> dict[str, Any]:
     return card
 
 
-def _require_stock_classes(path: Path, archive: bytes) -> None:
-    """Raise a PredictorError unless the archive is a Keras model of the classes that our networks are made of."""
+def _require_our_kind(path: Path, archive: bytes) -> None:
+    """Raise a PredictorError unless the archive is a Keras model of classes and sizes such as our networks have."""
     try:
         with zipfile.ZipFile(io.BytesIO(archive)) as content:
             if sum(entry.file_size for entry in content.infolist()) > _MAX_BYTES:
                 raise PredictorError(f"path = '{path}' unpacks to more than {_MAX_BYTES:,} bytes: do not use it.")
-            found = set(_classes(json.loads(content.read("config.json"))))
+            config = json.loads(content.read("config.json"))
+            config_bytes = content.getinfo("config.json").file_size
+            found, largest = set(_classes(config)), max(_sizes(config), default=0)
     except (zipfile.BadZipFile, KeyError, ValueError, RecursionError, NotImplementedError) as error:
         raise PredictorError(f"path = '{path}' is no Keras archive ({error}): train and save it anew.") from error
     foreign = sorted(name for name in found if name not in _CLASSES)
@@ -150,6 +148,21 @@ def _require_stock_classes(path: Path, archive: bytes) -> None:
             f"path = '{path}' holds {', '.join(foreign)}, which no predictor of ours has: it may run foreign code; do "
             "not use it."
         )
+    if largest > _MAX_SIZE or config_bytes > _MAX_CONFIG_BYTES:
+        raise PredictorError(
+            f"path = '{path}' describes a network with a size of {largest:,}, in {config_bytes:,} bytes: no predictor "
+            f"of ours has more than {_MAX_SIZE:,} and {_MAX_CONFIG_BYTES:,}; do not use it."
+        )
+
+
+def _sizes(entry: Any) -> Iterator[int]:
+    """Yield every whole number of a configuration except seeds: numbers of units and filters, shapes, strides."""
+    if isinstance(entry, int):
+        yield abs(entry)
+    values = entry.items() if isinstance(entry, dict) else enumerate(entry) if isinstance(entry, list) else ()
+    for key, value in values:
+        if key != "seed":
+            yield from _sizes(value)
 
 
 def _classes(entry: Any) -> Iterator[str]:
@@ -182,6 +195,8 @@ def _unpack(path: Path, archive: bytes) -> "keras.Model":
         )
         for more in CONTEXT_SHAPES
     ]
+    if not all(np.isfinite(weights).all() for weights in model.get_weights()):
+        raise PredictorError(f"path = '{path}' has weights that are not finite: train it anew.")
     if (inputs, outputs) not in known:
         raise PredictorError(f"path = '{path}' has inputs {sorted(inputs)} and outputs {outputs}: train it anew.")
     return model

@@ -4,12 +4,12 @@ import itertools
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.cores import core_count, in_order
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
+from sionna_partial.process import njit
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]

@@ -4,13 +4,13 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sionna_partial.planar import cross, span_in_strip
+from sionna_partial.process import njit
 
 _SAME_LINE_M = 1e-6
 """Distance from a line within which the ends of collinear walls lie [m]."""

@@ -1,8 +1,9 @@
 """Chains of lattice edges -> runs that a straight line fits within a tolerance."""
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sionna_partial.process import njit
 
 RAGGED_FACTOR = 2.0
 """How much farther than the tolerance a line may be from ragged walls."""

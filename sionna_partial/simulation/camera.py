@@ -4,11 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.process import njit
 from sionna_partial.settings import SensorSettings
 
 MISSED_PATCH_M = 0.5

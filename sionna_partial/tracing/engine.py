@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
+from sionna_partial.process import signals_held
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
@@ -48,16 +49,18 @@ _log = logging.getLogger(__name__)
 def load_sionna() -> ModuleType:
     """Import Sionna RT on the CPU, with a working LLVM; raise a BackendError that says what to do if that fails."""
     load_llvm()
-    import mitsuba as mi
+    with signals_held():
+        import mitsuba as mi
 
-    if mi.variant() is None:
-        mi.set_variant(MITSUBA_VARIANT)
+        if mi.variant() is None:
+            mi.set_variant(MITSUBA_VARIANT)
     if mi.variant() != MITSUBA_VARIANT:
         raise BackendError(
             f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
             "before the first trace, or import sionna_partial in a process of its own."
         )
-    import sionna.rt
+    with signals_held():
+        import sionna.rt
 
     return sionna.rt
 

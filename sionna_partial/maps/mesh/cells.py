@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
@@ -18,6 +17,7 @@ from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, row_runs
 from sionna_partial.planar import span_in_strip
+from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)
 """Height above the lowest point of a mesh in which surfaces are walls [m]: above tables, below the lintels of doors."""

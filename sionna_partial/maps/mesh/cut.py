@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sionna_partial.planar import cross
+from sionna_partial.process import njit
 
 BORDER_M = 1e-5
 """Distance within which a surface lies on a border, and stays [m]: float32 files round that much."""

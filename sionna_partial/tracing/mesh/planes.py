@@ -7,10 +7,10 @@ scanned mesh nearly every face is a plane of its own.
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.planar import span_in_strip
+from sionna_partial.process import njit
 
 PLANE_TOLERANCE_M = 1e-4
 """Distance of corners from a plane [m] up to which a face lies in it. Vertices are single precision."""

@@ -4,9 +4,9 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.mesh.planes import MeshPlanes, mix
 

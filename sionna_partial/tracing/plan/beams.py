@@ -13,10 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.planar import span_in_strip
+from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 
 TOLERANCE_M = 1e-4

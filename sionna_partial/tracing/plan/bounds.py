@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
+from sionna_partial.process import njit
 from sionna_partial.tracing.slab import reflection_coefficients
 
 LEVELS = 96

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sionna_partial.cores import in_order
+from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.candidates import Candidates, Wedges

@@ -9,4 +9,9 @@ for value in card.values():
     if isinstance(value, str) and len(value) == 64:
         text = text.replace(value, hashlib.sha256(path.read_bytes()).hexdigest())
 path.with_suffix(".json").write_text(text)
-must_refuse(lambda: sp.Predictor.load(path))
+try:
+    sp.Predictor.load(path)
+except sp.SionnaPartialError as error:
+    assert "not finite" in str(error), error
+else:
+    raise Wrong("loaded")

@@ -1,0 +1,154 @@
+"""What a process owes others: it ends when it is told to, leaves nothing behind, and compiles where it may write."""
+
+import contextlib
+import fcntl
+import hashlib
+import os
+import secrets
+import shutil
+import signal
+import socket
+import stat
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that end the command line."""
+
+GRACE_S = 1.0
+"""Time that native code has to return before the process ends without it [s]."""
+
+_cleanups: list[Callable[[], object]] = []
+
+
+@contextmanager
+def cleaned_up(cleanup: Callable[[], object]) -> Iterator[None]:
+    """Call `cleanup` in the end, also where a signal ends the process before."""
+    _cleanups.append(cleanup)
+    try:
+        yield
+    finally:
+        cleanup()
+        with suppress(ValueError):
+            _cleanups.remove(cleanup)
+
+
+def end_process(code: int) -> None:
+    """Clean up, and end without unwinding: native code that is interrupted would abort."""
+    while _cleanups:  # first what stops other threads, which may add some
+        with suppress(Exception):
+            _cleanups.pop(0)()
+    os._exit(code)
+
+
+def end_at_signals() -> None:
+    """Let signals end this process, even while native code runs; those that are ignored stay so."""
+
+    def end(number: int, _: object = None) -> None:
+        with suppress(OSError):
+            os.write(2, b"\x1b[?25h\ninterrupted\n" if os.isatty(2) else b"interrupted\n")  # with the cursor
+        end_process(128 + number)
+
+    def watch() -> None:
+        number = os.read(reader, 1)[0]
+        time.sleep(GRACE_S)
+        end(number)
+
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    for number in ENDING:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, end)
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def signals_held() -> Iterator[None]:
+    """Hold signals back: an interrupted import of a native library, or move of files, stays half done."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[tuple[int, Any]] = []
+    handlers = {number: signal.getsignal(number) for number in ENDING}
+    held = {number: handler for number, handler in handlers.items() if callable(handler)}
+    for number in held:
+        signal.signal(number, lambda *call: came.append(call))
+    try:
+        yield
+    finally:
+        for number, handler in held.items():
+            signal.signal(number, handler)
+        for first, frame in came[:1]:
+            held[signal.Signals(first)](first, frame)
+
+
+@contextmanager
+def own_folder(parent: Path, prefix: str) -> Iterator[Path]:
+    """Make a folder in `parent`, and remove it in the end, as well as new parents that stay empty.
+
+    Those that processes of this machine have left there are removed, too: each is locked while its process lives.
+    """
+    mine = prefix + hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+    made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
+    new, folder = (parent / f"{start}{secrets.token_hex(8)}" for start in (".new-sionna_partial_", mine))
+
+    def remove() -> None:
+        for each in (new, folder):
+            shutil.rmtree(each, ignore_errors=True)
+        for each in made:
+            with suppress(OSError):
+                each.rmdir()
+
+    with cleaned_up(remove), contextlib.ExitStack() as lock:
+        new.mkdir(0o700, parents=True)
+        lock.enter_context(_locked(new))
+        new.rename(folder)
+        for other in parent.glob(f"{mine}*"):
+            with suppress(OSError), _locked(other, must=True):
+                shutil.rmtree(other, ignore_errors=True)
+        yield folder
+
+
+@contextmanager
+def _locked(folder: Path, *, must: bool = False) -> Iterator[None]:
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        with contextlib.nullcontext() if must else suppress(OSError):  # some file systems have no locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return numba's decorator; code is cached where that can be, at last in a temporary folder."""
+    from numba import config
+    from numba import njit as compiled
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        try:
+            return compiled(**options)(function)
+        except RuntimeError:  # neither the package nor the home folder can be written
+            config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = _private_folder()
+        with suppress(RuntimeError):
+            return compiled(**options)(function)
+        return compiled(**(options | {"cache": False}))(function)
+
+    return decorate
+
+
+def _private_folder() -> str:
+    """Return a folder that nobody else can write to, as cached code is run; "" if there is none."""
+    with suppress(OSError):
+        folder = Path(tempfile.gettempdir()) / f"sionna-partial-numba-{os.getuid()}"
+        folder.mkdir(0o700, exist_ok=True)
+        status = folder.lstat()
+        if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
+            return str(folder)
+    return ""

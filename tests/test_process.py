@@ -1,0 +1,117 @@
+"""What a process owes others: signals, forks, leftovers of dead processes, caches."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sionna_partial import llvm
+from sionna_partial.errors import BackendError
+from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.process import njit, own_folder, signals_held
+
+COMMAND = "import sys; sys.argv = ['sionna-partial', *sys.argv[1:]]; from sionna_partial.cli import main; "
+
+
+def python(code: str, *arguments: object, **options: object) -> "subprocess.Popen[str]":
+    words = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.Popen(words, text=True, stderr=subprocess.PIPE, **options)  # type: ignore[call-overload,no-any-return]
+
+
+class TestSignals:
+    @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+    def test_the_command_line_ends_at_once_and_leaves_nothing(self, tmp_path: Path, number: signal.Signals) -> None:
+        code = COMMAND + (
+            "from sionna_partial.process import own_folder, end_at_signals; from pathlib import Path; import time\n"
+            "end_at_signals()\n"
+            "with own_folder(Path(sys.argv[1]) / 'new', 'x'):\n    Path(sys.argv[1], 'ready').touch(); time.sleep(60)"
+        )
+        process = python(code, tmp_path)
+        while not (tmp_path / "ready").exists():
+            time.sleep(0.02)
+        process.send_signal(number)
+        _, errors = process.communicate(timeout=3.0)
+        assert (process.returncode, errors) == (128 + number, "interrupted\n")
+        assert [path.name for path in tmp_path.iterdir()] == ["ready"]
+
+    def test_held_signals_come_later(self) -> None:
+        done = False
+        with pytest.raises(KeyboardInterrupt), signals_held():  # noqa: PT012
+            os.kill(os.getpid(), signal.SIGINT)
+            done = True
+        assert done
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
+    code = "import sys, time; from pathlib import Path; from sionna_partial.process import own_folder\n"
+    code += "with own_folder(Path(sys.argv[1]), 'left_'):\n    print(flush=True); time.sleep(60)"
+    process = python(code, tmp_path, stdout=subprocess.PIPE)
+    assert process.stdout
+    process.stdout.readline()
+    (tmp_path / "left_other").mkdir()
+    with own_folder(tmp_path, "left_"):
+        assert len(list(tmp_path.iterdir())) == 3
+    process.kill()
+    process.communicate()
+    with own_folder(tmp_path, "left_") as mine:
+        assert {path.name for path in tmp_path.iterdir()} == {mine.name, "left_other"}
+    assert [path.name for path in tmp_path.iterdir()] == ["left_other"]
+
+
+def refusal(_: object = None) -> str:
+    try:
+        llvm.load_llvm()
+    except BackendError as error:
+        return str(error)
+    return "accepted"
+
+
+def test_a_fork_of_a_process_that_has_started_the_libraries_is_refused() -> None:
+    llvm.load_llvm()
+    context = multiprocessing.get_context("fork")
+    reader, writer = context.Pipe()
+    child = context.Process(target=lambda: writer.send(refusal()))
+    child.start()
+    assert reader.poll(30.0)
+    assert "multiprocessing.get_context('spawn')" in reader.recv()
+    child.join()
+
+
+def test_a_deleted_working_directory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert refusal() == "the working directory was deleted: change to one that is there (cd)."
+
+
+def test_another_backend_of_keras_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    keras = import_keras()
+    keras.config.set_image_data_format("channels_first")
+    try:
+        with pytest.raises(BackendError, match="image_data_format = 'channels_first' is not supported: call keras"):
+            import_keras()
+    finally:
+        keras.config.set_image_data_format("channels_last")
+    monkeypatch.setenv("KERAS_BACKEND", "jax")
+    with pytest.raises(BackendError, match="the backend of Keras is 'jax': set KERAS_BACKEND=tensorflow"):
+        import_keras()
+
+
+def test_compiled_code_is_cached_where_that_can_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from numba import config
+
+    monkeypatch.setattr(config, "CACHE_DIR", "")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    code = compile("def half(x):\n    return x / 2", "/proc/nowhere/half.py", "exec")
+    names: dict[str, object] = {}
+    exec(code, names)
+    assert njit(cache=True)(names["half"])(3.0) == 1.5
+    assert not config.CACHE_DIR or Path(config.CACHE_DIR).parent == tmp_path
