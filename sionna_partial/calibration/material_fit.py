@@ -191,11 +191,11 @@ class Posterior:
         shown = np.minimum(loss_db, TYPICAL_LOSS_DB)
         return self.values[:, int(np.argmin(((shown - self.weight @ shown) ** 2).sum(axis=1)))]
 
-    def interval(self, values: NDArray[np.float64]) -> tuple[float, float]:
-        """Central 95 % of values (K,)."""
+    def interval(self, values: NDArray[np.float64], fraction: float = 0.95) -> tuple[float, float]:
+        """Central fraction of values (K,)."""
         order = np.argsort(values, kind="stable")
         rank = np.cumsum(self.weight[order]) - 0.5 * self.weight[order]
-        low, high = np.interp((0.025, 0.975), rank, values[order])
+        low, high = np.interp((0.5 - 0.5 * fraction, 0.5 + 0.5 * fraction), rank, values[order])
         return float(low), float(high)
 
 
