@@ -1,4 +1,4 @@
-"""Output that is written whole or not at all, and by one run at a time."""
+"""Files: input of bounded size; output that is written whole or not at all, and by one run at a time."""
 
 import errno
 import fcntl
@@ -6,6 +6,7 @@ import os
 import secrets
 import shutil
 import socket
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -34,6 +35,45 @@ _REMEDIES = {
 }
 
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+
+
+def open_regular(
+    path: str | os.PathLike[str],
+    field: str,
+    error: type[SionnaPartialError],
+    most: int,
+    remedy: str = "give a smaller file.",
+) -> IO[bytes]:
+    """Open a regular file of at most `most` bytes; pipes and devices, which need not end, raise an `error`."""
+    try:
+        stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except (OSError, ValueError) as cause:
+        reason = getattr(cause, "strerror", None) or cause
+        raise error(f"{field} = '{path}' cannot be read ({reason}): check the path.") from cause
+    status, reason = os.fstat(stream.fileno()), ""
+    if not stat.S_ISREG(status.st_mode):
+        reason = "is a pipe or a device: give a file."
+    elif status.st_size > most:
+        reason = f"has more than {most:,} bytes: {remedy}"
+    if reason:
+        stream.close()
+        raise error(f"{field} = '{path}' {reason}")
+    return stream
+
+
+def read_bytes(
+    path: str | os.PathLike[str],
+    field: str,
+    error: type[SionnaPartialError],
+    most: int,
+    remedy: str = "give a smaller file.",
+) -> bytes:
+    """Return the content of a regular file of at most `most` bytes, or raise an `error` that names `field`."""
+    with open_regular(path, field, error, most, remedy) as stream:
+        try:
+            return stream.read(os.fstat(stream.fileno()).st_size + 1)
+        except OSError as cause:
+            raise error(f"{field} = '{path}' cannot be read ({cause.strerror}): check the disk.") from cause
 
 
 def output_path(path: object) -> Path:

@@ -1,4 +1,4 @@
-"""Output is written whole or not at all."""
+"""Input is a regular file of bounded size; output is written whole or not at all."""
 
 import errno
 import fcntl
@@ -18,6 +18,7 @@ from sionna_partial.files import (
     atomic_path,
     atomic_write,
     locked_folder,
+    read_bytes,
     require_writable,
     temporary_folder,
 )
@@ -28,6 +29,28 @@ def tree(folder: Path) -> dict[str, bytes | None]:
     return {
         str(entry.relative_to(folder)): entry.read_bytes() if entry.is_file() else None for entry in folder.rglob("*")
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("pipe", "is a pipe or a device: give a file"),
+        ("/dev/zero", "is a pipe or a device: give a file"),
+        ("large", "has more than 3 bytes: give a smaller file"),
+        (".", "cannot be read (Is a directory): check the path"),
+        ("nowhere", "cannot be read (No such file or directory): check the path"),
+        ("a\0b", "cannot be read (embedded null byte): check the path"),
+        ("/proc/self/mem", "cannot be read (Input/output error): check the disk"),
+    ],
+)
+def test_only_small_regular_files_are_read(tmp_path: Path, name: str, message: str) -> None:
+    (tmp_path / "small").write_bytes(b"abc")
+    (tmp_path / "large").write_bytes(b"abcd")
+    os.mkfifo(tmp_path / "pipe")
+    assert read_bytes(tmp_path / "small", "map", MapError, 3) == b"abc"
+    with pytest.raises(MapError, match=re.escape(message)) as caught:
+        read_bytes(tmp_path / name, "map", MapError, 3)
+    assert str(caught.value).startswith("map = '")
 
 
 def test_write_bytes_and_text(tmp_path: Path) -> None:
