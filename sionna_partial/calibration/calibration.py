@@ -31,7 +31,7 @@ from sionna_partial.checks import require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 from sionna_partial.tracing.trace import Progress, checked_settings
@@ -209,12 +209,13 @@ def calibrate_materials(
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
     require_places(partial, measured, settings.frequency_hz)
+    links, link, variance = merged(measured)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))
     report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
-    paths = building.paths(measured, settings, scene_settings, report)
-    used, left_out = usable_links(partial, paths, measured)
-    target = MaterialTarget(paths.of_links(used), measured.gain_db[used])
+    paths = building.paths(links, settings, scene_settings, report)
+    used, left_out = usable_links(partial, paths, links, np.bincount(link))
+    target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used])
     begin = tuple(building.start.values())
     fit = _fit(target, begin, settings.frequency_hz, report)
     report(1.0, "done")
@@ -223,7 +224,7 @@ def calibrate_materials(
         for (permittivity, conductivity_s_m), each in zip(fit.point.values.T, begin, strict=True)
     )
     gains_db = [
-        np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(measured)), GAIN_FLOOR_DB)
+        np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(links)), GAIN_FLOOR_DB)[link]
         for each in (fit.steps[0], fit.point)
     ]
     doubts = _undetermined(begin, fit)
@@ -239,7 +240,7 @@ def calibrate_materials(
         undetermined=tuple(doubts),
         loss=np.minimum.accumulate([each.loss for each in fit.steps]) / used.sum(),
         noise_db=fit.point.errors.noise_db,
-        used=used,
+        used=used[link],
         left_out=left_out,
         gain_db=measured.gain_db,
         gain_before_db=gains_db[0],
