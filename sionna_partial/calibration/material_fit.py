@@ -353,7 +353,10 @@ def search(
         fractions = plane.fractions(cells)
         heavy = fractions > HEAVY_FRACTION
         wide, high = (cells[2] > max(fringe / FINEST_FRINGE_CELLS, 0.002)) | heavy, (cells[3] > 0.2) | heavy
-        split = (fractions > SPLIT_FRACTION) & (wide | high)
+        matters = fractions > SPLIT_FRACTION
+        wide_neighbour, high_neighbour = _coarser_neighbours(cells, matters)
+        wide, high = (wide & matters) | wide_neighbour, (high & matters) | high_neighbour
+        split = wide | high
         if not split.any():
             break
         kinds = ((wide & high, (2, 2)), (wide & ~high, (3, 1)), (~wide & high, (1, 2)))
@@ -366,6 +369,14 @@ def search(
     kept = order[: int(np.searchsorted(np.cumsum(fraction[order]), 0.999)) + 1]
     posterior = Posterior(cells[0, kept] ** 2, np.exp(cells[1, kept]), fraction[kept] / fraction[kept].sum())
     return plane.best(cells, fringe, FEW_FRINGES), posterior
+
+
+def _coarser_neighbours(cells: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find which cells (K,) touch a chosen one and are wider, and which are higher: a ridge may go on in them."""
+    distance = np.abs(cells[:2, :, None] - cells[:2, None, chosen])
+    own, other = cells[2:, :, None], cells[2:, None, chosen]
+    near = (distance < 0.51 * (own + other)).all(axis=0)
+    return np.any(near & (own > 1.5 * other), axis=-1)
 
 
 def _divided(cells: NDArray[np.float64], index_parts: int, log_parts: int) -> NDArray[np.float64]:
