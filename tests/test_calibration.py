@@ -111,6 +111,14 @@ class TestHiddenMaterial:
 
 
 class TestSameAnswer:
+    def test_for_identical_repetitions(self, result: sp.MaterialCalibration) -> None:
+        """Gains that repeat exactly are no news: their errors are those of the links."""
+        repeated = calibrate({name: np.repeat(values, 3, axis=0) for name, values in measured().items()})
+        assert repeated.permittivity == pytest.approx(result.permittivity)
+        assert repeated.permittivity_std == pytest.approx(result.permittivity_std, rel=1e-3)
+        np.testing.assert_allclose(repeated.gain_after_db, np.repeat(result.gain_after_db, 3), atol=1e-3)
+        assert repeated.used.sum() == 3 * result.used.sum()
+
     def test_from_a_poor_start(self, result: sp.MaterialCalibration) -> None:
         poor = calibrate(measured(), start=sp.Material(30.0, 20.0, THIN_M))
         assert poor.loss[0] > result.loss[0]
@@ -131,14 +139,23 @@ class TestWhatCannotBeDetermined:
         )
         assert found.conductivity_std > 0.2
 
-    def test_line_of_sight_says_nothing(self) -> None:
-        """In an open field with no floor in reach of the trace, nothing reflects."""
-        field = sp.PartialMap(np.zeros((50, 80), dtype=np.uint8), 0.1)
+    @pytest.mark.parametrize(
+        ("cell", "message"),
+        [
+            (
+                sp.CellState.FREE,
+                "the 20 usable links of measurements have no reflection that shows a material: ",
+            ),
+            (sp.CellState.UNKNOWN, "the map has no walls, floor or ceiling that shows a material: measure links that"),
+        ],
+    )
+    def test_nothing_reflects(self, cell: int, message: str) -> None:
+        field = sp.PartialMap(np.full((50, 80), cell, dtype=np.uint8), 0.1)
         tx, rx = places(20)
-        gain_db = sp.trace_links(field, TX, rx, settings=sp.TraceSettings(max_depth=0)).gain_db
-        measurements = {"tx": tx, "rx": rx, "gain_db": gain_db[np.arange(20) % 2, np.arange(20)]}
-        found = sp.calibrate_materials(field, measurements, start=START, settings=sp.TraceSettings(max_depth=0))
-        assert found.undetermined == ("permittivity", "conductivity")
+        with pytest.raises(MeasurementError, match=message):
+            sp.calibrate_materials(
+                field, {"tx": tx, "rx": rx, "gain_db": np.full(20, -70.0)}, settings=sp.TraceSettings(max_depth=0)
+            )
 
 
 class TestPartialMap:

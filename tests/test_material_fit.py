@@ -145,6 +145,20 @@ class TestSearch:
         assert low - 0.02 <= permittivity <= high + 0.02
         assert posterior.weight.sum() == pytest.approx(1.0)
 
+    def test_posterior_is_that_of_a_fine_grid(self) -> None:
+        """A slab of little loss has a narrow, inclined ridge, which cells must follow."""
+        target = fake_target(3.9, 0.02, noise_db=3.0)
+        _, posterior = search(target, point(target, 3.0, 0.1), 0, THICKNESS_M, FREQUENCY_HZ, quiet)
+        logs = np.log([np.sqrt(posterior.permittivity), posterior.conductivity_s_m])
+        centre = logs @ posterior.weight
+        spread = np.sqrt(((logs - centre[:, None]) ** 2) @ posterior.weight)
+        grid = centre[:, None] + spread[:, None] * np.reshape(np.meshgrid(*[np.linspace(-6.0, 6.0, 41)] * 2), (2, -1))
+        loss = np.array([point(target, *np.exp([2.0 * row[0], row[1]])).loss for row in grid.T])
+        weight = np.exp(loss.min() - loss) / np.exp(loss.min() - loss).sum()
+        fine = grid @ weight
+        np.testing.assert_allclose((centre - fine) / spread, 0.0, atol=0.1)
+        np.testing.assert_allclose(spread, np.sqrt((grid - fine[:, None]) ** 2 @ weight), rtol=0.15)
+
     def test_opaque_slab_hides_its_conductivity(self) -> None:
         target = fake_target(5.24, 0.8, noise_db=3.0)
         _, posterior = search(target, point(target, 3.0, 0.1), 0, 0.1, FREQUENCY_HZ, quiet)

@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sionna_partial.errors import MeasurementError
-from sionna_partial.measurements.measurements import Measurements, measurements_of
+from sionna_partial.measurements.measurements import Measurements, measurements_of, merged
 
 TX = np.array([[1.0, 2.0, 1.5], [1.0, 2.0, 1.5], [3.0, 4.0, 2.0]])
 RX = np.array([[2.0, 2.0, 1.5], [4.0, 1.0, 1.5], [5.0, 5.0, 1.0]])
@@ -76,6 +76,11 @@ class TestForms:
         found = measurements_of(path)
         assert (found.tx.tolist(), found.rx.tolist(), found.gain_db.tolist()) == ([[3, 4, 1.5]], [[1, 2, 1.5]], [-80])
 
+    @pytest.mark.parametrize("end", ["\r", "\r\n"])
+    def test_line_ends_of_other_systems(self, tmp_path: Path, end: str) -> None:
+        (tmp_path / "old.csv").write_bytes(f"{HEADER}\n{rows(FLAT)}\n".replace("\n", end).encode())
+        np.testing.assert_array_equal(measurements_of(tmp_path / "old.csv").gain_db, GAIN_DB)
+
     def test_one_transmitter_stands_for_all(self) -> None:
         found = measurements_of({**FIELDS, "tx": TX[0]})
         np.testing.assert_array_equal(found.tx, [TX[0]] * 3)
@@ -85,6 +90,29 @@ class TestForms:
         found = measurements_of({**FIELDS, "gain_db": gain_db})
         gain_db[0] = -1.0
         assert found.gain_db[0] == GAIN_DB[0]
+
+
+class TestMerged:
+    def test_repetitions_are_averaged(self) -> None:
+        rows = np.array([2, 0, 1, 0, 2, 2])
+        moved = RX[rows] + np.linspace(-0.002, 0.002, 6)[:, None]
+        noise_db = np.array([0.0, 1.0, 0.0, -1.0, 3.0, -3.0])
+        links, link, variance = merged(Measurements(TX[rows], moved, GAIN_DB[rows] + noise_db))
+        assert link.tolist() == [0, 1, 2, 1, 0, 0]
+        np.testing.assert_array_equal(links.rx, moved[[0, 1, 2]])
+        np.testing.assert_allclose(links.gain_db, GAIN_DB[[2, 0, 1]])
+        np.testing.assert_allclose(variance, (1.0 + 1.0 + 9.0 + 9.0) / (3 + 10) / np.array([3, 2, 1]))
+
+    def test_without_repetitions_all_stays(self) -> None:
+        links, link, variance = merged(Measurements(TX, RX, GAIN_DB))
+        np.testing.assert_array_equal(links.gain_db, GAIN_DB)
+        assert (link.tolist(), variance.tolist()) == ([0, 1, 2], [0.0, 0.0, 0.0])
+
+    def test_too_many_links(self) -> None:
+        rx = np.column_stack([np.arange(6001) * 0.02, np.ones(6001), np.ones(6001)])
+        message = "measurements has 6,001 links that are not repetitions, more than 3,000: give one in 3, which"
+        with pytest.raises(MeasurementError, match=message):
+            merged(Measurements(TX[0], rx, np.full(6001, -80.0)))
 
 
 class TestMeasurements:
@@ -133,12 +161,30 @@ class TestWhatIsMissing:
             measurements_of({**FLAT, "tx_y": TX[:2, 1]})
 
     def test_file(self, tmp_path: Path) -> None:
-        with pytest.raises(MeasurementError, match=r"gone\.csv' cannot be read \(.*No such file.*\): give a mapping"):
+        with pytest.raises(MeasurementError, match=r"gone\.csv' cannot be read \(No such file.*\): check the path"):
             measurements_of(tmp_path / "gone.csv")
 
     @pytest.mark.parametrize("text", ["", "tx_x,tx_y\n1,2\n"])
     def test_columns_of_a_file(self, tmp_path: Path, text: str) -> None:
         with pytest.raises(MeasurementError, match=r"is missing .*with the columns tx_x, tx_y, tx_z, rx_x"):
+            measurements_of(csv_file(tmp_path, text))
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", "' has 2 columns gain_db: keep one of them."),
+            (
+                f"{HEADER}\n1,2,1.5,3,4,1.5,-7",
+                "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be cut",
+            ),
+            (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
+            ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
+            (f'{HEADER}\n"1,5",2,1.5,3,4,1.5,-70\n', "line 2: tx_x = '1,5' is not a number: write decimal points."),
+            (f"{HEADER}\n{'1' * 200_000},2\n", ", line 2 cannot be read (field larger than field limit"),
+        ],
+    )
+    def test_csv_that_would_be_misread(self, tmp_path: Path, text: str, message: str) -> None:
+        with pytest.raises(MeasurementError, match=re.escape(message)):
             measurements_of(csv_file(tmp_path, text))
 
     @pytest.mark.parametrize(("line", "shown"), [("1,2,1.5,3,4,1.5,loud", "'loud'"), ("1,2,1.5,3,4,1.5", "''")])

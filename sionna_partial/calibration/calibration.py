@@ -31,7 +31,7 @@ from sionna_partial.checks import require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 from sionna_partial.tracing.trace import Progress, checked_settings
@@ -156,15 +156,18 @@ def calibrate_materials(
 ) -> MaterialCalibration:
     """Find the permittivity and the conductivity of walls, floor and ceiling from measured path gains.
 
-    Paths are traced once. The power of a link is the sum of the powers of its paths, which Sionna RT evaluates for any
-    material. Measured gains differ from it by noise, by paths that the map does not show, and by obstacles; the prior
-    of the material is wide (see `calibration.material_fit`). The whole plane of permittivity and conductivity is
-    searched, so that the result does not depend on the start; then Newton's method follows the derivatives from Dr.Jit
-    to the likeliest material. The result is the material whose reflection losses are nearest to their posterior mean:
-    where the measurements determine little, the likeliest material would follow the noise. The thickness is fixed.
+    Paths are traced once, from the side with fewer ends: where diffraction dominates, the side matters (median 2.4
+    dB), as Sionna RT's diffraction is not reciprocal. The power of a link is the sum of the powers of its paths, which
+    Sionna RT evaluates for any material. Measured gains differ from it by noise, by paths that the map does not show,
+    and by obstacles; the prior of the material is wide (see `calibration.material_fit`). The whole plane of
+    permittivity and conductivity is searched, so that the result does not depend on the start; then Newton's method
+    follows the derivatives from Dr.Jit to the likeliest material. The result is the material whose reflection losses
+    are nearest to their posterior mean: where the measurements determine little, the likeliest material would follow
+    the noise. The thickness is fixed.
 
-    Links of a partial map are used where the line of sight, or half of the power without one, runs through observed
-    space. Outages contain no information on the material.
+    Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged; their scatter shows how much of
+    the noise averages out. Links of a partial map are used where the line of sight, or half of the power without one,
+    runs through observed space. Outages contain no information on the material.
 
     Parameters
     ----------
@@ -189,7 +192,8 @@ def calibrate_materials(
     Raises
     ------
     MeasurementError
-        For measurements that are damaged, or of which too few are usable on this map.
+        For measurements that are damaged, of which too few are usable on this map, in which nothing is reflected, or
+        of more than 3,000 links.
     PositionError
         For a position outside the map, inside a wall, or not between floor and ceiling.
     SettingsError
@@ -209,12 +213,13 @@ def calibrate_materials(
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
     require_places(partial, measured, settings.frequency_hz)
+    links, link, variance = merged(measured)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))
     report = progress or (lambda fraction, message: None)
     report(0.0, "building the scene")
-    paths = building.paths(measured, settings, scene_settings, report)
-    used, left_out = usable_links(partial, paths, measured)
-    target = MaterialTarget(paths.of_links(used), measured.gain_db[used])
+    paths = building.paths(links, settings, scene_settings, report)
+    used, left_out = usable_links(partial, paths, links, np.bincount(link))
+    target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used])
     begin = tuple(building.start.values())
     fit = _fit(target, begin, settings.frequency_hz, report)
     report(1.0, "done")
@@ -223,7 +228,7 @@ def calibrate_materials(
         for (permittivity, conductivity_s_m), each in zip(fit.point.values.T, begin, strict=True)
     )
     gains_db = [
-        np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(measured)), GAIN_FLOOR_DB)
+        np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(links)), GAIN_FLOOR_DB)[link]
         for each in (fit.steps[0], fit.point)
     ]
     doubts = _undetermined(begin, fit)
@@ -239,7 +244,7 @@ def calibrate_materials(
         undetermined=tuple(doubts),
         loss=np.minimum.accumulate([each.loss for each in fit.steps]) / used.sum(),
         noise_db=fit.point.errors.noise_db,
-        used=used,
+        used=used[link],
         left_out=left_out,
         gain_db=measured.gain_db,
         gain_before_db=gains_db[0],

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr
 
 from sionna_partial.calibration.measured_building import LinkPaths, link_gains_db
@@ -57,8 +57,9 @@ INDEX_RANGE, FINE_INDEX = (1.01, 6.0), 3.4
 FRINGE_CELLS, FINEST_FRINGE_CELLS, COARSE_CELLS = 14, 60, 29
 """Number of cells to a fringe when the search begins, and where it ends; number of cells where there are no fringes."""
 
-SPLIT_FRACTION, MOST_CELLS = 0.004, 600
-"""Fraction of the posterior above which a cell is divided, and number of cells that division may add."""
+SPLIT_FRACTION, HEAVY_FRACTION, MOST_CELLS = 0.004, 0.02, 600
+"""Fraction of the posterior above which a cell is divided until it is small, and above which it is divided in any case;
+number of cells that division may add."""
 
 MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
 """Number of fringes whose minima are searched, of steps to each, and of fringes that are followed to the end."""
@@ -89,16 +90,17 @@ class GainErrors:
         return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
 
     def curve(
-        self, error_db: NDArray[np.float64], is_direct: NDArray[np.bool_]
+        self, error_db: NDArray[np.float64], is_direct: NDArray[np.bool_], variance: ArrayLike = 0.0
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Negative logarithm of the density of errors (N,) [dB], and its first and second derivatives."""
-        parts = _log_densities(error_db, self.noise_db)
+        noise_db = np.sqrt(self.noise_db**2 + np.asarray(variance))
+        parts = _log_densities(error_db, noise_db)
         fraction = _fractions(is_direct, self.missed_fraction, self.blocked_fraction)
         top = np.max(parts, axis=0)
         normal, missed, blocked = fraction * np.exp(parts - top)
         bell = np.exp(parts[0] - top)
         density = normal + missed + blocked
-        variance = self.noise_db**2
+        variance = noise_db**2
         missed_slope = (fraction[1] * bell - missed) / MISSED_DB
         blocked_slope = (fraction[2] * bell - blocked) / BLOCKED_DB
         slope = -error_db / variance * normal + missed_slope - blocked_slope
@@ -117,9 +119,15 @@ _ALL_ERRORS = [
 _PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
 
 
-def fit_errors(error_db: NDArray[np.float64], is_direct: NDArray[np.bool_]) -> tuple[GainErrors, float]:
-    """Return the likeliest density of errors (N,) [dB], and its negative log likelihood with the prior's."""
-    kinds = np.exp(np.maximum(_log_densities(error_db, NOISES_DB[:, None]), -700.0))
+def fit_errors(
+    error_db: NDArray[np.float64], is_direct: NDArray[np.bool_], variance: ArrayLike = 0.0
+) -> tuple[GainErrors, float]:
+    """Return the likeliest density of errors (N,) [dB], and its negative log likelihood with the prior's.
+
+    The variance [dB^2] is that of each mean of repeated measurements, beyond the noise of the link.
+    """
+    noise_db = np.sqrt(NOISES_DB[:, None] ** 2 + np.asarray(variance))
+    kinds = np.exp(np.maximum(_log_densities(error_db, noise_db), -700.0))
     losses = [
         -np.log(np.maximum(np.einsum("ksn,kn->sn", kinds, _fractions(is_direct, *fractions)), 1e-300)).sum(axis=1)
         for fractions in itertools.product(MISSED_FRACTIONS, BLOCKED_FRACTIONS)
@@ -191,25 +199,26 @@ class Posterior:
         shown = np.minimum(loss_db, TYPICAL_LOSS_DB)
         return self.values[:, int(np.argmin(((shown - self.weight @ shown) ** 2).sum(axis=1)))]
 
-    def interval(self, values: NDArray[np.float64]) -> tuple[float, float]:
-        """Central 95 % of values (K,)."""
+    def interval(self, values: NDArray[np.float64], fraction: float = 0.95) -> tuple[float, float]:
+        """Central fraction of values (K,)."""
         order = np.argsort(values, kind="stable")
         rank = np.cumsum(self.weight[order]) - 0.5 * self.weight[order]
-        low, high = np.interp((0.025, 0.975), rank, values[order])
+        low, high = np.interp((0.5 - 0.5 * fraction, 0.5 + 0.5 * fraction), rank, values[order])
         return float(low), float(high)
 
 
 class MaterialTarget:
     """How well materials explain measured gains (N,) [dB] of links that all have a path."""
 
-    def __init__(self, paths: LinkPaths, gain_db: NDArray[np.float64]) -> None:
-        self.paths, self.gain_db = paths, gain_db
+    def __init__(self, paths: LinkPaths, gain_db: NDArray[np.float64], variance: NDArray[np.float64]) -> None:
+        self.paths, self.gain_db, self.variance = paths, gain_db, variance
         self.is_direct = np.zeros(len(gain_db), dtype=bool)
         self.is_direct[paths.link[paths.is_direct]] = True
 
     def at(self, values: NDArray[np.float64]) -> Point:
         """Evaluate materials (2, M)."""
-        errors, loss = fit_errors(self.gain_db - self.gains_db(self.paths.power(*values)), self.is_direct)
+        error_db = self.gain_db - self.gains_db(self.paths.power(*values))
+        errors, loss = fit_errors(error_db, self.is_direct, self.variance)
         return Point(values, loss + prior_loss(values), errors)
 
     def gains_db(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -225,7 +234,7 @@ class MaterialTarget:
         scale = (point.values - LOSSLESS).ravel()
         jacobian: NDArray[np.float64] = sums * (10.0 / math.log(10.0) * scale / total[:, None])
         error_db = self.gain_db - np.maximum(10.0 * np.log10(total), LOWEST_GAIN_DB)
-        _, first, second = point.errors.curve(error_db, self.is_direct)
+        _, first, second = point.errors.curve(error_db, self.is_direct, self.variance)
         information = np.broadcast_to(PRIOR_SPREAD**-2.0, point.values.shape)
         prior_slope = (information * (point.logs - np.log(PRIOR_MEDIAN))).ravel()
         curvature: NDArray[np.float64] = (jacobian.T * np.maximum(second, 0.0)) @ jacobian
@@ -341,8 +350,13 @@ def search(
     cells = np.hstack([cells[:, ~held], plane.evaluate(_divided(cells[:, held], 9, 2), 0.7, 0.8)])
     added = 0
     while added < MOST_CELLS:
-        wide, high = cells[2] > max(fringe / FINEST_FRINGE_CELLS, 0.002), cells[3] > 0.2
-        split = (plane.fractions(cells) > SPLIT_FRACTION) & (wide | high)
+        fractions = plane.fractions(cells)
+        heavy = fractions > HEAVY_FRACTION
+        wide, high = (cells[2] > max(fringe / FINEST_FRINGE_CELLS, 0.002)) | heavy, (cells[3] > 0.2) | heavy
+        matters = fractions > SPLIT_FRACTION
+        wide_neighbour, high_neighbour = _coarser_neighbours(cells, matters)
+        wide, high = (wide & matters) | wide_neighbour, (high & matters) | high_neighbour
+        split = wide | high
         if not split.any():
             break
         kinds = ((wide & high, (2, 2)), (wide & ~high, (3, 1)), (~wide & high, (1, 2)))
@@ -355,6 +369,14 @@ def search(
     kept = order[: int(np.searchsorted(np.cumsum(fraction[order]), 0.999)) + 1]
     posterior = Posterior(cells[0, kept] ** 2, np.exp(cells[1, kept]), fraction[kept] / fraction[kept].sum())
     return plane.best(cells, fringe, FEW_FRINGES), posterior
+
+
+def _coarser_neighbours(cells: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find which cells (K,) touch a chosen one and are wider, and which are higher: a ridge may go on in them."""
+    distance = np.abs(cells[:2, :, None] - cells[:2, None, chosen])
+    own, other = cells[2:, :, None], cells[2:, None, chosen]
+    near = (distance < 0.51 * (own + other)).all(axis=0)
+    return np.any(near & (own > 1.5 * other), axis=-1)
 
 
 def _divided(cells: NDArray[np.float64], index_parts: int, log_parts: int) -> NDArray[np.float64]:

@@ -31,6 +31,8 @@ EXTREMES = tuple((permittivity, loss) for permittivity in (1.2, 3.0, 8.0, 30.0) 
 OUTAGE = "measured outage"
 """Reason why a link is left out before anything is traced."""
 
+_NO_MATERIAL = "that shows a material: measure links that walls reflect, and trace with max_depth of 1 or more."
+
 _REFLECTING = Material(10.0, 1.0)
 """Material with which paths are found: everything reflects well, so that none is missing for a better material."""
 
@@ -111,11 +113,13 @@ class MeasuredBuilding:
     ) -> "LinkPaths":
         """Find the paths of the measured links, and keep those that may have some power.
 
-        Paths are reciprocal: they are traced from those ends of which there are fewer.
+        They are traced from those ends of which there are fewer. Sionna RT's diffraction is not reciprocal.
         """
         reflecting = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in self.start.values()]
         settings = replace(settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
         scene = PathScene(self.with_materials(reflecting), settings=settings, scene_settings=scene_settings)
+        if not set(self.start) <= set(scene.materials):
+            raise MeasurementError(f"the map has no walls, floor or ceiling {_NO_MATERIAL}")
         tx, rx = measured.tx, measured.rx
         if len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0)):
             tx, rx = rx, tx
@@ -177,9 +181,9 @@ def custom_material(material: Material, frequency_hz: float) -> Material:
 
 
 def usable_links(
-    partial: PartialMap, paths: LinkPaths, measured: Measurements
+    partial: PartialMap, paths: LinkPaths, measured: Measurements, repeats: NDArray[np.int64]
 ) -> tuple[NDArray[np.bool_], dict[str, int]]:
-    """Find the links (N,) from which materials can be determined, and count the others by reason."""
+    """Find the links (N,) from which materials can be determined, and count the other measurements by reason."""
     count, ones = len(measured), np.ones(len(paths.columns))
     power = paths.power(4.0 * ones, 0.1 * ones)
     found = paths.paths
@@ -196,9 +200,11 @@ def usable_links(
     }
     used, left_out = np.ones(count, dtype=bool), {}
     for reason, matters in reasons.items():
-        left_out[reason] = int((used & matters).sum())
+        left_out[reason] = int(repeats[used & matters].sum())
         used &= ~matters
     _require_enough(used, left_out)
+    if paths.is_direct[used[paths.link]].all():
+        raise MeasurementError(f"the {int(used.sum())} usable links of measurements have no reflection {_NO_MATERIAL}")
     return used, left_out
 
 

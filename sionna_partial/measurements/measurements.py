@@ -1,6 +1,8 @@
 """Measured path gains at known positions: mappings, data frames and CSV files -> Measurements."""
 
 import csv
+import io
+import math
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,12 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.errors import MeasurementError
+from sionna_partial.files import read_bytes
 
 LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
 """Gains beyond these are in another unit, or of another sign [dB]. Noise may take an outage below the floor."""
 
 OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 """Up to this gain, noise included, a link counts as an outage [dB]."""
+
+MOST_BYTES = 50_000_000
+"""Largest CSV that is read."""
+
+SAME_M, MOST_LINKS = 0.01, 3000
+"""Links whose ends lie in the same cubes are one link [m]; number of links that are evaluated at most."""
+
+FEW_REPEATS = 10
+"""Number of repetitions from which their scatter is believed rather than not."""
 
 _CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db")
 _GIVE = (
@@ -99,6 +111,33 @@ def measurements_of(source: Any) -> Measurements:
     return Measurements(_ends(source, "tx"), _ends(source, "rx"), gain_db)
 
 
+def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
+    """Merge repeated measurements: L links with mean gains, the link of each measurement (N,), and variances (L,).
+
+    The variance [dB^2] of a link's mean is what the scatter of repetitions makes of it; without repetitions it is 0,
+    and all noise counts as that of the link.
+    """
+    cubes = np.round(np.hstack([measured.tx, measured.rx]) / SAME_M)
+    keys = np.column_stack([cubes, measured.is_outage])
+    _, first, link, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    if len(first) > MOST_LINKS:
+        raise MeasurementError(
+            f"measurements has {len(first):,} links that are not repetitions, more than {MOST_LINKS:,}: give one "
+            f"in {math.ceil(len(first) / MOST_LINKS)}, which determines the material as well."
+        )
+    order = np.argsort(first)
+    link, first, count = np.argsort(order)[link.ravel()], first[order], count[order]
+    mean_db = np.bincount(link, weights=measured.gain_db) / count
+    heard = ~measured.is_outage
+    square = ((measured.gain_db - mean_db[link])[heard] ** 2).sum()
+    repeats = heard.sum() - heard[first].sum()
+    return (
+        Measurements(measured.tx[first], measured.rx[first], mean_db),
+        link,
+        square / (repeats + FEW_REPEATS) / count,
+    )
+
+
 def _field(source: Any, name: str) -> Any:
     """Return a field by its name, None where there is none."""
     try:
@@ -125,22 +164,46 @@ def _ends(source: Any, name: str) -> Any:
 
 def _read_csv(path: Path) -> dict[str, list[float]]:
     """Read those columns of a CSV that measurements have."""
+    given = f"measurements = '{path}'"
     try:
-        with path.open(newline="", encoding="utf-8-sig") as stream:
-            header, *rows = list(csv.reader(stream, skipinitialspace=True)) or [[]]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise MeasurementError(f"measurements = '{path}' cannot be read ({error}): {_GIVE}") from error
-    columns = {column: name.strip() for column, name in enumerate(header) if name.strip() in _CSV_COLUMNS}
-    found: dict[str, list[float]] = {name: [] for name in columns.values()}
-    for line, row in enumerate(rows, 2):
-        for column, name in columns.items() if row else ():
+        text = read_bytes(path, "measurements", MeasurementError, MOST_BYTES, "average links.").decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise MeasurementError(f"{given} cannot be read ({error}): {_GIVE}") from error
+    if text and text[-1] not in "\r\n":
+        last = text.splitlines()[-1][-40:]
+        raise MeasurementError(
+            f"{given} ends in {last!r}, without a line end: the file may be cut. Copy it again, or add a line end."
+        )
+    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    try:
+        return _columns(given, rows)
+    except csv.Error as error:
+        raise MeasurementError(f"{given}, line {rows.line_num} cannot be read ({error}): {_GIVE}") from error
+
+
+def _columns(given: str, rows: Any) -> dict[str, list[float]]:
+    header = [name.strip() for name in next(rows, [])]
+    commas = "separate columns by commas, and write decimal points."
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        raise MeasurementError(f"{given} has the header {header[0][:80]!r}: {commas}")
+    found: dict[str, list[float]] = {name: [] for name in header if name in _CSV_COLUMNS}
+    columns = [(column, name) for column, name in enumerate(header) if name in found]
+    if len(columns) > len(found):
+        twice = next(name for name in found if header.count(name) > 1)
+        raise MeasurementError(f"{given} has {header.count(twice)} columns {twice}: keep one of them.")
+    for row in rows:
+        if len(row) > len(header):
+            raise MeasurementError(
+                f"{given}, line {rows.line_num} has {len(row)} cells for {len(header)} columns: {commas}"
+            )
+        for column, name in columns if row else ():
             text = row[column] if column < len(row) else ""
             try:
                 found[name].append(float(text))
             except ValueError as error:
+                remedy = "write decimal points." if "," in text else "correct the line, or leave it out."
                 raise MeasurementError(
-                    f"measurements = '{path}', line {line}: {name} = {text!r} is not a number: correct the line, or "
-                    "leave it out."
+                    f"{given}, line {rows.line_num}: {name} = {text[:80]!r} is not a number: {remedy}"
                 ) from error
     return found
 
