@@ -1,6 +1,7 @@
 """What all tests share: every run draws the same examples, and a command line leaves its process as it was."""
 
 import logging
+import signal
 import warnings
 from collections.abc import Iterator
 
@@ -9,6 +10,9 @@ from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("repeatable")
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell has started the tests in the background
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture

@@ -86,7 +86,7 @@ def test_unusable_measurements_are_one_line(place: Path, tmp_path: Path) -> None
 
 def test_too_few_measurements(place: Path, tmp_path: Path) -> None:
     few = (place / "measured.csv").read_text().splitlines()[:6]
-    (tmp_path / "few.csv").write_text("\n".join(few))
+    (tmp_path / "few.csv").write_text("\n".join(few) + "\n")
     result = run(place / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "has 5 usable links of 5, fewer than 10" in result.output
