@@ -117,7 +117,8 @@ def train(
     ('make_home(7)',)
     """
     table, traces = open_links(dataset)
-    settings = settings_or_default("settings", settings or settings_for(traces), PredictorSettings)
+    settings = settings_for(traces) if settings is None else settings
+    settings = settings_or_default("settings", settings, PredictorSettings)
     remedy = "give PredictorSettings with the frequency and diffraction of the data set."
     require_like(traces, LinkTraces.of_settings(settings), "settings are for links", remedy)
     report = progress or no_progress

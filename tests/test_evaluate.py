@@ -201,6 +201,10 @@ class TestBaselinesFolder:
 
 
 class TestErrors:
+    def test_no_baselines(self, table):
+        with pytest.raises(PredictorError, match="baselines = 5 is not allowed: give Baselines, or None"):
+            evaluate(trained_on("home 0"), table, baselines=5)
+
     def test_trained_on_all_homes(self, table):
         names = [f"home {index}" for index in range(4)]
         message = (

@@ -201,6 +201,11 @@ class TestDataset:
         with pytest.raises(PredictorError, match=rf"home '{name}' is not in '.*': choose from 'b', 'a', 'c'\."):
             read_dataset(folder, [name])
 
+    @pytest.mark.parametrize("homes", ["b", 5, [1], np.full((2, 2), 7)])
+    def test_homes_that_are_no_names(self, folder: Path, homes: object) -> None:
+        with pytest.raises(PredictorError, match=r"homes = .* is not allowed: give names of homes, or None for all\."):
+            read_dataset(folder, homes)  # type: ignore[arg-type]
+
     def test_nothing_built(self, folder: Path) -> None:
         for name in ("a", "b", "c"):
             shard_path(folder, name).unlink()

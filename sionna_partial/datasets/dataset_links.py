@@ -1,6 +1,7 @@
 """Links of data sets, how they were traced, and the check that a predictor was trained on such links."""
 
 import math
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -75,7 +76,9 @@ def _folders(dataset: str | PathLike[str] | Sequence[str | PathLike[str]]) -> li
             "`sionna-partial dataset` wrote."
         )
     paths = [Path(each) for each in folders]
-    twice = [path for path, count in Counter(path.resolve() for path in paths).items() if count > 1]
+    twice = [
+        path for path, count in Counter(path.resolve() for path in paths if os.path.exists(path)).items() if count > 1
+    ]
     if twice:
         raise PredictorError(f"dataset has '{twice[0]}' twice, whose links would count twice: give it once.")
     return paths

@@ -15,6 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from sionna_partial.checks import shown
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, open_regular, read_bytes
@@ -165,7 +166,9 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
     """
     known = [home["name"] for home in read_index(folder)["homes"]]
     built = [name for name in known if shard_path(folder, name).is_file()]
-    wanted = built if homes is None else list(homes)
+    wanted = built if homes is None else list(homes) if isinstance(homes, Iterable) else [homes]
+    if isinstance(homes, str) or not all(isinstance(name, str) for name in wanted):
+        raise PredictorError(f"homes = {shown(homes)} is not allowed: give names of homes, or None for all.")
     missing = [name for name in wanted if name not in built]
     if missing:
         raise PredictorError(f"home {missing[0]!r} is not in '{folder}': choose from {_few(built)}.")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.checks import Progress
+from sionna_partial.checks import Progress, shown
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.datasets.link_table import LinkTable, stage_name
 from sionna_partial.errors import PredictorError
@@ -151,6 +151,10 @@ def evaluate(
         traces, LinkTraces.of_settings(model.settings), f"predictor '{model.name}' was trained on links", remedy
     )
     homes = _homes(model, links)
+    if not isinstance(baselines, Baselines | None):
+        raise PredictorError(
+            f"baselines = {shown(baselines)} is not allowed: give Baselines, or None for those shipped."
+        )
     fitted, paper = baselines or Baselines.load(_baselines_folder(model)), _paper(model)
     rows, differences, calibrations = [], [], {}
     parts = list(itertools.product(homes, map(float, np.unique(links.stage))))

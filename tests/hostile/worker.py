@@ -29,7 +29,7 @@ def command(*arguments: object) -> str:
             app([*map(str, arguments)], prog_name="sionna-partial")
         except SystemExit as end:
             code = end.code
-    errors = [line for line in err.getvalue().splitlines() if line.startswith("error: ")]
+    errors = [line for line in err.getvalue().splitlines() if line.lower().startswith("error: ")]
     if code == 2 and (len(errors) == 1 or "Usage:" in err.getvalue()):
         raise Refused(errors[0] if errors else err.getvalue())
     assert code in (0, None), f"exit code {code}: {err.getvalue()[-500:]}"
