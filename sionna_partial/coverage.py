@@ -15,7 +15,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import real_array, require, require_choice, require_number, settings_or_default
+from sionna_partial.checks import (
+    Progress,
+    no_progress,
+    real_array,
+    require,
+    require_choice,
+    require_number,
+    settings_or_default,
+)
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
@@ -25,7 +33,7 @@ from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import SHORTEST_M, Progress, Tracer, checked_settings, nearest_m
+from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, nearest_m
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
@@ -191,7 +199,7 @@ def predict_map(
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
     needs_context = model is not None and model.settings.networks != "paper"
-    report = progress or (lambda fraction, message: None)
+    report = progress or no_progress
     report(0.0, "building the scene")
     columns: list[dict[str, NDArray[Any]]] = []
     with temporary_folder() as work:

@@ -27,14 +27,14 @@ from sionna_partial.calibration.measured_building import (
     start_materials,
     usable_links,
 )
-from sionna_partial.checks import require
+from sionna_partial.checks import Progress, no_progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
-from sionna_partial.tracing.trace import Progress, checked_settings
+from sionna_partial.tracing.trace import checked_settings
 
 DETERMINED = 0.35
 """Largest standard deviation of a parameter that counts as determined, as a fraction of that of the prior."""
@@ -215,7 +215,7 @@ def calibrate_materials(
     require_places(partial, measured, settings.frequency_hz)
     links, link, variance = merged(measured)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))
-    report = progress or (lambda fraction, message: None)
+    report = progress or no_progress
     report(0.0, "building the scene")
     paths = building.paths(links, settings, scene_settings, report)
     used, left_out = usable_links(partial, paths, links, np.bincount(link))

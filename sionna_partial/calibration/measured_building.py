@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.checks import Progress
 from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
@@ -14,7 +15,7 @@ from sionna_partial.scene.scene import itu_constants
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathScene, PathSet
 from sionna_partial.tracing.slab import VACUUM_F_M
-from sionna_partial.tracing.trace import Progress, nearest_m
+from sionna_partial.tracing.trace import nearest_m
 
 FEWEST_LINKS = 10
 """Smallest number of usable measured links."""

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import require
+from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.maps.map_files import load_map
@@ -63,7 +63,6 @@ from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
-from sionna_partial.tracing.trace import Progress
 
 WINDOW_STEP_M = CELLS_M[0] / 2
 """How far from the transmitter further windows are drawn [m]."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from sionna_partial.checks import require, require_number, settings_or_default
+from sionna_partial.checks import Progress, no_progress, require, require_number, settings_or_default
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -20,7 +20,7 @@ from sionna_partial.placement.area import PlacementArea, placement_area
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import Progress, Tracer, checked_settings, nearest_m
+from sionna_partial.tracing.trace import Tracer, checked_settings, nearest_m
 
 RECEIVERS = 120
 """Largest number of receivers during the search; the final positions are compared at all receivers."""
@@ -177,7 +177,7 @@ def place_transmitter(
         height_m = getattr(settings, name)
         require_number(name, height_m, low_m, high_m, open_low=True)
         require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
-    report = progress or (lambda fraction, message: None)
+    report = progress or no_progress
     report(0.0, "building the scene")
     model = None
     if not partial.is_complete:
@@ -265,7 +265,7 @@ class _Objective:
             return values
         features = []
         for tx_m, kept in zip(positions_m, far, strict=True):
-            paths = self.tracer.paths(tx_m, area.rx_m[kept], lambda fraction, message: None)
+            paths = self.tracer.paths(tx_m, area.rx_m[kept], no_progress)
             phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
             features.append(phi)
         phi = LinkFeatures.concatenate(features)

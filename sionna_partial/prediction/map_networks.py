@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
@@ -26,7 +27,6 @@ from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, fre
 from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.tracing.trace import Progress
 
 if TYPE_CHECKING:
     import keras

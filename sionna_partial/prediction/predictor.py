@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states, require_each
@@ -33,7 +34,6 @@ from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read
 from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.tracing.trace import Progress
 
 if TYPE_CHECKING:
     import keras

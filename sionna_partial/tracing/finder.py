@@ -1,7 +1,7 @@
 """The scene of a map on disk, and where its paths come from: exact candidates of a floor plan, rays in a mesh."""
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.checks import Progress
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_mesh_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -20,9 +21,6 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
 from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
-
-Progress = Callable[[float, str], None]
-"""Called with the fraction of the work done, in [0, 1], and what is being done."""
 
 CANDIDATES_AT_ONCE = 100_000
 """Number of candidates that Sionna RT verifies together, which bounds the memory."""

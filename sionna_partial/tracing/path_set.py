@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import require
+from sionna_partial.checks import Progress, no_progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
@@ -25,7 +25,7 @@ from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
 from sionna_partial.tracing.finder import part_of, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
-from sionna_partial.tracing.trace import Progress, TracedLinks, checked_positions, checked_settings, link_summary
+from sionna_partial.tracing.trace import TracedLinks, checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
 """Number of paths that are evaluated together, which bounds the memory."""
@@ -102,7 +102,7 @@ class PathScene:
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], as `trace_links` does."""
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.settings.frequency_hz)
         tx_m, rx_m = tx_m.reshape(np.shape(tx)).copy(), rx_m.copy()
-        report = progress or (lambda fraction, message: None)
+        report = progress or no_progress
         found = PathSet.joined([PathSet(self, tx_m, rx_m, []), *self.blocks(tx_m, rx_m, report)])
         report(1.0, "traced")
         return found
@@ -467,7 +467,7 @@ def gain_gradients(
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = path_settings(partial, settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, one_transmitter(tx), rx, settings.frequency_hz)
-    report = progress or (lambda fraction, message: None)
+    report = progress or no_progress
     report(0.0, "building the scene")
     power, is_direct, slopes = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool), np.zeros((7, len(rx_m)))
     if len(rx_m):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sionna_partial.checks import settings_or_default
+from sionna_partial.checks import Progress, no_progress, settings_or_default
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
@@ -25,7 +25,6 @@ from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Wedges
 from sionna_partial.tracing.engine import SceneSolver, engine_fault, load_sionna, open_scene
 from sionna_partial.tracing.finder import MeshScene, PlanScene, part_of, write_scene_of
-from sionna_partial.tracing.finder import Progress as Progress
 from sionna_partial.tracing.paths import (
     DIFFRACTION,
     DIFFUSE,
@@ -180,7 +179,7 @@ def trace_links(
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
-    shape, report = np.shape(tx), progress or (lambda fraction, message: None)
+    shape, report = np.shape(tx), progress or no_progress
     report(0.0, "building the scene")
     with temporary_folder() as work:
         tracer = Tracer(partial, work, settings, scene_settings)
@@ -212,7 +211,7 @@ def trace_each(
     ends = [checked_positions(partial, *each, settings.frequency_hz) for each in zip(tx, rx, strict=True)]
     with temporary_folder() as folder:
         tracer = Tracer(partial, folder, settings, scene_settings)
-        return [tracer.links(tx_m[0], rx_m, lambda fraction, message: None) for tx_m, rx_m in ends]
+        return [tracer.links(tx_m[0], rx_m, no_progress) for tx_m, rx_m in ends]
 
 
 @dataclass(frozen=True)
@@ -282,7 +281,7 @@ class Tracer:
         if len(tx_m) * len(rx_m) <= RECEIVERS_OF_PLAN:
             return
         some = rx_m[np.linspace(0, len(rx_m) - 1, min(len(rx_m), SAMPLE)).astype(int)]
-        found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, lambda fraction, message: None))
+        found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, no_progress))
         count = round(found / len(some) * len(rx_m) * len(tx_m))
         size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth)) / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)
