@@ -57,6 +57,9 @@ SHUT_AREA = 0.2
 LEAF_FRACTION = 0.2
 """Fraction of the doors whose leaf stands open into a room."""
 
+CLOSED_DOORS = (0.3, 0.5, 0.2)
+"""Fractions of the office floors with no door closed, with some, and with all, as on plans of real floors."""
+
 _MARGIN_M = 0.3
 _JAMB_M = 0.05
 _CORRIDOR_SHAPE = 25
@@ -88,6 +91,7 @@ class _Style:
     swelling: float = 0.0
     raggedness: float = 0.0
     layout: LayoutMaker | None = None
+    closed_doors: bool = False
 
     @property
     def walk(self) -> float:
@@ -99,7 +103,11 @@ STYLES: dict[str, _Style] = {
     "apartment": _Style(0.5, (30, 150), (7, 20), 0.35, 0.5, (0.9, 1.4), 0.4, 0.15, 0.1),
     "house": _Style(0.35, (40, 230), (9, 26), 0.35, 0.5, (1.0, 1.6), 0.4, 0.25, 0.15),
     "office": _Style(0.15, (90, 600), (10, 40), 0.1, 0.95, (1.4, 2.4), 0.2, 0.15, 0.5, 0.1, clutter=0.5),
-    "floor": _Style(0, (600, 6000), (30, 100), 0, 1, _AISLE_M, 0.1, 0.05, 0, 0.1, 0.1, 0.03, layout=floor_layout),
+    "floor": _Style(
+        *(0, (600, 6000), (30, 100), 0, 1, _AISLE_M, 0.1, 0.05, 0, 0.1, 0.1, 0.03),
+        layout=floor_layout,
+        closed_doors=True,
+    ),
     "hall": _Style(0, (200, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.02, layout=hall_layout),
     "warehouse": _Style(0, (300, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.01, layout=warehouse_layout),
 }
@@ -121,14 +129,15 @@ def make_home(
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
     locked_rooms : bool
-        Whether the home may have free rooms that are out of reach; the rest of it does not depend on it.
+        Whether the home may have free rooms that are out of reach, behind closed doors too; the rest of it does not
+        depend on it.
 
     Returns
     -------
     PartialMap
         Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture.
-        Nothing is missing (`is_complete`). Free cells are connected, but for those of locked rooms, which some homes
-        have. Walls meet at least at the corners of cells.
+        Nothing is missing (`is_complete`). Free cells are connected, but for those of locked rooms and of rooms behind
+        closed doors, which some homes and many office floors have. Walls meet at least at the corners of cells.
 
     Raises
     ------
@@ -156,7 +165,8 @@ def make_home(
     thickness_m = rng.choice([0.0, rng.uniform(0.13, 0.25)], p=[0.85, 0.15])
     corners = bool(thickness_m > 0 or rng.random() < 0.3)
     angle_deg = float(rng.choice([0.0, rng.uniform(-45, 45)], p=[0.3, 0.7]))
-    shapes = {name: affinity.rotate(getattr(plan, name), angle_deg, (0, 0)) for name in ("free", "shut", "lines")}
+    names = ("free", "shut", "lines", "doors")
+    shapes = {name: affinity.rotate(getattr(plan, name), angle_deg, (0, 0)) for name in names}
     plan = replace(plan, **shapes)
     state = _cells(plan, resolution_m, max(1, round(thickness_m / resolution_m)), corners)
     return PartialMap(state, resolution_m, interior_cells=int((state == CellState.FREE).sum()))
@@ -164,11 +174,12 @@ def make_home(
 
 @dataclass(frozen=True)
 class _Plan:
-    """One home: free area, locked rooms, wall lines; how far walls and furniture swell [m], how unevenly, and waves."""
+    """One home: free area, locked rooms, wall lines, closed doors; how far walls and furniture swell [m], and waves."""
 
     free: Polygon
     shut: shapely.GeometryCollection
     lines: shapely.Geometry
+    doors: shapely.Geometry
     swelling_m: float
     raggedness: float
     waves: NDArray[np.float64]
@@ -208,7 +219,14 @@ def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
     free = next(part for part in parts_of(free) if part.intersects(walked[0]))
     waves = rng.normal(size=(_WAVES, 3))
     shut = _shut(locked if locked_rooms and rng.spawn(1)[0].random() < SHUT_FRACTION else [], free, style.wall)
-    return _Plan(free, shut, lines, style.swelling, style.raggedness, waves)
+    closed = _closed(rng.spawn(1)[0], openings) if locked_rooms and style.closed_doors else []
+    return _Plan(free, shut, lines, shapely.MultiLineString(closed), style.swelling, style.raggedness, waves)
+
+
+def _closed(rng: Rng, openings: list[LineString]) -> list[LineString]:
+    """Doors that are closed."""
+    share = rng.choice([0.0, rng.random(), 1.0], p=CLOSED_DOORS)
+    return [opening for opening in openings if opening.length <= DOOR_M[1] and rng.random() < share]
 
 
 def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.GeometryCollection:
@@ -366,6 +384,8 @@ def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> 
     lines = rasterize([plan.lines], all_touched=True, **grid).astype(bool)
     inside = rasterize([plan.free], **grid).astype(bool) & ~lines
     inside = _largest(inside & ~_swollen(inside, resolution_m, plan))
+    if not plan.doors.is_empty:
+        inside &= ~rasterize([plan.doors], all_touched=True, **grid).astype(bool)
     around = ndimage.generate_binary_structure(2, 1 + corners)
     if not plan.shut.is_empty:
         walls = rasterize([room.boundary for room in plan.shut.geoms], all_touched=True, **grid).astype(bool)
