@@ -58,6 +58,7 @@ def measure(home: sp.PartialMap, seed: int) -> dict[str, float]:
         "free area [m2]": area_m2,
         "perimeter per free area [1/m]": perimeter_cells(free) * cell_m / area_m2,
         "mean room [m2]": area_m2 / room_count(free, cell_m),
+        "largest part without a closed door": float(np.bincount(ndimage.label(free)[0][free]).max() / free.sum()),
         "mean clearance [m]": float(clearance_m[free].mean()),
         "free area farther than 2 m from walls": float((clearance_m[free] > 2.0).mean()),
         "mean length of a link [m]": float(distance_m.mean()),

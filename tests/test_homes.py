@@ -202,6 +202,17 @@ def test_floors_have_corridors_and_rooms_and_halls_have_few():
     assert rooms["floor"] > 3 * max(rooms["hall"], rooms["warehouse"])
 
 
+def test_doors_of_some_floors_are_closed_and_those_of_none_without_locked_rooms():
+    """Of twelve floors some are one part within reach, and some are many parts, each enclosed by walls."""
+    floors = [make_home(seed, "floor") for seed in range(12)]
+    parts = [ndimage.label(floor.state == CellState.FREE)[1] for floor in floors]
+    assert sum(count < 6 for count in parts) >= 3
+    assert sum(count > 10 for count in parts) >= 3
+    assert all(floor.is_complete for floor in floors)
+    within = make_home(int(np.argmax(parts)), "floor", locked_rooms=False)
+    assert ndimage.label(within.state == CellState.FREE)[1] == 1
+
+
 def test_warehouses_have_aisles_between_shelves():
     """Shelves and legs are islands in the free area."""
     islands = [ndimage.label(make_home(seed, "warehouse").state != CellState.FREE)[1] - 1 for seed in range(6)]
