@@ -18,6 +18,7 @@ from sionna_partial.maps.map_files import map_from_occupancy as map_from_occupan
 from sionna_partial.maps.map_files import map_from_slam as map_from_slam
 from sionna_partial.maps.map_files import save_map as save_map
 from sionna_partial.maps.partial_map import PartialMap as PartialMap
+from sionna_partial.measurements.measurements import Measurements as Measurements
 from sionna_partial.placement.placement import TransmitterPlacement as TransmitterPlacement
 from sionna_partial.placement.placement import place_transmitter as place_transmitter
 from sionna_partial.plots.coverage_plot import plot_coverage as plot_coverage

@@ -25,10 +25,12 @@ from sionna_partial.checks import (
     settings_or_default,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
-from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
+from sionna_partial.errors import MeasurementError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.measurements import Measurements, measurements_of
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
@@ -58,6 +60,15 @@ are predicted together [bytes]; `benchmarks/scale.py` measures it."""
 
 _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 """Number of receivers that are predicted together."""
+
+SAME_TX_M = 0.5
+"""Distance within which measured links are of the same transmitter [m]."""
+
+LARGE_OFFSET_DB = 15.0
+"""Offset of measurements from which on they are no path gains, but powers [dB]."""
+
+MOST_MEASUREMENTS = 20_000
+"""Number of measurements that are held against predictions."""
 
 _LEAST_DEPTH = 2
 """Interactions from which on a trace is like those of the training."""
@@ -121,6 +132,7 @@ def predict_map(
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
+    measurements: Any = None,
     receivers: str = RECEIVERS[0],
     memory_gb: float = MEMORY_GB,
     progress: Progress | None = None,
@@ -153,6 +165,9 @@ def predict_map(
         used.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
+    measurements : Measurements, mapping, data frame or path, optional
+        Gains that were measured of this transmitter (see `Measurements`): what they tell of the links to other
+        receivers is taken into account (`Assimilation`). Others in it, farther than 0.5 m from `tx`, are not used.
     receivers : {"indoor", "anywhere"}
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float
@@ -171,6 +186,8 @@ def predict_map(
         If the map cannot be read.
     MemoryLimitError
         If the job cannot be done within `memory_gb`; nothing was begun.
+    MeasurementError
+        If the measurements cannot be read, or none is usable.
     PositionError
         For a transmitter outside the map or in a wall, or if no receiver can be anywhere.
     SettingsError
@@ -198,21 +215,23 @@ def predict_map(
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    needs_context = model is not None and model.settings.networks != "paper"
     report = progress or no_progress
     report(0.0, "building the scene")
+    measured = None if measurements is None else _measured(partial, tx_m, measurements, trace_settings.frequency_hz)
     columns: list[dict[str, NDArray[Any]]] = []
     with temporary_folder() as work:
-        tracer = Tracer(partial, work, trace_settings, scene_settings)
+        links = _Links(partial, tx_m, Tracer(partial, work, trace_settings, scene_settings), model)
+        told = None if measured is None else _assimilated(links, measured, at_once)
         for start in range(0, len(grid.rx_m), at_once):
 
             def within(fraction: float, message: str, start: int = start) -> None:
                 report(min(0.99, (start + fraction * at_once) / len(grid.rx_m)), message)
 
             rx_m = grid.rx_m[start : start + at_once]
-            paths = tracer.paths(tx_m, rx_m, within)
-            phi = features_of_paths(partial, tx_m, rx_m, paths, context=needs_context)
-            columns.append(_columns(phi, model, partial.state_at(rx_m), anywhere=receivers == "anywhere"))
+            phi, prediction = links.predict(rx_m, within)
+            if told is not None:
+                prediction = told.update(rx_m, prediction)
+            columns.append(_columns(phi, prediction, links.p_indoor(rx_m, phi), anywhere=receivers == "anywhere"))
     variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
@@ -222,6 +241,12 @@ def predict_map(
         "spacing_m": float(spacing_m),
         "receivers": receivers,
     }
+    if measured is not None and told is not None:
+        attributes |= {
+            "measured_links": len(measured),
+            "measured_noise_db": told.noise_db,
+            "measured_offset_db": told.offset_db,
+        }
     report(1.0, "done")
     return _label(grid, variables, attributes)
 
@@ -327,12 +352,77 @@ def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: fl
     return int(min(max(most, _FEWEST_RECEIVERS), _MOST_RECEIVERS))
 
 
+@dataclass(frozen=True)
+class _Links:
+    """Links of one transmitter, traced on the known part of the map and predicted."""
+
+    partial: PartialMap
+    tx_m: Floats
+    tracer: Tracer
+    model: Predictor | None
+
+    def predict(self, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
+        """Trace and predict the links to receivers (N, 3) [m] that are indoors; without a model the trace predicts."""
+        context = self.model is not None and self.model.settings.networks != "paper"
+        phi = features_of_paths(
+            self.partial, self.tx_m, rx_m, self.tracer.paths(self.tx_m, rx_m, report), context=context
+        )
+        return phi, LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+
+    def p_indoor(self, rx_m: Floats, phi: LinkFeatures) -> Floats:
+        """Probability that each receiver (N,) is indoors."""
+        free = self.partial.state_at(rx_m) == CellState.FREE
+        return np.where(free, 1.0, 0.0 if self.model is None else self.model.predict_indoor(phi))
+
+
+def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz: float) -> Measurements:
+    """Read the measurements of this transmitter whose receivers are at places where links can be predicted."""
+    measured = measurements_of(measurements)
+    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
+    if not (apart_m <= SAME_TX_M).any():
+        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
+        raise MeasurementError(
+            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
+            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
+            "the transmitter that is predicted, in the frame of the map."
+        )
+    measured = measured.take(apart_m <= SAME_TX_M)
+    if len(measured) > MOST_MEASUREMENTS:
+        raise MeasurementError(
+            f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
+            "those that are near each other."
+        )
+    rx_m = partial.require_positions("rx of the measurements", measured.rx)
+    usable = clear_of_walls(partial, rx_m) & (np.linalg.norm(rx_m - tx_m, axis=1) >= nearest_m(frequency_hz))
+    if not usable.any():
+        raise MeasurementError(
+            f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
+            "frame is that of the map."
+        )
+    if not usable.all():
+        message = "%d of %d measurements are not used: their receivers are in walls or at the transmitter"
+        _log.warning(message, int((~usable).sum()), len(usable))
+    return measured.take(usable)
+
+
+def _assimilated(links: _Links, measured: Measurements, at_once: int) -> Assimilation:
+    """Hold what was measured against what is predicted there."""
+    blocks = [slice(start, start + at_once) for start in range(0, len(measured), at_once)]
+    predictions = [links.predict(measured.rx[block], no_progress)[1] for block in blocks]
+    told = Assimilation(links.partial, links.tx_m, measured, LinkPrediction.concatenate(predictions))
+    if abs(told.offset_db) > LARGE_OFFSET_DB:
+        _log.warning(
+            "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
+            abs(told.offset_db),
+            "above" if told.offset_db > 0 else "below",
+        )
+    return told
+
+
 def _columns(
-    phi: LinkFeatures, model: Predictor | None, cell_state: NDArray[np.uint8], *, anywhere: bool
+    phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Predict links to receivers in cells of these states: values (N,) of each variable that depends on them."""
-    prediction = LinkPrediction.of_trace(phi) if model is None else model.predict(phi)
-    p_indoor = np.where(cell_state == CellState.FREE, 1.0, 0.0 if model is None else model.predict_indoor(phi))
+    """Values (N,) of each variable that depends on the links."""
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
     columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {

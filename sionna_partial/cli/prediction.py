@@ -32,6 +32,9 @@ def predict(
     max_depth: opt.MaxDepth = 6,
     diffraction: opt.Diffraction = True,
     predictor: opt.PredictorName = "",
+    measurements: Annotated[
+        Path | None, typer.Option(help="CSV of gains measured of this transmitter.", show_default=False)
+    ] = None,
     receivers: Annotated[
         str, typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage.")
     ] = "indoor",
@@ -59,6 +62,7 @@ def predict(
             predictor=predictor or None,
             scene_settings=scene_settings,
             trace_settings=trace_settings,
+            measurements=measurements,
             receivers=receivers,
             memory_gb=memory,
             progress=lambda fraction, message: report(0.9 * fraction, message),

@@ -27,10 +27,14 @@ MOST_BYTES = 50_000_000
 SAME_M, MOST_LINKS = 0.01, 3000
 """Links whose ends lie in the same cubes are one link [m]; number of links that are evaluated at most."""
 
+HIGHEST_STD_DB = 30.0
+"""Largest standard deviation of a gain [dB]."""
+
 FEW_REPEATS = 10
 """Number of repetitions from which their scatter is believed rather than not."""
 
-_CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db")
+_CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
+_STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
 _GIVE = (
     "give a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV with the columns "
     f"{', '.join(_CSV_COLUMNS)}."
@@ -49,6 +53,10 @@ class Measurements:
         Receiver position of each link [m].
     gain_db : (N,) float64 array
         Omnidirectional path gain [dB], negative. -150 is an outage.
+    std_db : (N,) float64 array, optional
+        Standard deviation of each gain [dB], one number for all; estimated where it is needed and not given.
+    sensitivity_db : float
+        Of the receiver [dB]: gains at or below it are known to be no higher than that.
 
     Raises
     ------
@@ -59,6 +67,8 @@ class Measurements:
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
     gain_db: NDArray[np.float64]
+    std_db: NDArray[np.float64] | None = None
+    sensitivity_db: float = GAIN_FLOOR_DB
 
     def __post_init__(self) -> None:
         gain_db = _numbers("gain_db", self.gain_db)
@@ -70,10 +80,26 @@ class Measurements:
         _require(~high, "gain_db", gain_db, "path gains are negative; give minus the path loss.")
         _require(~low, "gain_db", gain_db, f"give dB, not below {LOWEST_DB:g}; an outage is {GAIN_FLOOR_DB:g}.")
         object.__setattr__(self, "gain_db", gain_db)
+        if self.std_db is not None:
+            std_db = _numbers("std_db", self.std_db)
+            if std_db.shape not in ((), gain_db.shape):
+                raise MeasurementError(f"std_db has shape {std_db.shape}: give one for all links, or one for each.")
+            _require((std_db > 0.0) & (std_db <= HIGHEST_STD_DB), "std_db", std_db, _STD_REMEDY)
+            object.__setattr__(self, "std_db", np.broadcast_to(std_db, gain_db.shape).copy())
+        sensitivity_db = _numbers("sensitivity_db", self.sensitivity_db)
+        if sensitivity_db.shape != () or not GAIN_FLOOR_DB <= sensitivity_db <= HIGHEST_DB:
+            remedy = f"give one path gain of {GAIN_FLOOR_DB:g} to {HIGHEST_DB:g} dB."
+            raise MeasurementError(f"sensitivity_db = {self.sensitivity_db!r} is not allowed: {remedy}")
+        object.__setattr__(self, "sensitivity_db", float(sensitivity_db))
 
     def __len__(self) -> int:
         """Return the number of links N."""
         return len(self.gain_db)
+
+    def take(self, index: NDArray[np.generic]) -> "Measurements":
+        """Return the links that an index array or a mask (N,) selects."""
+        std_db = None if self.std_db is None else self.std_db[index]
+        return Measurements(self.tx[index], self.rx[index], self.gain_db[index], std_db, self.sensitivity_db)
 
     @property
     def is_outage(self) -> NDArray[np.bool_]:
@@ -89,7 +115,7 @@ def measurements_of(source: Any) -> Measurements:
     source : Measurements, mapping, data frame, Dataset or path
         With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB]; cells of a data frame may hold x, y, z. Instead
         of `tx` there may be `tx_x`, `tx_y` and `tx_z` (N,), and likewise for `rx`. A CSV has these columns, with a
-        header; without `tx_z` or `rx_z`, heights are 1.5 m.
+        header; without `tx_z` or `rx_z`, heights are 1.5 m. `std_db` (N,) and `sensitivity_db` are optional.
 
     Returns
     -------
@@ -108,7 +134,14 @@ def measurements_of(source: Any) -> Measurements:
     gain_db = _field(source, "gain_db")
     if gain_db is None:
         raise MeasurementError(f"gain_db is missing from {given}: {_GIVE}")
-    return Measurements(_ends(source, "tx"), _ends(source, "rx"), gain_db)
+    sensitivity_db = _field(source, "sensitivity_db")
+    return Measurements(
+        _ends(source, "tx"),
+        _ends(source, "rx"),
+        gain_db,
+        _field(source, "std_db"),
+        GAIN_FLOOR_DB if sensitivity_db is None else sensitivity_db,
+    )
 
 
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:

@@ -107,6 +107,11 @@ class LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
 
+    @classmethod
+    def concatenate(cls, parts: Sequence["LinkPrediction"]) -> "LinkPrediction":
+        """Return the links of all `parts`, one part after the other."""
+        return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+
     def where(self, taken: Bools, other: "LinkPrediction") -> "LinkPrediction":
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
         columns = (column.name for column in fields(self))

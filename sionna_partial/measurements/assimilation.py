@@ -1,0 +1,268 @@
+"""Predictions that heed measurements: a Gaussian process on the residuals, correlated over the distance of a walk."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.special import log_ndtr
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.prediction.predictor import LinkPrediction
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+CELL_M = 0.3
+"""Smallest edge of the cells through which walks lead [m]."""
+
+UNKNOWN_COST = 3.0
+"""Length of a walk through unknown cells, in lengths of one through free cells."""
+
+REACH_M = {"unseen": 14.0, "seen": 0.8}
+"""Walk over which residuals stay correlated, by whether the transmitter is in a cell that was seen [m]."""
+
+SHARED_VARIANCE = 0.9
+"""Fraction of the variance of residuals that receivers side by side share."""
+
+TRACE_STD_DB = 3.0
+"""Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
+
+NOISES_DB, LIKELY_NOISE_DB = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0
+"""Standard deviations of measurements that are tried where none is given, and the likeliest before [dB]."""
+
+OFFSETS_DB = {1.0: 0.95, 40.0: 0.05}
+"""Standard deviations of the offset of measurements [dB], and how likely: of path gains, and of powers as received."""
+
+MOST_POINTS = 500
+"""Number of places with measurements from which on neighbours are averaged."""
+
+_SWEEPS, _DAMPING = 8, 0.5
+_REACHES = 5.0
+_LEAST_TOLD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class _Walks:
+    """Lengths of walks from P points to everywhere on a map: walls block them, unknown cells make them longer."""
+
+    partial: PartialMap
+    points_m: Floats
+    longest_m: float
+
+    def lengths_m(self, points_m: Floats) -> Floats:
+        """Lengths (P, N) of walks to other points (N, 3) [m], infinite beyond `longest_m`."""
+        straight_m = np.linalg.norm(self.points_m[:, None, :2] - points_m[:, :2], axis=-1)
+        return np.maximum(self._lengths_m[:, self._node_at(points_m)], straight_m)
+
+    @cached_property
+    def _step(self) -> int:
+        return max(1, round(CELL_M / self.partial.resolution_m))
+
+    @cached_property
+    def _blocks(self) -> NDArray[np.uint8]:
+        """States (ny, nx, k) of the cells of the map in each cell of walks."""
+        step = self._step
+        padding = [(0, -count % step) for count in self.partial.shape]
+        state = np.pad(self.partial.state, padding, constant_values=CellState.UNKNOWN)
+        ny, nx = (count // step for count in state.shape)
+        return state.reshape(ny, step, nx, step).swapaxes(1, 2).reshape(ny, nx, step * step)
+
+    @cached_property
+    def _open(self) -> Bools:
+        return (self._blocks != CellState.WALL).all(axis=-1)
+
+    @cached_property
+    def _nodes(self) -> NDArray[np.intp]:
+        """Node of each cell of walks, -1 in walls."""
+        nodes = np.full(self._open.shape, -1)
+        nodes[self._open] = np.arange(self._open.sum())
+        return nodes
+
+    @cached_property
+    def _graph(self) -> csr_array:
+        cost = 1.0 + (UNKNOWN_COST - 1.0) * (self._blocks == CellState.UNKNOWN).mean(axis=-1)
+        ends, weights, (ny, nx) = [], [], cost.shape
+        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            here = slice(0, ny - down), slice(max(0, -right), nx - max(0, right))
+            there = slice(down, ny), slice(max(0, right), nx + min(0, right))
+            corners = (here, there, (here[0], there[1]), (there[0], here[1]))
+            linked = np.logical_and.reduce([self._open[corner] for corner in corners])
+            ends.append([self._nodes[here][linked], self._nodes[there][linked]])
+            weights.append(math.hypot(down, right) * 0.5 * (cost[here] + cost[there])[linked])
+        lengths_m = np.concatenate(weights) * self._step * self.partial.resolution_m
+        return coo_array((lengths_m, np.concatenate(ends, axis=1)), shape=(int(self._open.sum()),) * 2).tocsr()
+
+    @cached_property
+    def _nearest(self) -> NDArray[np.intp]:
+        """Node of each cell of walks, in walls the nearest."""
+        rows, columns = ndimage.distance_transform_edt(~self._open, return_distances=False, return_indices=True)
+        return self._nodes[rows, columns]
+
+    @cached_property
+    def _lengths_m(self) -> NDArray[np.float32]:
+        nodes, index = np.unique(self._node_at(self.points_m), return_inverse=True)
+        lengths_m = dijkstra(self._graph, directed=False, indices=nodes, limit=self.longest_m)
+        return lengths_m.astype(np.float32)[index]
+
+    def _node_at(self, points_m: Floats) -> NDArray[np.intp]:
+        cells = (points_m[:, :2] - self.partial.origin_m) / (self._step * self.partial.resolution_m)
+        column, row = np.clip(np.floor(cells).astype(np.intp), 0, np.array(self._open.shape)[::-1] - 1).T
+        return self._nearest[row, column]
+
+
+class Assimilation:
+    """What measurements of one transmitter tell of the links to other receivers.
+
+    The residual of a link is what its gain is above the predicted mean, in predicted standard deviations. Residuals are
+    a Gaussian process, whose correlation falls off with the length of the walk between receivers. A gain at or below
+    the sensitivity is known to be at most that (expectation propagation; Rasmussen and Williams, Gaussian Processes for
+    Machine Learning, sections 3.6 and 3.9). Standard deviations of noise and of an offset that all measurements have in
+    common are those that make the measurements likeliest.
+
+    Parameters
+    ----------
+    partial : PartialMap
+    tx_m : (3,) array
+        The transmitter [m].
+    measured : Measurements
+        M links of this transmitter.
+    prior : LinkPrediction
+        Of these links, without the measurements.
+    """
+
+    noise_db: float
+    """Standard deviation of the measurements [dB]; the root mean square of those that were given."""
+
+    offset_db: float
+    """What the measurements have in common above the predicted gains [dB]."""
+
+    def __init__(self, partial: PartialMap, tx_m: Floats, measured: Measurements, prior: LinkPrediction) -> None:
+        rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
+        seen = partial.state_at(tx_m[None])[0] == CellState.FREE
+        self._reach_m = REACH_M["seen" if seen else "unseen"]
+        heard = gain_db > measured.sensitivity_db
+        first, place, count = _places(rx_m, heard)
+        heard = heard[first]
+
+        def averaged(values: Floats) -> Floats:
+            return np.bincount(place, weights=values) / count
+
+        scale_db = averaged(np.hypot(prior.gain_std_db, TRACE_STD_DB))
+        residual = averaged(np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db) / scale_db
+        self._walks = _Walks(partial, rx_m[first], _REACHES * self._reach_m)
+        shape = _positive(self._correlation(rx_m[first]), SHARED_VARIANCE)
+        given_db = None if std_db is None else np.sqrt(averaged(std_db**2) / count)
+        tries = [given_db] if given_db is not None else [noise / np.sqrt(count) for noise in NOISES_DB]
+        noise_db, offset_std_db = _likeliest(shape, residual, scale_db, heard, tries, is_given=given_db is not None)
+        self.noise_db = float(np.sqrt(np.mean(noise_db**2 * count)))
+        offset = offset_std_db**2 / np.outer(scale_db, scale_db)
+        self._weights, self._precision = _posterior(shape + offset, residual, heard, noise_db / scale_db)
+        self.offset_db = float(offset_std_db**2 * (self._weights / scale_db).sum())
+
+    def update(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
+        """Return what is predicted of the links to receivers (N, 3) [m] given the measurements, from what was before.
+
+        What the process says of a residual is as good as a measurement of the gain with a noise of its own: it weighs
+        the link states, and the distribution of the gain given each, by Bayes' rule.
+        """
+        across = self._correlation(rx_m)
+        told = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
+        touched = told > _LEAST_TOLD
+        told = np.where(touched, told, 1.0)
+        scale_db = np.hypot(prior.gain_std_db, TRACE_STD_DB)
+        gain_db = prior.gain_mean_db + scale_db * (self._weights @ across) / told
+        noise_db2 = scale_db**2 * (1.0 - told) / told
+        probabilities = np.stack([prior.p_outage, prior.p_los, prior.p_nlos])
+        means_db = np.stack([np.full(len(told), GAIN_FLOOR_DB), prior.gain_los_mean_db, prior.gain_nlos_mean_db])
+        stds_db = np.stack([np.zeros(len(told)), prior.gain_los_std_db, prior.gain_nlos_std_db])
+        variance = stds_db**2 + TRACE_STD_DB**2
+        total = variance + noise_db2
+        with np.errstate(divide="ignore"):
+            logs = np.log(probabilities) - 0.5 * np.log(total) - 0.5 * (gain_db - means_db) ** 2 / total
+        weights = np.exp(logs - logs.max(axis=0))
+        pull = np.where(np.arange(3)[:, None] == LinkState.OUTAGE, 0.0, variance / total)
+        means_db = np.maximum(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB)
+        stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, variance * (1.0 - pull)), 0.0))
+        return prior.where(touched, LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db))
+
+    def _correlation(self, rx_m: Floats) -> Floats:
+        """Correlation (M, N) of residuals at the measured places and at other receivers."""
+        return SHARED_VARIANCE * np.exp(-self._walks.lengths_m(rx_m) / self._reach_m)
+
+
+def _places(rx_m: Floats, heard: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """First measurement of each place, place of each measurement (M,), and number of measurements of each place.
+
+    Places are as small as leaves no more than `MOST_POINTS` of them.
+    """
+    edge_m = 0.01
+    while True:
+        keys = np.column_stack([np.floor(rx_m / edge_m), heard])
+        _, first, place, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
+        if len(first) <= MOST_POINTS:
+            return first, place.ravel(), count
+        edge_m *= 1.5
+
+
+def _positive(correlation: Floats, shared: float) -> Floats:
+    """Correlation (P, P) of the places among each other, made positive definite: walks are no Euclidean distances."""
+    matrix = 0.5 * (correlation + correlation.T)
+    matrix[np.diag_indices_from(matrix)] = 1.0
+    values, vectors = np.linalg.eigh(matrix)
+    return matrix if values[0] > 0.1 * (1 - shared) else (vectors * np.maximum(values, 0.1 * (1 - shared))) @ vectors.T
+
+
+def _likeliest(
+    shape: Floats, residual: Floats, scale_db: Floats, heard: Bools, tries: list[Floats], *, is_given: bool
+) -> tuple[Floats, float]:
+    """Noise (P,) and standard deviation of the offset that make the gains that were heard likeliest [dB]."""
+    shape, z, scale = shape[np.ix_(heard, heard)], residual[heard], scale_db[heard]
+
+    def log_evidence(noise_db: Floats, offset_db: float) -> float:
+        matrix = shape + np.diag((noise_db[heard] / scale) ** 2) + offset_db**2 / np.outer(scale, scale)
+        factor = cho_factor(matrix, lower=True)
+        log_prior = math.log(OFFSETS_DB[offset_db])
+        if not is_given:
+            log_prior -= 0.5 * (math.log(float(noise_db.max()) / LIKELY_NOISE_DB) / 0.6) ** 2
+        return float(log_prior - 0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
+
+    candidates = [(noise_db, offset_db) for noise_db in tries for offset_db in OFFSETS_DB]
+    return max(candidates, key=lambda each: log_evidence(*each))
+
+
+def _posterior(covariance: Floats, residual: Floats, heard: Bools, noise: Floats) -> tuple[Floats, Floats]:
+    """Weights (P,) and matrix (P, P) with which the process predicts; where nothing was heard, residuals are bounds."""
+    precision = np.where(heard, 1.0 / noise**2, 0.0)
+    shift = precision * residual
+    for _ in range(1 if heard.all() else _SWEEPS):
+        inverse = _inverse(covariance, precision)
+        variance = np.diag(covariance - covariance @ inverse @ covariance)
+        mean = covariance @ (shift - inverse @ (covariance @ shift))
+        cavity = 1.0 / np.maximum(1.0 / variance - precision, 1e-9)
+        cavity_mean = cavity * (mean / variance - shift)
+        spread = np.sqrt(cavity + noise**2)
+        x = (residual - cavity_mean) / spread
+        ratio = np.exp(-0.5 * (x**2 + math.log(2.0 * math.pi)) - log_ndtr(x))
+        tilted = np.maximum(cavity - cavity**2 * ratio * (x + ratio) / spread**2, 1e-6)
+        tilted_mean = cavity_mean - cavity * ratio / spread
+        bounded_precision = np.clip(1.0 / tilted - 1.0 / cavity, 0.0, 1e6)
+        bounded_shift = tilted_mean / tilted - cavity_mean / cavity
+        precision = np.where(heard, precision, (1 - _DAMPING) * precision + _DAMPING * bounded_precision)
+        shift = np.where(heard, shift, (1 - _DAMPING) * shift + _DAMPING * bounded_shift)
+    inverse = _inverse(covariance, precision)
+    return shift - inverse @ (covariance @ shift), inverse
+
+
+def _inverse(covariance: Floats, precision: Floats) -> Floats:
+    """(covariance + 1 / precision)^-1, precisions of 0 included."""
+    root = np.sqrt(precision)
+    factor = cho_factor(np.eye(len(root)) + root[:, None] * covariance * root, lower=True)
+    return root[:, None] * cho_solve(factor, np.diag(root))
