@@ -21,6 +21,15 @@ def looked_up(planes: MeshPlanes, plane: NDArray[np.int32], points: NDArray[np.f
 
 
 class TestGroupPlanes:
+    @pytest.mark.parametrize("turn", [None, TURN])
+    def test_box_has_six(self, turn: NDArray[np.float64] | None) -> None:
+        mesh = fine_box(turn)
+        planes = planes_of(mesh)
+        assert sorted(np.bincount(planes.plane)) == [32] * 6
+        corners = mesh.vertices[mesh.faces]
+        away = (corners * planes.normal[planes.plane][:, None]).sum(axis=2) - planes.offset_m[planes.plane][:, None]
+        np.testing.assert_allclose(away, 0.0, atol=1e-9)
+
     def test_sides_of_a_face_are_one_plane(self) -> None:
         corners = np.array([[0, 0, 0], [1, 0, 1], [0, 1, 2], [5, 5, 15]], float)
         assert len(group_planes(corners, np.array([[0, 1, 2], [2, 1, 0], [0, 3, 1]])).normal) == 1
@@ -39,10 +48,19 @@ class TestGroupPlanes:
         planes = planes_of(trimesh.Trimesh(mesh.vertices + noise, mesh.faces))
         assert len(planes.normal) > 0.98 * len(mesh.faces)
 
+    def test_balls_hold_the_faces(self) -> None:
+        mesh = fine_box(TURN)
+        planes = planes_of(mesh)
+        away = np.linalg.norm(mesh.vertices[mesh.faces] - planes.centre_m[planes.plane][:, None], axis=2)
+        assert (away <= planes.radius_m[planes.plane][:, None] + 1e-12).all()
+
     def test_faces_of_no_area_are_on_no_other_plane(self) -> None:
         corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [2, 0, 0]], float)
         planes = group_planes(corners, np.array([[0, 1, 3], [0, 1, 2], [1, 1, 1]]))
         assert np.bincount(planes.plane)[planes.plane[1]] == 1
+
+    def test_no_faces(self) -> None:
+        assert len(group_planes(np.zeros((0, 3)), np.zeros((0, 3), np.int64)).normal) == 0
 
 
 class TestFaceAt:
