@@ -1,4 +1,6 @@
-"""Geometry in the plane that maps and traces share."""
+"""Geometry in the plane that several rooms share."""
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +11,24 @@ from sionna_partial.process import njit
 def cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Cross products of vectors (..., 2)."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
+def grid_edges(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Pairs of neighbouring cells (2, E) of a grid, in eight directions, and what a step from one to the other costs.
+
+    A cell that costs 0 cannot be crossed, nor can the corner at which two such cells meet (skimage's MCP would take
+    that corner).
+    """
+    cell, (ny, nx), passable = np.arange(cost.size).reshape(cost.shape), cost.shape, cost > 0
+    ends, costs = [], []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = slice(0, ny - down), slice(max(0, -right), nx - max(0, right))
+        there = slice(down, ny), slice(max(0, right), nx + min(0, right))
+        beside = passable[here[0], there[1]] | passable[there[0], here[1]]
+        linked = passable[here] & passable[there] & beside
+        ends.append([cell[here][linked], cell[there][linked]])
+        costs.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
+    return np.concatenate(ends, axis=1), np.concatenate(costs)
 
 
 @njit(cache=True)

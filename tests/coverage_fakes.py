@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray as xr
+from extruded import drawn
 from numpy.typing import NDArray
 
 from sionna_partial import coverage as coverage_module
-from sionna_partial.constants import CellState, LinkState
+from sionna_partial.constants import LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
@@ -48,10 +49,8 @@ TX = (0.6, 3.6)
 
 
 def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = (-1.0, 2.0)) -> PartialMap:
-    """Make a map of a drawing: `.` free, `#` wall, `?` unknown."""
-    codes = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
-    rows = [[codes[sign] for sign in line] for line in picture.split()]
-    return PartialMap(np.flipud(np.array(rows, dtype=np.uint8)), resolution_m, origin_m)
+    """Make a map of a drawing, off the world's origin."""
+    return drawn(picture, resolution_m, origin_m)
 
 
 class FakeTracer:

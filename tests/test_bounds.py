@@ -103,14 +103,3 @@ def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance
     assert (lost_db >= -1e-6).all()
     assert lost_db.max() <= tolerance_db
     assert np.abs(every.gain_db - some.gain_db).max() <= tolerance_db
-
-
-def test_a_receiver_keeps_its_paths_whoever_else_is_there() -> None:
-    plan = drawn("######### #.......# #..##...# #.......# #########", 0.7)
-    rx = np.array([[x, 1.1, 1.5] for x in np.linspace(1.0, 5.4, 12)])
-    together = sp.trace_links(plan, (1.6, 2.6, 1.5), rx)
-    for index in (0, 7):
-        alone = sp.trace_links(plan, (1.6, 2.6, 1.5), rx[[index]])
-        mine = together.path_rx == index
-        np.testing.assert_array_equal(alone.a, together.a[mine])
-        np.testing.assert_array_equal(alone.vertices_m, together.vertices_m[mine])

@@ -7,45 +7,27 @@ from pathlib import Path
 import pytest
 
 from sionna_partial import info
-from sionna_partial.errors import BackendError, SceneError
+from sionna_partial.errors import SceneError
 from sionna_partial.info import Finding
-from sionna_partial.llvm import LlvmLibrary
-
-
-@pytest.fixture(autouse=True)
-def _sound_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    (tmp_path / "paper.keras").touch()
-    monkeypatch.setattr(info, "PREDICTORS_FOLDER", tmp_path)
-    monkeypatch.setattr(info, "load_llvm", lambda: LlvmLibrary(Path("/lib/libLLVM.so.19.1"), "19.1.7", "system"))
-    monkeypatch.setattr(info, "engine_fault", str)
-    monkeypatch.setattr(info, "demo_homes", lambda: {"flat": {}, "office": {}})
-    monkeypatch.setattr(platform, "system", lambda: "Linux")
-    monkeypatch.setattr(platform, "machine", lambda: "x86_64")
+from sionna_partial.llvm import load_llvm
+from sionna_partial.resources import demo_homes
 
 
 def found() -> dict[str, Finding]:
     return {finding.name: finding for finding in info.findings()}
 
 
-def test_sound_machine_needs_nothing() -> None:
-    findings = found()
+def test_this_machine_needs_nothing() -> None:
+    findings, library = found(), load_llvm()
     assert not [finding for finding in findings.values() if finding.remedy]
     values = {name: finding.value for name, finding in findings.items()}
-    assert values["LLVM"] == "19.1.7"
-    assert values["LLVM library"] == "/lib/libLLVM.so.19.1"
-    assert values["LLVM source"] == "system"
+    assert values["LLVM"] == library.version
+    assert values["LLVM library"] == str(library.path)
+    assert values["LLVM source"] == library.source
     assert values["fast engine"] == "on"
-    assert values["predictors"] == "paper"
-    assert values["demo scenes"] == "flat, office"
+    assert values["predictors"] == "map, paper"
+    assert values["demo scenes"] == ", ".join(demo_homes())
     assert values["numpy"] == metadata.version("numpy")
-
-
-def test_unusable_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail() -> None:
-        raise BackendError("unset it")
-
-    monkeypatch.setattr(info, "load_llvm", fail)
-    assert found()["LLVM"] == Finding("LLVM", "not usable", "unset it")
 
 
 def test_sionna_rt_of_another_make(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -58,7 +40,7 @@ def test_missing_libraries(monkeypatch: pytest.MonkeyPatch) -> None:
     def version(name: str) -> str:
         if name in ("keras", "shapely"):
             raise metadata.PackageNotFoundError(name)
-        return "1.0"
+        return "2.2.0"
 
     monkeypatch.setattr(metadata, "version", version)
     monkeypatch.setattr(metadata, "requires", lambda _: ["keras<4,>=3", "shapely>=2", "scipy", 'ruff; extra == "dev"'])
@@ -73,7 +55,7 @@ def test_missing_data(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def fail() -> None:
         raise SceneError("install again")
 
-    (tmp_path / "paper.keras").unlink()
+    monkeypatch.setattr(info, "PREDICTORS_FOLDER", tmp_path)
     monkeypatch.setattr(info, "demo_homes", fail)
     findings = found()
     remedy = f"'{tmp_path}' holds none: install sionna-partial again."

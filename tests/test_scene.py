@@ -30,6 +30,7 @@ from sionna_partial.scene.scene import (
     write_scene,
 )
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+from sionna_partial.simulation.homes import make_home
 
 ROOM = """
     ????????????
@@ -372,3 +373,12 @@ def test_only_maps_and_scene_settings_are_taken() -> None:
         build_scene(np.zeros((3, 3)))  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match=r"settings = 5 is not allowed: give SceneSettings"):
         build_scene(PartialMap(np.zeros((3, 3), np.uint8), 0.1), 5)  # type: ignore[arg-type]
+
+
+def test_floors_whose_holes_touch_in_chains_are_triangulated_in_strips():
+    """Walls on cells of a turned floor meet at corners only, and GEOS finds no triangles of what is around them."""
+    geometry = build_scene(make_home(220097, "floor"))
+    area_m2 = np.prod(geometry.floor_m[:, 2:] - geometry.floor_m[:, :2], axis=1).sum()
+    corners_m, triangles = geometry.floor_mesh
+    (x0, y0), (x1, y1), (x2, y2) = corners_m[triangles].transpose(1, 2, 0)
+    assert 0.5 * ((x1 - x0) * (y2 - y0) - (x2 - x0) * (y1 - y0)).sum() == pytest.approx(area_m2)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from sionna_partial.settings import Material, TraceSettings
+from sionna_partial.settings import Material, SceneSettings, TraceSettings
 
 _MAP_HELP = "ROS map_server YAML, exported scene folder, .npz, or mesh."
 _BAND_HELP = "Of a mesh: z between which its surfaces are walls [m]."
@@ -88,9 +88,12 @@ def parse_material(text: str) -> Material:
     return Material(permittivity, conductivity_s_m, thickness_m)
 
 
-def trace_settings(frequency_hz: float, max_depth: int, diffraction: bool) -> TraceSettings:
-    """Trace settings of a subcommand; with diffraction where it is the default."""
-    return TraceSettings(frequency_hz, max_depth, diffraction=None if diffraction else False)
+def settings_of(
+    material: str, frequency_hz: float, max_depth: int, diffraction: bool
+) -> tuple[SceneSettings, TraceSettings]:
+    """Return settings of scene and trace; with diffraction where it is the default."""
+    trace = TraceSettings(frequency_hz, max_depth, diffraction=None if diffraction else False)
+    return SceneSettings(material=parse_material(material)), trace
 
 
 def _is_number(text: str) -> bool:

@@ -11,7 +11,7 @@ import sionna_partial.cli.options as opt
 from sionna_partial.cli.progress import show_progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.settings import Objective, SceneSettings
+from sionna_partial.settings import Objective
 
 TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
 """Angles of incidence of the printed losses [degrees]."""
@@ -39,8 +39,7 @@ def calibrate(
 
     The folder --out gets the map with the calibrated material (predict takes it), the numbers as JSON, and a picture.
     """
-    scene_settings = SceneSettings(material=opt.parse_material(material))
-    settings = opt.trace_settings(frequency, max_depth, diffraction)
+    scene_settings, settings = opt.settings_of(material, frequency, max_depth, diffraction)
     from sionna_partial.measurements.measurements import measurements_of
 
     measured = measurements_of(measurements)
@@ -86,8 +85,7 @@ def place(
 
     The folder --out gets the position and the search as JSON, and a picture.
     """
-    scene_settings = SceneSettings(material=opt.parse_material(material))
-    trace_settings = opt.trace_settings(frequency, max_depth, diffraction)
+    scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with show_progress() as report:

@@ -48,8 +48,7 @@ def predict(
     """Predict the coverage of a transmitter on a partial map."""
     position = opt.parse_position(tx)
     suffixes = [_parse_format(name) for name in formats]
-    scene_settings = SceneSettings(material=opt.parse_material(material))
-    trace_settings = opt.trace_settings(frequency, max_depth, diffraction)
+    scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with show_progress() as report:

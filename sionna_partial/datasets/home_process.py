@@ -7,7 +7,6 @@ when it has had nothing to do for a while.
 import contextlib
 import faulthandler
 import hashlib
-import json
 import os
 import signal
 import socket
@@ -71,9 +70,9 @@ class HomeTask:
     @property
     def metadata(self) -> dict[str, object]:
         """What the shard notes beside its links."""
-        plain = json.dumps(asdict(self.settings), default=lambda number: number.item())  # a number of NumPy's
-        sensor = asdict(home_sensor(self.source.name, self.settings))
-        return {"home": self.source.record, "sensor": sensor, "settings": json.loads(plain), "versions": self.versions}
+        sensor, settings = asdict(home_sensor(self.source.name, self.settings)), asdict(self.settings)
+        settings["stages"] = list(self.settings.stages)  # as JSON has it
+        return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
 
     @property
     def is_done(self) -> bool:

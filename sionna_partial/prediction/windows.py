@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.unobserved import GRAZE, Floats, in_cells, line_fractions
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
@@ -126,27 +126,15 @@ def _detours(wall: Floats) -> Floats:
 
     Routes go from the four cells in the middle from cell to cell, also across corners; walls are crossed at a cost.
     """
-    ends, lengths = _neighbours()
     half = WINDOW_CELLS // 2
     middle = np.s_[half - 1 : half + 1, half - 1 : half + 1]
     cost = 1.0 + _WALL_COST * wall
     cost[middle] = 1.0
-    weights = lengths * 0.5 * (cost.ravel()[ends[0]] + cost.ravel()[ends[1]])
-    graph = csr_array((weights, ends), shape=(cost.size, cost.size))
+    ends, steps = grid_edges(cost)
+    graph = csr_array((steps, ends), shape=(cost.size, cost.size))
     start = np.arange(cost.size).reshape(cost.shape)[middle].ravel()
     costs = dijkstra(graph, directed=False, indices=start, min_only=True).reshape(wall.shape)
     offsets = np.abs(np.arange(WINDOW_CELLS) - half + 0.5) - 0.5
     short, long = np.minimum.outer(offsets, offsets), np.maximum.outer(offsets, offsets)
     straight = long + (math.sqrt(2.0) - 1.0) * short
     return np.clip((costs - straight) / _LONGEST_DETOUR, 0.0, 1.0)
-
-
-@cache
-def _neighbours() -> tuple[NDArray[np.intp], Floats]:
-    """Pairs of neighbouring cells (2, E), and their distances (E,) [cells]."""
-    cell = np.arange(WINDOW_CELLS**2).reshape(WINDOW_CELLS, WINDOW_CELLS)
-    pairs = [(cell[:, :-1], cell[:, 1:]), (cell[:-1], cell[1:]), (cell[:-1, :-1], cell[1:, 1:])]
-    pairs.append((cell[:-1, 1:], cell[1:, :-1]))
-    lengths = np.repeat([1.0, 1.0, math.sqrt(2.0), math.sqrt(2.0)], [one.size for one, _ in pairs])
-    ends = np.concatenate([np.stack([one.ravel(), other.ravel()]) for one, other in pairs], axis=1)
-    return ends, lengths

@@ -338,11 +338,23 @@ def _triangles(rectangles_m: NDArray[np.float64], cell_m: float) -> tuple[NDArra
     Triangles share whole edges: an edge inside the area must not look like the rim of a screen, which diffracts.
     """
     area = shapely.simplify(shapely.union_all(shapely.box(*np.rint(rectangles_m / cell_m).T)), 0.0)
-    pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
-    rings = shapely.get_coordinates(shapely.orient_polygons(pieces)).reshape(-1, 4, 2)[:, :3]
+    rings = shapely.get_coordinates(shapely.orient_polygons(_pieces(area))).reshape(-1, 4, 2)[:, :3]
     corners, index = np.unique(rings.reshape(-1, 2), axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
     return corners * cell_m, triangles[np.lexsort(triangles.T)].astype(np.int64)
+
+
+def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
+    """Triangles of an area with corners on whole numbers, in ever narrower strips where GEOS fails (docs/traps.md)."""
+    strips, count = area, 1
+    while True:
+        try:
+            return shapely.get_parts(shapely.constrained_delaunay_triangles(strips))
+        except shapely.errors.GEOSException:
+            x0, y0, x1, y1 = area.bounds
+            count *= 2
+            cuts = np.unique(np.floor(np.linspace(x0, x1, count + 1)[1:-1])) + 0.5  # no corner is there
+            strips = shapely.intersection(area, shapely.box([x0, *cuts], y0, [*cuts, x1], y1))
 
 
 def _floor_cells(partial: PartialMap, extent: str) -> NDArray[np.bool_]:

@@ -10,10 +10,11 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import coo_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
+from sionna_partial.planar import grid_edges
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import Camera
 
@@ -227,27 +228,16 @@ def _part(low: tuple[int, int], high: tuple[int, int]) -> tuple[slice, slice]:
 
 
 class _Router:
-    """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross.
-
-    None leads between two cells that meet at a corner and cannot be crossed (skimage's MCP would take that corner).
-    """
+    """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross."""
 
     def __init__(self, cost: NDArray[np.float64], start: tuple[int, ...]) -> None:
         self._cells = np.argwhere(cost > 0)
         self._index = np.full(cost.shape, -1)
         self._index[tuple(self._cells.T)] = np.arange(len(self._cells))
-        ny, nx = cost.shape
-        ends, weights = [], []
-        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            here = slice(0, ny - down), slice(max(0, -right), nx - max(0, right))
-            there = slice(down, ny), slice(max(0, right), nx + min(0, right))
-            beside = (cost[here[0], there[1]] > 0) | (cost[there[0], here[1]] > 0)
-            linked = (cost[here] > 0) & (cost[there] > 0) & beside
-            ends.append([self._index[here][linked], self._index[there][linked]])
-            weights.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
-        graph = coo_array((np.concatenate(weights), np.concatenate(ends, axis=1)), shape=(len(self._cells),) * 2)
+        ends, costs = grid_edges(cost)
+        graph = csr_array((costs, self._index.ravel()[ends]), shape=(len(self._cells),) * 2)
         options = {"directed": False, "indices": self._index[start], "return_predecessors": True}
-        cheapest, self._before = dijkstra(graph.tocsr(), **options)
+        cheapest, self._before = dijkstra(graph, **options)
         self.costs = np.full(cost.shape, np.inf)
         self.costs[tuple(self._cells.T)] = cheapest
 

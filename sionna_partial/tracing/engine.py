@@ -265,7 +265,9 @@ class SceneSolver:
         """
         if len(candidates.rx) == 0:
             return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
-        buffer = self._solve(self._symbolic, candidates, _points(tx_m[None]), _points(rx_m))
+        ends, diffraction = (_points(tx_m[None]), _points(rx_m)), candidates.wedges is not None
+        buffer = self._symbolic.verify(self._scene, self._buffer(candidates), *ends, diffraction)
+        buffer = self._symbolic.evaluate(self._scene, buffer, *ends, self._settings.samples_per_tx, diffraction)
         return _read_buffer(buffer, tx_m, rx_m)
 
     def moved(
@@ -369,12 +371,6 @@ class SceneSolver:
             for material, permittivity, conductivity, thickness in kept:
                 material.relative_permittivity = permittivity
                 material.conductivity, material.thickness = conductivity, thickness
-
-    def _solve(self, verification: _Verification, candidates: Candidates, source: Any, targets: Any) -> Any:
-        """Verify candidates in a buffer that keeps their order, and compute their coefficients."""
-        diffraction, samples = candidates.wedges is not None, self._settings.samples_per_tx
-        buffer = verification.verify(self._scene, self._buffer(candidates), source, targets, diffraction)
-        return verification.evaluate(self._scene, buffer, source, targets, samples, diffraction)
 
     def _buffer(self, candidates: Candidates) -> Any:
         """Fill one of Sionna RT's path buffers with unverified candidates."""

@@ -147,6 +147,8 @@ class PathSet:
         Squared magnitude |a|^2 of each, at `base`.
     interactions : (P, D) uint8 array
         Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
+    is_direct : (P,) bool array
+        Whether each is the line of sight.
     vertices_m : (P, D, 3) float64 array
         Positions of the interactions at `base` [m]; NaN where there is none.
     """
@@ -161,6 +163,7 @@ class PathSet:
         paths = SolvedPaths.concatenate([solved for _, solved in self._parts], scene.settings.max_depth)
         self.path_tx, self.path_rx, self.interactions = paths.path_tx, paths.path_rx, paths.interactions
         self.power, self.vertices_m = np.abs(paths.a) ** 2, paths.vertices_m + scene.shift_m
+        self.is_direct = paths.is_direct
 
     def __len__(self) -> int:
         """Return the number of paths P."""
@@ -184,11 +187,6 @@ class PathSet:
     def materials(self) -> tuple[str, ...]:
         """Names of the M radio materials, in the order of `PathParameters`."""
         return self._scene.materials
-
-    @property
-    def is_direct(self) -> NDArray[np.bool_]:
-        """Whether each path (P,) is the line of sight."""
-        return (self.interactions == 0).all(axis=1)
 
     def links(self) -> TracedLinks:
         """Return the links as `trace_links` does."""
