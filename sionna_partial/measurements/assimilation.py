@@ -8,13 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.predictor import LinkPrediction
 
 Floats = NDArray[np.float64]
@@ -60,61 +61,40 @@ class _Walks:
     def lengths_m(self, points_m: Floats) -> Floats:
         """Lengths (P, N) of walks to other points (N, 3) [m], infinite beyond `longest_m`."""
         straight_m = np.linalg.norm(self.points_m[:, None, :2] - points_m[:, :2], axis=-1)
-        return np.maximum(self._lengths_m[:, self._node_at(points_m)], straight_m)
+        return np.maximum(self._lengths_m[:, self._cell_at(points_m)], straight_m)
 
     @cached_property
     def _step(self) -> int:
         return max(1, round(CELL_M / self.partial.resolution_m))
 
     @cached_property
-    def _blocks(self) -> NDArray[np.uint8]:
-        """States (ny, nx, k) of the cells of the map in each cell of walks."""
+    def _cost(self) -> Floats:
+        """What it costs to cross a cell of walks, which is several cells of the map wide; 0 in walls."""
         step = self._step
         padding = [(0, -count % step) for count in self.partial.shape]
         state = np.pad(self.partial.state, padding, constant_values=CellState.UNKNOWN)
-        ny, nx = (count // step for count in state.shape)
-        return state.reshape(ny, step, nx, step).swapaxes(1, 2).reshape(ny, nx, step * step)
-
-    @cached_property
-    def _open(self) -> Bools:
-        return (self._blocks != CellState.WALL).all(axis=-1)
-
-    @cached_property
-    def _nodes(self) -> NDArray[np.intp]:
-        """Node of each cell of walks, -1 in walls."""
-        nodes = np.full(self._open.shape, -1)
-        nodes[self._open] = np.arange(self._open.sum())
-        return nodes
-
-    @cached_property
-    def _graph(self) -> csr_array:
-        cost = 1.0 + (UNKNOWN_COST - 1.0) * (self._blocks == CellState.UNKNOWN).mean(axis=-1)
-        ends, weights, (ny, nx) = [], [], cost.shape
-        for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            here = slice(0, ny - down), slice(max(0, -right), nx - max(0, right))
-            there = slice(down, ny), slice(max(0, right), nx + min(0, right))
-            corners = (here, there, (here[0], there[1]), (there[0], here[1]))
-            linked = np.logical_and.reduce([self._open[corner] for corner in corners])
-            ends.append([self._nodes[here][linked], self._nodes[there][linked]])
-            weights.append(math.hypot(down, right) * 0.5 * (cost[here] + cost[there])[linked])
-        lengths_m = np.concatenate(weights) * self._step * self.partial.resolution_m
-        return coo_array((lengths_m, np.concatenate(ends, axis=1)), shape=(int(self._open.sum()),) * 2).tocsr()
+        blocks = state.reshape(state.shape[0] // step, step, -1, step)
+        unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
+        return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
 
     @cached_property
     def _nearest(self) -> NDArray[np.intp]:
-        """Node of each cell of walks, in walls the nearest."""
-        rows, columns = ndimage.distance_transform_edt(~self._open, return_distances=False, return_indices=True)
-        return self._nodes[rows, columns]
+        """The nearest cell that can be crossed, for each cell."""
+        cell = ndimage.distance_transform_edt(self._cost == 0.0, return_distances=False, return_indices=True)
+        return np.ravel_multi_index(tuple(cell), self._cost.shape)
 
     @cached_property
     def _lengths_m(self) -> NDArray[np.float32]:
-        nodes, index = np.unique(self._node_at(self.points_m), return_inverse=True)
-        lengths_m = dijkstra(self._graph, directed=False, indices=nodes, limit=self.longest_m)
-        return lengths_m.astype(np.float32)[index]
+        """Lengths (P, K) of walks to all cells [m]."""
+        ends, costs = grid_edges(self._cost)
+        lengths_m = costs * self._step * self.partial.resolution_m
+        graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
+        cells, index = np.unique(self._cell_at(self.points_m), return_inverse=True)
+        return dijkstra(graph, directed=False, indices=cells, limit=self.longest_m).astype(np.float32)[index]
 
-    def _node_at(self, points_m: Floats) -> NDArray[np.intp]:
+    def _cell_at(self, points_m: Floats) -> NDArray[np.intp]:
         cells = (points_m[:, :2] - self.partial.origin_m) / (self._step * self.partial.resolution_m)
-        column, row = np.clip(np.floor(cells).astype(np.intp), 0, np.array(self._open.shape)[::-1] - 1).T
+        column, row = np.clip(np.floor(cells).astype(np.intp), 0, np.array(self._cost.shape)[::-1] - 1).T
         return self._nearest[row, column]
 
 
