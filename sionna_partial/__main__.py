@@ -1,6 +1,6 @@
 """`python -m sionna_partial` is the command line."""
 
-from sionna_partial.cli import main
+from sionna_partial.cli.app import main
 
 if __name__ == "__main__":
     main()
