@@ -73,10 +73,10 @@ def maps_of(seed: int, steps: list[int]) -> Iterator[tuple[int, Callable[[], tup
 def measure(partial: sp.PartialMap, home: sp.PartialMap, threshold_db: float) -> dict[str, Any]:
     """Place a transmitter in several ways, and evaluate every position."""
     model = sp.Predictor.load()
-    settings = PlacementSettings(threshold_db=threshold_db, height_m=HEIGHT_M, rx_height_m=HEIGHT_M)
+    settings = PlacementSettings(threshold_db=threshold_db, tx_height_m=HEIGHT_M, rx_height_m=HEIGHT_M)
     area = placement_area(partial, HEIGHT_M, HEIGHT_M, None if partial.is_complete else model)
     grid_m = grid(partial)
-    search = bind(sp.place_transmitter, partial, predictor=model, threshold_db=threshold_db, height_m=HEIGHT_M)
+    search = bind(sp.place_transmitter, partial, predictor=model, threshold_db=threshold_db, tx_height_m=HEIGHT_M)
     search()  # warms up
     exhaustive(area, grid_m[:2], model, settings)
     ours, ours_s = timed(search)

@@ -160,7 +160,7 @@ def trace_ours(
     partial, seconds = sp.load_map(folder), []
     for _ in range(4):
         start = time.perf_counter()
-        links = sp.trace_links(partial, tx, rx, settings=settings)
+        links = sp.trace_links(partial, tx, rx, trace_settings=settings)
         seconds.append(time.perf_counter() - start)
     memory_gb = peak_memory_gb()
     result = {"first_s": seconds[0], "seconds": float(np.median(seconds[1:])), "memory_gb": memory_gb}

@@ -64,7 +64,7 @@ def compare(partial: sp.PartialMap, receivers: int, rays: int, *, diffraction: b
     tx, rx = np.append(positions[0], heights[0]), np.column_stack([positions, heights])[1:]
     depth = 3 if diffraction else 6
     settings = sp.TraceSettings(max_depth=depth, diffraction=diffraction, power_tolerance_db=0.0)
-    links = sp.trace_links(partial, tx, rx, settings=settings)
+    links = sp.trace_links(partial, tx, rx, trace_settings=settings)
     with TemporaryDirectory() as folder:
         sp.export_scene(partial, folder + "/scene")
         stock = isolated(true_paths, folder + "/scene", tx, rx, rays=rays, max_depth=depth, diffraction=diffraction)

@@ -35,7 +35,7 @@ def main() -> None:
     arguments = parser.parse_args()
     home = sp.load_map(scenes_folder() / "apartment" / "complete")
     measurements = measure(home, arguments.links)
-    result = sp.calibrate_materials(home, measurements, start=START, settings=TRACE)
+    result = sp.calibrate_materials(home, measurements, start=START, trace_settings=TRACE)
     print(f"permittivity {result.permittivity:.2f} +- {result.permittivity_std:.2f}")
     print(f"conductivity {result.conductivity:.3f} +- {result.conductivity_std:.3f} S/m")
     print(f"cannot be determined: {', '.join(result.undetermined) or 'nothing'}")
@@ -56,7 +56,7 @@ def measure(home: sp.PartialMap, links: int) -> dict[str, NDArray[np.float64]]:
     places = cells[rng.choice(len(cells), 4 + links, replace=False)][:, ::-1] + 0.5
     places = np.column_stack([places * home.resolution_m + home.origin_m, np.full(len(places), 1.5)])
     tx, rx = places[:4], places[4:]
-    traced = sp.trace_links(home, tx, rx, settings=TRACE, scene_settings=sp.SceneSettings(material=HIDDEN))
+    traced = sp.trace_links(home, tx, rx, trace_settings=TRACE, scene_settings=sp.SceneSettings(material=HIDDEN))
     of_link = np.arange(links) % len(tx)
     gain_db = traced.gain_db[of_link, np.arange(links)] + 3.0 * rng.standard_normal(links)
     return {"tx": tx[of_link], "rx": rx, "gain_db": gain_db}

@@ -1,16 +1,19 @@
 """Predict radio coverage from a robot's partial map of a building.
 
 The public names, which `__init__.pyi` lists, load their modules, and the libraries that those need, when they are first
-used.
+used. Importing the package also chooses the LLVM library of Dr.Jit: import it before `sionna.rt`, `mitsuba` or `drjit`.
 """
 
 import ast
 from importlib import import_module
 from pathlib import Path
 
+from sionna_partial.llvm import choose_llvm as _choose_llvm
 from sionna_partial.process import signals_held as _signals_held
 
 __version__ = "0.1.0"
+
+_choose_llvm()
 
 _MODULE_OF = {
     alias.name: str(node.module)

@@ -33,6 +33,8 @@ from sionna_partial.prediction.predictor import Predictor as Predictor
 from sionna_partial.scene.scene import export_scene as export_scene
 from sionna_partial.settings import DatasetSettings as DatasetSettings
 from sionna_partial.settings import Material as Material
+from sionna_partial.settings import PlacementSettings as PlacementSettings
+from sionna_partial.settings import PredictorSettings as PredictorSettings
 from sionna_partial.settings import SceneSettings as SceneSettings
 from sionna_partial.settings import SensorSettings as SensorSettings
 from sionna_partial.settings import TraceSettings as TraceSettings

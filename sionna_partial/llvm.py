@@ -1,8 +1,9 @@
 """Loads the LLVM library of Dr.Jit before Dr.Jit and TensorFlow meet.
 
-Dr.Jit compiles its kernels with an LLVM that it finds by itself, and accepts versions 15 and 16, which abort the
-process in path solving. TensorFlow exports LLVM symbols that would replace those of that library. So pip's library is
-loaded here, with its own symbols first, and `DRJIT_LIBLLVM_PATH` names it for Dr.Jit and for child processes.
+Dr.Jit compiles its kernels with an LLVM that it finds when it is imported, and accepts versions 15 and 16, which abort
+the process in path solving. TensorFlow exports LLVM symbols that would replace those of that library. So pip's library
+is loaded when `sionna_partial` is imported, with its own symbols first, and `DRJIT_LIBLLVM_PATH` names it for Dr.Jit,
+stock Sionna RT too, and for child processes.
 """
 
 import ctypes
@@ -41,14 +42,27 @@ class LlvmLibrary:
     source: str
 
 
-def load_llvm() -> LlvmLibrary:
-    """Load the LLVM library that `DRJIT_LIBLLVM_PATH` names, or pip's; later calls return what the first one loaded.
+def choose_llvm() -> None:
+    """Load the library that Dr.Jit will find, when the package is imported.
 
-    Call it before importing mitsuba, drjit or sionna; whether TensorFlow was imported before does not matter. Raises a
-    BackendError that says what to do if there is no library, or none that works; if the process is a fork of one that
-    loaded it; or if its working directory was deleted, on which native libraries abort.
+    Raises a BackendError where Dr.Jit runs on another one already, and cannot compile with it. A library that cannot be
+    loaded is an error of `load_llvm` only: what needs no Dr.Jit works without.
     """
-    library, process = _loaded_library()
+    try:
+        _loaded_library()
+    except BackendError:
+        if "drjit" in sys.modules:
+            raise
+
+
+def load_llvm() -> LlvmLibrary:
+    """Return the LLVM library that `DRJIT_LIBLLVM_PATH` names, or pip's, which Dr.Jit is to be started with.
+
+    Call it before importing mitsuba, drjit or sionna. Raises a BackendError that says what to do if there is no
+    library, or none that works; if the process is a fork of one that called it; or if its working directory was
+    deleted, on which native libraries abort.
+    """
+    library, process = _loaded_library(), _first_process()
     if process != os.getpid():
         raise BackendError(
             f"process {os.getpid()} is a fork of process {process}, which has started Dr.Jit or TensorFlow: they do "
@@ -62,37 +76,51 @@ def load_llvm() -> LlvmLibrary:
 
 
 @functools.cache
-def _loaded_library() -> tuple[LlvmLibrary, int]:
-    """Load the library; return it, and the process that did."""
+def _first_process() -> int:
+    return os.getpid()
+
+
+@functools.cache
+def _loaded_library() -> LlvmLibrary:
     named = os.environ.get(PATH_VARIABLE)
-    path = _started_library() or (_named_library(named) if named else _pip_library())
+    started = _started_library() if "drjit" in sys.modules else None
     try:
+        path = started or (_named_library(named) if named else _pip_library())
         version = _version(_open_library(path))
     except OSError as error:
-        raise BackendError(f"{PATH_VARIABLE} = '{path}' cannot be used ({error}): {_UNSET}.") from error
+        raise BackendError(f"{PATH_VARIABLE} = '{named}' cannot be used ({error}): {_UNSET}.") from error
     if int(version.partition(".")[0]) < OLDEST_MAJOR:
         fault = f"LLVM {version} is older than {OLDEST_MAJOR} and cannot compile path kernels"
         raise BackendError(f"{PATH_VARIABLE} = '{path}' cannot be used ({fault}): {_UNSET}.")
     os.environ[PATH_VARIABLE] = str(path)
-    return LlvmLibrary(path, version, PATH_VARIABLE if named else PIP_PACKAGE), os.getpid()
+    return LlvmLibrary(path, version, PATH_VARIABLE if named else PIP_PACKAGE)
 
 
 def _started_library() -> Path | None:
-    """Return the library that Dr.Jit runs on already, because drjit was imported first."""
-    drjit = sys.modules.get("drjit")
-    if drjit is None:
-        return None
-    major = drjit.detail.llvm_version()[0]
-    with suppress(OSError):
-        lines = Path("/proc/self/maps").read_text().splitlines()
-        mapped = dict.fromkeys(line.split(maxsplit=5)[-1] for line in lines if "libLLVM" in line)
-        if major >= OLDEST_MAJOR and mapped:
-            return Path(next(iter(mapped)))
+    """Return the library that Dr.Jit runs on already; raise a BackendError if it cannot compile path kernels with it.
+
+    A path that the user has set is left to the checks of the path where Dr.Jit could not load it.
+    """
+    order, major = list(sys.modules), sys.modules["drjit"].detail.llvm_version()[0]
     found = f"LLVM {major}" if major > 0 else "no LLVM"
+    if "tensorflow" in order and order.index("tensorflow") < order.index("drjit"):
+        found += " with symbols of TensorFlow"
+        _end_without_destructors()
+    elif major >= OLDEST_MAJOR:
+        lines = Path("/proc/self/maps").read_text().splitlines()
+        return Path(next(line.split(maxsplit=5)[-1] for line in lines if "libLLVM" in line))
+    elif os.environ.get(PATH_VARIABLE):
+        return None
     raise BackendError(
-        f"drjit was imported before sionna_partial could choose an LLVM, and runs on {found}: call "
-        f"sionna_partial.llvm.load_llvm() before importing drjit, mitsuba or sionna, and {_INSTALL}."
+        f"Dr.Jit was imported before sionna_partial and runs on {found}, which fails: put the line "
+        "`import sionna_partial` before those that import sionna.rt, mitsuba or drjit."
     )
+
+
+def _end_without_destructors() -> None:
+    """Let this process skip the destructors of native libraries in the end: this LLVM's free memory of TensorFlow's."""
+    libc = ctypes.CDLL(None)
+    libc.on_exit(libc._exit, None)
 
 
 def _named_library(name: str) -> Path:

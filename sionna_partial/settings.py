@@ -396,7 +396,7 @@ class PlacementSettings(Checked):
         count in full up to 5 % of the weight, and linearly less up to 15 %, so that no single one decides.
     threshold_db : float
         Path gain above which a receiver is covered [dB], in (-150, 0].
-    height_m, rx_height_m : float
+    tx_height_m, rx_height_m : float
         Heights of transmitter and receivers [m], below the ceiling.
     seed : int
         Seed of the grid of positions that are compared. The same seed gives the same bytes.
@@ -409,6 +409,6 @@ class PlacementSettings(Checked):
 
     objective: Objective = "coverage"
     threshold_db: Annotated[float, Within(-150.0, 0.0, open_low=True)] = -100.0
-    height_m: float = DEFAULT_HEIGHT_M
+    tx_height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0

@@ -111,8 +111,7 @@ def train(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> from sionna_partial.settings import PredictorSettings
-    >>> run = sp.train("links", test_fraction=0.0, settings=PredictorSettings("paper"))  # that build_dataset wrote
+    >>> run = sp.train("links", test_fraction=0.0, settings=sp.PredictorSettings("paper"))  # that build_dataset wrote
     >>> run.train_homes
     ('make_home(7)',)
     """

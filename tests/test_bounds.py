@@ -94,7 +94,8 @@ def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance
     tx, rx = (1.3, 1.2, 1.5), [[x, y, 1.4] for x in (0.9, 2.3, 3.8, 5.2, 6.3) for y in (0.8, 2.1, 3.5, 4.0)]
     rx = [place for place in rx if plan.state_at(np.array([place]))[0] == 0]
     every, some = (
-        sp.trace_links(plan, tx, rx, settings=sp.TraceSettings(power_tolerance_db=each)) for each in (0.0, tolerance_db)
+        sp.trace_links(plan, tx, rx, trace_settings=sp.TraceSettings(power_tolerance_db=each))
+        for each in (0.0, tolerance_db)
     )
     assert len(some.a) < 0.7 * len(every.a)
     assert some.link_state.tolist() == every.link_state.tolist()

@@ -51,13 +51,13 @@ def measured(
 ) -> dict[str, object]:
     tx, rx = places()
     settings = None if hidden is None else sp.SceneSettings(material=hidden)
-    links = sp.trace_links(scene, TX, rx, settings=SETTINGS, scene_settings=settings)
+    links = sp.trace_links(scene, TX, rx, trace_settings=SETTINGS, scene_settings=settings)
     gain_db = links.gain_db[np.arange(len(rx)) % 2, np.arange(len(rx))]
     return {"tx": tx, "rx": rx, "gain_db": gain_db + noise_db * np.random.default_rng(4).standard_normal(len(rx))}
 
 
 def calibrate(measurements: object, **arguments: object) -> sp.MaterialCalibration:
-    return sp.calibrate_materials(FLAT, measurements, **{"start": START, "settings": SETTINGS, **arguments})  # type: ignore[arg-type]
+    return sp.calibrate_materials(FLAT, measurements, **{"start": START, "trace_settings": SETTINGS, **arguments})  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -101,7 +101,7 @@ class TestHiddenMaterial:
     def test_scene_predicts_with_it(self, result: sp.MaterialCalibration) -> None:
         assert result.scene == replace(FLAT, material=result.materials[0])
         assert result.materials[0] == sp.Material(result.permittivity, result.conductivity, THIN_M)
-        links = sp.trace_links(result.scene, TX[0], places()[1][::2], settings=SETTINGS)
+        links = sp.trace_links(result.scene, TX[0], places()[1][::2], trace_settings=SETTINGS)
         np.testing.assert_allclose(links.gain_db, result.gain_after_db[::2], atol=0.3)
 
     def test_record_is_plain(self, result: sp.MaterialCalibration) -> None:
@@ -154,7 +154,7 @@ class TestWhatCannotBeDetermined:
         tx, rx = places(20)
         with pytest.raises(MeasurementError, match=message):
             sp.calibrate_materials(
-                field, {"tx": tx, "rx": rx, "gain_db": np.full(20, -70.0)}, settings=sp.TraceSettings(max_depth=0)
+                field, {"tx": tx, "rx": rx, "gain_db": np.full(20, -70.0)}, trace_settings=sp.TraceSettings(max_depth=0)
             )
 
 
@@ -162,7 +162,7 @@ class TestPartialMap:
     def test_links_through_the_unseen_are_left_out(self) -> None:
         state = FLAT.state.copy()
         state[5:45, 42:60] = sp.CellState.UNKNOWN
-        found = sp.calibrate_materials(replace(FLAT, state=state), measured(), start=START, settings=SETTINGS)
+        found = sp.calibrate_materials(replace(FLAT, state=state), measured(), start=START, trace_settings=SETTINGS)
         assert found.left_out["runs through unobserved space"] > 5
         assert (~found.used).sum() == sum(found.left_out.values())
 
@@ -187,9 +187,9 @@ def test_materials_of_a_mesh() -> None:
     rng = np.random.default_rng(5)
     tx, rx = np.tile([1.5, 1.0, 1.5], (24, 1)), rng.uniform([0.3, 0.3, 1.0], [4.7, 3.7, 2.0], (24, 3))
     rx[np.abs(rx[:, 0] - 3.0) < 0.2, 0] -= 0.4
-    gain_db = sp.trace_links(partial, tx[0], rx, settings=SETTINGS).gain_db
+    gain_db = sp.trace_links(partial, tx[0], rx, trace_settings=SETTINGS).gain_db
     blank = replace(partial, mesh=replace(mesh, materials=(None, unused, None)), material=START)
-    found = sp.calibrate_materials(blank, {"tx": tx, "rx": rx, "gain_db": gain_db}, settings=SETTINGS)
+    found = sp.calibrate_materials(blank, {"tx": tx, "rx": rx, "gain_db": gain_db}, trace_settings=SETTINGS)
     assert found.permittivity.shape == found.conductivity_std.shape == (2,)
     assert found.permittivity[0] == pytest.approx(6.0, abs=1.5)
     assert found.record()["rmse_db"]["after"] < found.record()["rmse_db"]["before"]
@@ -227,7 +227,7 @@ class TestWrongArguments:
         with pytest.raises(SettingsError, match="start = 'brick' is not allowed: give a Material, or None for the s"):
             calibrate(measured(), start="brick")
         with pytest.raises(SettingsError, match="refraction = True is not allowed"):
-            calibrate(measured(), settings=sp.TraceSettings(refraction=True))
+            calibrate(measured(), trace_settings=sp.TraceSettings(refraction=True))
         with pytest.raises(SettingsError, match="'wet_ground' is defined for 1-10 GHz"):
             calibrate(measured(), start=sp.Material(itu="wet_ground"))
 

@@ -70,7 +70,7 @@ def links_of():
 
 
 def predicted(kind, predictor):
-    links = sp.trace_links(MAPS[kind], TX_M, RX_M, settings=TRACE, scene_settings=SCENE)
+    links = sp.trace_links(MAPS[kind], TX_M, RX_M, trace_settings=TRACE, scene_settings=SCENE)
     return loaded(predictor).predict(sp.link_features(MAPS[kind], links)), links
 
 

@@ -45,8 +45,8 @@ def test_a_plan_traced_as_a_mesh_has_the_same_paths(tmp_path: Path) -> None:
         _plan(),
         sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, diffraction=False, samples_per_tx=100_000),
     )
-    exact = sp.trace_links(plan, TX, RX, settings=settings)
-    scan = sp.trace_links(_as_mesh(plan, tmp_path), TX, RX, settings=settings)
+    exact = sp.trace_links(plan, TX, RX, trace_settings=settings)
+    scan = sp.trace_links(_as_mesh(plan, tmp_path), TX, RX, trace_settings=settings)
     np.testing.assert_array_equal(scan.link_state, exact.link_state)
     np.testing.assert_allclose(scan.gain_db, exact.gain_db, atol=1e-3)
     for index in range(len(RX)):
@@ -58,7 +58,7 @@ def test_a_mesh_far_away_has_the_same_paths() -> None:
     there = SceneMesh(mesh.vertices_m + far, mesh.triangles, mesh.material)
     settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=3, samples_per_tx=50_000)
     near, moved = (
-        sp.trace_links(mesh_map(each, MeshReading(resolution_m=0.1)), TX + shift, RX + shift, settings=settings)
+        sp.trace_links(mesh_map(each, MeshReading(resolution_m=0.1)), TX + shift, RX + shift, trace_settings=settings)
         for each, shift in ((mesh, 0.0), (there, far))
     )
     assert len(near.a) > 50
@@ -69,7 +69,7 @@ def test_a_mesh_far_away_has_the_same_paths() -> None:
 def test_diffraction_is_on_for_plans_and_off_for_meshes(tmp_path: Path) -> None:
     settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=2, samples_per_tx=10_000)
     for partial, diffracts in ((_plan(), True), (_as_mesh(_plan(), tmp_path), False)):
-        links = sp.trace_links(partial, TX, RX, settings=settings)
+        links = sp.trace_links(partial, TX, RX, trace_settings=settings)
         assert links.settings.diffraction is diffracts
         assert (8 in links.interactions) is diffracts
 
@@ -81,7 +81,7 @@ def test_parts_of_a_mesh_have_their_own_materials() -> None:
     parts = SceneMesh(mesh.vertices, mesh.faces, np.repeat([0, 1], 12), (metal, glass))
     partial = mesh_map(parts, MeshReading(resolution_m=0.1))
     settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1, samples_per_tx=20_000)
-    links = sp.trace_links(partial, (1.0, 2.0, 1.0), [[4.0, 2.0, 1.0]], settings=settings)
+    links = sp.trace_links(partial, (1.0, 2.0, 1.0), [[4.0, 2.0, 1.0]], trace_settings=settings)
     strength = {round(z, 1): abs(a) for a, (_, _, z) in zip(links.a[1:], links.vertices_m[1:, 0], strict=True)}
     assert strength[0.0] > 100 * strength[2.9]
 
@@ -99,9 +99,9 @@ def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
 
 def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, samples_per_tx=20_000)
-    exact = sp.trace_links(_plan(), TX, RX[:2], settings=settings)
+    exact = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
     monkeypatch.setattr(trace, "engine_fault", lambda: "broken")
-    public = sp.trace_links(_plan(), TX, RX[:2], settings=settings)
+    public = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
     np.testing.assert_array_equal(public.link_state, exact.link_state)
     bent = (public.interactions == 8).any(axis=1)
     assert bent.any()
@@ -156,7 +156,9 @@ def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:
     words = []
     for walls in (0, 1, 2):
         settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction_walls=walls)
-        links = sp.trace_links(_plan(), TX, RX, settings=settings, scene_settings=sp.SceneSettings(floor_extent="none"))
+        links = sp.trace_links(
+            _plan(), TX, RX, trace_settings=settings, scene_settings=sp.SceneSettings(floor_extent="none")
+        )
         words.append({"".join("D" if kind == 8 else "R" for kind in row if kind) for row in links.interactions})
     assert {word for word in words[0] if "D" in word} == {"D"}
     assert {word for word in words[1] if "D" in word} == {"D", "DR", "RD", "RDR"}

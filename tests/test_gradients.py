@@ -60,7 +60,7 @@ def floor_slopes(material: sp.Material, rx: NDArray[np.float64], frequency_hz: f
 
 @pytest.fixture(scope="module")
 def found() -> GainGradients:
-    return gain_gradients(small_room(), TX_M, RX_M, settings=SETTINGS)
+    return gain_gradients(small_room(), TX_M, RX_M, trace_settings=SETTINGS)
 
 
 class TestAgainstFormulas:
@@ -96,14 +96,15 @@ class TestAgainstDifferencesOfTheTrace:
         return (ends[0].gain_db - ends[1].gain_db) / (2 * step)
 
     def test_room_has_diffracted_paths_and_every_receiver_reflections(self) -> None:
-        links = sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS)
+        links = sp.trace_links(small_room(), TX_M, RX_M, trace_settings=SETTINGS)
         assert (links.interactions == 8).any()
         assert {*links.path_rx[(links.interactions == 1).any(axis=1)]} == {0, 1, 2}
 
     def test_transmitter(self, found: GainGradients) -> None:
         slopes = [
             self.difference(
-                lambda step, axis=axis: sp.trace_links(small_room(), TX_M + step * axis, RX_M, settings=SETTINGS), 2e-3
+                lambda step, axis=axis: sp.trace_links(small_room(), TX_M + step * axis, RX_M, trace_settings=SETTINGS),
+                2e-3,
             )
             for axis in np.eye(3)
         ]
@@ -122,14 +123,14 @@ class TestAgainstDifferencesOfTheTrace:
         def change(value: float) -> sp.TracedLinks:
             material = dataclasses.replace(sp.Material(), **{field: getattr(sp.Material(), field) + value})
             scene_settings = sp.SceneSettings(material=material)
-            return sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS, scene_settings=scene_settings)
+            return sp.trace_links(small_room(), TX_M, RX_M, trace_settings=SETTINGS, scene_settings=scene_settings)
 
         np.testing.assert_allclose(getattr(found, name), self.difference(change, step), rtol=0.01)
 
 
 class TestGainGradients:
     def test_gain_and_state_are_those_of_the_trace(self, found: GainGradients) -> None:
-        links = sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS)
+        links = sp.trace_links(small_room(), TX_M, RX_M, trace_settings=SETTINGS)
         np.testing.assert_array_equal(found.link_state, links.link_state)
         np.testing.assert_allclose(found.gain_db, links.gain_db, rtol=1e-13)
         np.testing.assert_array_equal([*found.tx, *found.rx.ravel()], [*links.tx, *links.rx.ravel()])
@@ -155,7 +156,7 @@ class TestGainGradients:
             small_room(),
             TX_M,
             RX_M,
-            settings=SETTINGS,
+            trace_settings=SETTINGS,
             progress=lambda fraction, message: calls.append((fraction, message)),
         )
         fractions, messages = zip(*calls, strict=True)
@@ -174,12 +175,12 @@ class TestErrors:
     def test_rays_are_shot(self, name: str) -> None:
         message = f"{name} = True is not allowed: paths that are found by shooting rays have no gradients: give False"
         with pytest.raises(SettingsError, match=message):
-            gain_gradients(FIELD, TX, RX, settings=sp.TraceSettings(**{name: True}))
+            gain_gradients(FIELD, TX, RX, trace_settings=sp.TraceSettings(**{name: True}))
 
     def test_diffraction_on_a_mesh(self, tmp_path: Path) -> None:
         room().export(tmp_path / "room.ply")
         with pytest.raises(SettingsError, match="diffraction = True is not allowed: paths that are found by shooting"):
-            gain_gradients(tmp_path / "room.ply", TX, TX[None] + 0.1, settings=sp.TraceSettings(diffraction=True))
+            gain_gradients(tmp_path / "room.ply", TX, TX[None] + 0.1, trace_settings=sp.TraceSettings(diffraction=True))
 
     def test_several_transmitters(self) -> None:
         with pytest.raises(PositionError, match=r"tx has shape \(2, 3\): give one transmitter as \(3,\)\."):

@@ -116,7 +116,7 @@ class TestTruthAndFeatures:
         here = table.take((table.stage == 40) & table.inside)
         for tx in np.unique(here.context.tx_m, axis=0):
             mine = here.take((here.context.tx_m == tx).all(axis=1))
-            links = trace_links(home, tx, mine.context.rx_m, settings=SETTINGS.trace)
+            links = trace_links(home, tx, mine.context.rx_m, trace_settings=SETTINGS.trace)
             np.testing.assert_array_equal(mine.link_state, links.link_state)
             np.testing.assert_allclose(mine.gain_db, links.gain_db, atol=1e-3)
 
@@ -152,7 +152,7 @@ class TestTruthAndFeatures:
         np.testing.assert_array_equal(here.context.rx_seen, partial.state_at(here.context.rx_m) != CellState.UNKNOWN)
         tx = here.context.tx_m[0]
         mine = here.take((here.context.tx_m == tx).all(axis=1))
-        phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, settings=SETTINGS.trace))
+        phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, trace_settings=SETTINGS.trace))
         np.testing.assert_array_equal(mine.phi.link_state, phi.link_state)
         np.testing.assert_array_equal(mine.phi.unobserved_distance_m, phi.unobserved_distance_m)
         np.testing.assert_array_equal(mine.phi.gain_db, phi.gain_db)

@@ -48,10 +48,11 @@ ROOMS = {
     "plots": (*("style", "coverage_plot", "exploration_plot", "material_plot", "placement_plot", "evaluation_plot"),),
     "results": ("export", "demo", "info", "reports"),
     "cli": ("options", "progress", "prediction", "learning", "planning", "app"),
+    "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "training", "results"}
+FILES = {"foundations", "coverage", "training", "results", "command"}
 """Rooms whose modules are files of the package itself."""
 
 MODULES = tuple(

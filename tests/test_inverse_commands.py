@@ -29,7 +29,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rng = np.random.default_rng(0)
     tx, rx = np.array([1.0, 1.0, 1.5]), rng.uniform([2.8, 0.3, 1.0], [4.7, 3.7, 2.0], (24, 3))
     links = sp.trace_links(
-        room, tx, rx, settings=sp.TraceSettings(max_depth=2), scene_settings=sp.SceneSettings(material=HIDDEN)
+        room, tx, rx, trace_settings=sp.TraceSettings(max_depth=2), scene_settings=sp.SceneSettings(material=HIDDEN)
     )
     rows = [
         ",".join(f"{value:.6f}" for value in (*tx, *place, gain)) for place, gain in zip(rx, links.gain_db, strict=True)

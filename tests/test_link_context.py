@@ -177,7 +177,7 @@ class TestLinks:
     def test_with_the_direct_path_it_is_the_gain_of_the_trace(self):
         partial = room(0.5, unknown_from=7)
         rx = np.array([(1.2, 1.4, 1.5), (3.1, 0.9, 1.2), (4.2, 1.6, 1.5)])
-        links = trace_links(partial, (0.8, 0.7, 1.5), rx, settings=TraceSettings(max_depth=2))
+        links = trace_links(partial, (0.8, 0.7, 1.5), rx, trace_settings=TraceSettings(max_depth=2))
         found = link_context(partial, links)
         direct = ~links.interactions.any(axis=1)
         power = np.bincount(links.path_rx[direct], np.abs(links.a[direct]) ** 2, minlength=3)

@@ -1,11 +1,13 @@
-"""LLVM is found and loaded so that Dr.Jit and TensorFlow live together, in either order."""
+"""LLVM is found and loaded so that Dr.Jit, TensorFlow and stock Sionna RT live together, in any order."""
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from importlib import metadata
+from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -34,8 +36,8 @@ except BackendError as error:
     print(error)
 """
 LIVE_TOGETHER = {
-    "tensorflow first": ("import tensorflow", "load_llvm()", TRACE),
-    "tensorflow last": ("load_llvm()", TRACE, "import tensorflow"),
+    "tensorflow first": ("import tensorflow", START, TRACE),
+    "tensorflow last": (START, TRACE, "import tensorflow"),
 }
 AND_THEN = """
 import io
@@ -51,25 +53,81 @@ model.fit(np.ones((8, 2)), np.ones(8), verbose=0)
 """
 
 
-def run_python(*lines: str, folder: Path | None = None, **environment: str) -> str:
-    """Output of a Python of its own, without the DRJIT_LIBLLVM_PATH of this one; it ends well."""
+IMPORTS = {
+    "ours": "import sionna_partial as sp",
+    "sionna": "import sionna.rt",
+    "mitsuba": "import drjit, mitsuba; mitsuba.set_variant('llvm_ad_mono_polarized')",
+    "tensorflow": "import tensorflow",
+}
+STOCK_AND_OURS = """
+import tempfile
+import numpy as np, sionna.rt as rt
+state = np.zeros((20, 40), np.uint8)
+state[[0, -1]] = state[:, [0, -1]] = 1
+room = sp.PartialMap(state, 0.1)
+scene = rt.load_scene(str(sp.export_scene(room, tempfile.mkdtemp()) / "scene.xml"))
+scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+scene.add(rt.Transmitter("tx", [1.0, 1.0, 1.5]))
+scene.add(rt.Receiver("rx", [3.0, 1.0, 1.5]))
+shortest = [rt.PathSolver()(scene, max_depth=1, samples_per_src=1000).tau.numpy().min()]
+shortest += [sp.trace_links(room, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)]).delay_s.min()]
+print([round(299792458.0 * float(delay_s), 3) for delay_s in shortest])
+"""
+REFUSED = (
+    r"sionna_partial\.errors\.BackendError: Dr\.Jit was imported before sionna_partial and runs on {}, which fails: "
+    r"put the line `import sionna_partial` before those that import sionna\.rt, mitsuba or drjit\."
+)
+IN_THE_WAY = r"(no LLVM|LLVM 1[56])"
+INTERPOSED = r"(no LLVM|LLVM \d+) with symbols of TensorFlow"
+
+
+def run(*lines: str, folder: Path | None = None, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run lines in a Python of its own, without the DRJIT_LIBLLVM_PATH of this one."""
     base = {name: value for name, value in os.environ.items() if name != llvm.PATH_VARIABLE}
     modules = os.pathsep.join(filter(None, [str(Path(llvm.__file__).parents[1]), base.get("PYTHONPATH")]))
-    done = subprocess.run(
-        [sys.executable, "-c", START + "\n".join(lines)],
+    return subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)],
         env=base | {"PYTHONPATH": modules} | environment,
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=600,
     )
+
+
+def output(done: subprocess.CompletedProcess[str]) -> str:
+    """Output of a Python that ended well."""
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
+def run_python(*lines: str, folder: Path | None = None, **environment: str) -> str:
+    return output(run(START, *lines, folder=folder, **environment))
+
+
+def require_refusal(done: subprocess.CompletedProcess[str], message: str) -> None:
+    """Check that a Python ended in a one-line error before anything else, and did not crash on its way out."""
+    assert (done.returncode, done.stdout) == (1, ""), done.stderr
+    assert re.fullmatch(message, done.stderr.splitlines()[-1])
+
+
+@pytest.mark.parametrize("order", [*permutations(IMPORTS)], ids="-".join)
+def test_any_order_of_imports_works_or_ends_in_one_line(order: tuple[str, ...]) -> None:
+    done = run(*(IMPORTS[name] for name in order), STOCK_AND_OURS)
+    mitsuba_at = min(order.index("sionna"), order.index("mitsuba"))
+    if mitsuba_at > order.index("ours"):
+        assert output(done) == "[2.0, 2.0]\n"
+    elif mitsuba_at > order.index("tensorflow"):
+        require_refusal(done, REFUSED.format(INTERPOSED))
+    elif done.returncode:  # not on a machine where Dr.Jit finds an LLVM that works
+        require_refusal(done, REFUSED.format(IN_THE_WAY))
+    else:
+        assert output(done) == "[2.0, 2.0]\n"
+
+
 @pytest.mark.parametrize("order", LIVE_TOGETHER)
 def test_dr_jit_and_tensorflow_live_together(order: str) -> None:
-    lines = run_python(*LIVE_TOGETHER[order], AND_THEN, TRACE).splitlines()
+    lines = output(run(*LIVE_TOGETHER[order], AND_THEN, TRACE)).splitlines()
     first, second = (line for line in lines if line.startswith("["))
     assert first == second
     assert json.loads(first)[0] == pytest.approx(2.0 / 299792458.0, rel=1e-5)
@@ -117,13 +175,22 @@ def test_relative_path_stays_valid_elsewhere(tmp_path: Path) -> None:
 class TestDrjitImportedFirst:
     def test_on_a_good_library(self) -> None:
         path = str(load_llvm().path)
-        answer = run_python("import drjit", TRY, TRACE, **{llvm.PATH_VARIABLE: path})
+        answer = output(
+            run("import drjit", START, TRY, TRACE, "import tensorflow", TRACE, **{llvm.PATH_VARIABLE: path})
+        )
         assert answer.startswith(f"{llvm.PATH_VARIABLE} {path}\n[")
 
+    def test_on_a_good_library_with_symbols_of_tensorflow(self) -> None:
+        done = run("import tensorflow, drjit", START, **{llvm.PATH_VARIABLE: str(load_llvm().path)})
+        require_refusal(done, REFUSED.format(INTERPOSED))
+
     def test_on_none(self) -> None:
-        answer = run_python("import drjit", TRY, **{llvm.PATH_VARIABLE: "/no/such/libLLVM.so"})
-        assert "drjit was imported before sionna_partial could choose an LLVM, and runs on no LLVM: call" in answer
-        assert "sionna_partial.llvm.load_llvm() before importing drjit" in answer
+        forget = f"import drjit, os; del os.environ['{llvm.PATH_VARIABLE}']"
+        require_refusal(run(forget, START, **{llvm.PATH_VARIABLE: "/no/such/libLLVM.so"}), REFUSED.format("no LLVM"))
+
+    def test_on_none_because_of_the_path_that_the_user_set(self) -> None:
+        done = run("import drjit", START, **{llvm.PATH_VARIABLE: "/no/such/libLLVM.so"})
+        require_refusal(done, rf".*{llvm.PATH_VARIABLE} = '/no/such/libLLVM.so' cannot be used .*: unset .*")
 
 
 class TestNamedByTheUser:

@@ -131,19 +131,19 @@ class TestLinks:
                 assert ours == theirs
 
     def test_plan(self, paths: PathSet) -> None:
-        links = sp.trace_links(small_room(), TX_M, RX_M, settings=SETTINGS)
+        links = sp.trace_links(small_room(), TX_M, RX_M, trace_settings=SETTINGS)
         assert {0, 1, 8} <= {*links.interactions.ravel().tolist()}
         self.assert_same(paths.links(), links)
         self.assert_same(paths.links(), links)  # a second time, too
 
     def test_mesh(self, mesh_paths: PathSet) -> None:
-        self.assert_same(mesh_paths.links(), sp.trace_links(mesh_room(), MESH_TX_M, MESH_RX_M, settings=SETTINGS))
+        self.assert_same(mesh_paths.links(), sp.trace_links(mesh_room(), MESH_TX_M, MESH_RX_M, trace_settings=SETTINGS))
 
     def test_map_elsewhere(self, paths: PathSet) -> None:
         move = np.array([5e5, 4.5e6, 0.0])
         moved = replace(small_room(), origin_m=(5e5, 4.5e6))
         there = PathScene(moved, settings=SETTINGS).paths(TX_M + move, RX_M + move)
-        self.assert_same(there.links(), sp.trace_links(moved, TX_M + move, RX_M + move, settings=SETTINGS))
+        self.assert_same(there.links(), sp.trace_links(moved, TX_M + move, RX_M + move, trace_settings=SETTINGS))
         power, vertices_m = there.at(changed(there, tx_m=[0.01, -0.02, 0.03]))
         expected, expected_m = paths.at(changed(paths, tx_m=[0.01, -0.02, 0.03]))
         np.testing.assert_allclose(power, expected, rtol=1e-3, atol=1e-6 * expected.max())
@@ -160,7 +160,9 @@ class TestLinks:
 
 class TestSeveralTransmitters:
     def test_links_are_those_of_the_trace(self, several: PathSet) -> None:
-        TestLinks.assert_same(several.links(), sp.trace_links(small_room(), SEVERAL_TX_M, RX_M, settings=SETTINGS))
+        TestLinks.assert_same(
+            several.links(), sp.trace_links(small_room(), SEVERAL_TX_M, RX_M, trace_settings=SETTINGS)
+        )
 
     def test_each_moves_as_it_does_alone(self, room: PathScene, several: PathSet) -> None:
         move = np.array([[4e-3, -3e-3, 5e-3], [0.0, 2e-3, -1e-3]])
@@ -213,7 +215,7 @@ class TestAt:
         paths = request.getfixturevalue(which)
         there = changed(paths, tx_m=[4e-3, -3e-3, 5e-3])
         partial = paths._scene.partial
-        links = sp.trace_links(partial, there.tx_m, paths.rx_m, settings=SETTINGS)
+        links = sp.trace_links(partial, there.tx_m, paths.rx_m, trace_settings=SETTINGS)
         assert len(links.a) == len(paths)
         moved = replace(paths.base, tx_m=there.tx_m)
         power, vertices_m = paths.at(moved)
@@ -231,7 +233,7 @@ class TestAt:
         else:
             material = replace(material, **{name: getattr(material, name) + by})
         links = sp.trace_links(
-            small_room(), TX_M, RX_M, settings=settings, scene_settings=sp.SceneSettings(material=material)
+            small_room(), TX_M, RX_M, trace_settings=settings, scene_settings=sp.SceneSettings(material=material)
         )
         power, _ = paths.at(changed(paths, **{name: by}))
         expected = as_traced(paths, links)[0]

@@ -80,7 +80,7 @@ class TestSearch:
         assert len(sp.place_transmitter(hall, trace_settings=settings).starts_m) == STARTS[1]
 
     def test_heights_and_free_cells(self) -> None:
-        found = placed(height_m=2.5, rx_height_m=0.7)
+        found = placed(tx_height_m=2.5, rx_height_m=0.7)
         tried_m = np.vstack([found.starts_m, found.trajectory_m])
         assert (tried_m[:, 2] == 2.5).all()
         assert (found.rx_m[:, 2] == 0.7).all()
@@ -100,7 +100,7 @@ class TestSearch:
             found.partial,
             found.position_m,
             found.rx_m[far],
-            settings=sp.TraceSettings(max_depth=0, diffraction=False),
+            trace_settings=sp.TraceSettings(max_depth=0, diffraction=False),
         )
         answer = sp.Predictor.load("paper").predict(sp.link_features(found.partial, links))
         np.testing.assert_allclose(found.values[far], link_values(answer, found.settings), atol=1e-6)
@@ -143,8 +143,8 @@ class TestErrors:
             ({"threshold_db": -150.0}, r"threshold_db = -150\.0 is not allowed: give a number in \(-150, 0\]"),
             ({"threshold_db": 0.1}, r"threshold_db = 0\.1 is not allowed"),
             ({"threshold_db": "loud"}, "threshold_db = 'loud' is not allowed"),
-            ({"height_m": 0.0}, r"height_m = 0\.0 is not allowed: give a number in \(0, 3\]"),
-            ({"height_m": 3.0}, r"height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
+            ({"tx_height_m": 0.0}, r"tx_height_m = 0\.0 is not allowed: give a number in \(0, 3\]"),
+            ({"tx_height_m": 3.0}, r"tx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
             ({"rx_height_m": 4.0}, r"rx_height_m = 4\.0 is not allowed: give a number in \(0, 3\]"),
             ({"seed": -1}, r"seed = -1 is not allowed: give a whole number in \[0, "),
         ],
@@ -172,7 +172,7 @@ def test_finds_the_door(objective: str) -> None:
     found = sp.place_transmitter(two_rooms, objective=objective, threshold_db=-90.0, seed=1, trace_settings=settings)
     corner = (1.0, 0.6, 1.5)
     rx = found.rx_m[np.linalg.norm(found.rx_m - found.position_m, axis=1) > 0.02]
-    gains_db = [sp.trace_links(two_rooms, tx, rx, settings=settings).gain_db for tx in (found.position_m, corner)]
+    gains_db = [sp.trace_links(two_rooms, tx, rx, trace_settings=settings).gain_db for tx in (found.position_m, corner)]
     if objective == "coverage":
         assert found.score == pytest.approx(np.mean(gains_db[0] > -90.0), abs=1.5 / len(rx))
         assert found.score > np.mean(gains_db[1] > -90.0)

@@ -62,6 +62,7 @@ def inputs(tmp_path: Path) -> Path:
     [
         ("README.md", ("coverage.nc", "coverage.png", "scene/scene.xml")),
         ("docs/usage.md", ("coverage.nc", "scene/scene.xml", "exploration.gif", "calibration.png", "placement.png")),
+        ("docs/sionna.md", ("scene/scene.xml", "camera.png", "changed/scene.xml")),
     ],
 )
 def test_python_blocks_run(page: str, files: tuple[str, ...], inputs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,7 +76,7 @@ def test_python_blocks_run(page: str, files: tuple[str, ...], inputs: Path, monk
 
 
 def test_other_pages_have_no_python_blocks() -> None:
-    assert [page.name for page in PAGES if blocks(page, "python")] == ["README.md", "usage.md"]
+    assert [page.name for page in PAGES if blocks(page, "python")] == ["README.md", "sionna.md", "usage.md"]
 
 
 def test_commands_and_their_options_exist() -> None:

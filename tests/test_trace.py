@@ -81,7 +81,7 @@ def test_one_mirror_image_with_the_slab_reflection_coefficient() -> None:
     state = _map((60, 100))
     state[50, :] = CellState.WALL
     tx, rx = np.array([1.0, 2.0, 1.5]), np.array([[5.0, 3.0, 1.5]])
-    links = trace_links(PartialMap(state, 0.1), tx, rx, settings=SPECULAR, scene_settings=NO_FLOOR)
+    links = trace_links(PartialMap(state, 0.1), tx, rx, trace_settings=SPECULAR, scene_settings=NO_FLOOR)
     wall_y = 5.05
     length = np.hypot(4.0, (wall_y - 2.0) + (wall_y - 3.0))
     cos_incidence = ((wall_y - 2.0) + (wall_y - 3.0)) / length
@@ -105,7 +105,7 @@ def test_floor_and_ceiling_reflect_with_the_parallel_coefficient() -> None:
         PartialMap(_map((60, 100)), 0.1),
         tx,
         rx,
-        settings=TraceSettings(power_tolerance_db=0.0, max_depth=1),
+        trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=1),
         scene_settings=settings,
     )
     length = np.hypot(3.0, 3.0)
@@ -123,7 +123,7 @@ def test_corridor_of_two_walls_has_every_image() -> None:
     state[[0, 40], :] = CellState.WALL
     low, high = 0.05, 4.05
     tx, rx = np.array([19.0, 1.25, 1.5]), np.array([[21.0, 3.05, 1.5]])
-    links = trace_links(PartialMap(state, 0.1), tx, rx, settings=SPECULAR, scene_settings=NO_FLOOR)
+    links = trace_links(PartialMap(state, 0.1), tx, rx, trace_settings=SPECULAR, scene_settings=NO_FLOOR)
     width, offsets = high - low, [rx[0, 1] - tx[1]]
     for count, first in itertools.product(range(1, 7), (low, high)):
         to_first = abs(tx[1] - first)
@@ -136,7 +136,7 @@ def test_corridor_of_two_walls_has_every_image() -> None:
 def test_reciprocity() -> None:
     partial = _room()
     a, b = np.array([0.75, 0.83, 1.2]), np.array([5.21, 0.61, 2.1])
-    there, back = (trace_links(partial, p, q[None], settings=SPECULAR) for p, q in ((a, b), (b, a)))
+    there, back = (trace_links(partial, p, q[None], trace_settings=SPECULAR) for p, q in ((a, b), (b, a)))
     assert there.link_state[0] == back.link_state[0] == LinkState.NLOS
     assert len(there.a) == len(back.a) > 10
     assert there.gain_db[0] == pytest.approx(back.gain_db[0], abs=0.01)
@@ -164,7 +164,7 @@ def test_line_of_sight_alone_at_depth_zero() -> None:
         _room(),
         (1.0, 1.0, 1.5),
         [[2.0, 3.0, 1.5], [5.0, 0.6, 1.5]],
-        settings=TraceSettings(power_tolerance_db=0.0, max_depth=0),
+        trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=0),
     )
     assert links.link_state.tolist() == [LinkState.LOS, LinkState.OUTAGE]
     assert links.path_rx.tolist() == [0]
@@ -183,11 +183,11 @@ def test_the_answer_depends_neither_on_the_other_receivers_nor_on_the_run(
     partial: PartialMap, settings: TraceSettings
 ) -> None:
     tx, rx = (1.05, 2.95, 1.5), _grid(partial, 0.3)
-    together, again = (trace_links(partial, tx, rx, settings=settings) for _ in range(2))
+    together, again = (trace_links(partial, tx, rx, trace_settings=settings) for _ in range(2))
     for name in ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m", "gain_db"):
         assert getattr(together, name).tobytes() == getattr(again, name).tobytes()
     some = np.arange(0, len(rx), 17)
-    apart = trace_links(partial, tx, rx[some], settings=settings)
+    apart = trace_links(partial, tx, rx[some], trace_settings=settings)
     np.testing.assert_array_equal(apart.link_state, together.link_state[some])
     np.testing.assert_array_equal(apart.gain_db, together.gain_db[some])
 
@@ -222,7 +222,7 @@ def test_moving_the_map_changes_nothing() -> None:
 @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
 def test_finds_every_path_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
     tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::29] + np.array([0.021, 0.013, 0.3])
-    links = trace_links(partial, tx, rx, settings=SPECULAR)
+    links = trace_links(partial, tx, rx, trace_settings=SPECULAR)
     scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
     paths = load_sionna().PathSolver(deterministic=True)(
         scene, max_depth=6, refraction=False, samples_per_src=100_000, max_num_paths_per_src=1_000_000
@@ -263,7 +263,7 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
         _room(),
         tx,
         rx,
-        settings=TraceSettings(power_tolerance_db=0.0, max_depth=1, refraction=True, samples_per_tx=1000),
+        trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=1, refraction=True, samples_per_tx=1000),
     )
     assert caplog.messages == [
         "refraction: Sionna RT shoots 1000 rays for one receiver after the other, and finds most paths, not all"
@@ -297,7 +297,7 @@ def test_positions_are_checked(tx: object, rx: object, message: str) -> None:
         trace_links(_room(), tx, rx)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", ["settings", "scene_settings"])
+@pytest.mark.parametrize("name", ["trace_settings", "scene_settings"])
 def test_settings_of_another_kind_are_named(name: str) -> None:
     with pytest.raises(SettingsError, match=rf"^{name} = 5 is not allowed: give \w+Settings\(\.\.\.\), or None"):
         trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], **{name: 5})  # type: ignore[arg-type]
@@ -325,7 +325,7 @@ def test_material_of_the_map_comes_before_that_of_the_settings() -> None:
 def test_links_shorter_than_friis_allows_are_refused() -> None:
     settings = TraceSettings(power_tolerance_db=0.0, frequency_hz=10e6)
     with pytest.raises(PositionError, match=r"is 1.* m from the transmitter.*: leave out receivers nearer than 2.39 m"):
-        trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], settings=settings)
+        trace_links(_room(), (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]], trace_settings=settings)
 
 
 def _screen() -> tuple[PartialMap, float]:
@@ -346,7 +346,7 @@ def test_the_field_behind_an_open_wall_end_follows_the_fresnel_integral() -> Non
     tx = np.array([edge_x, 0.55, 1.5])
     rx = np.column_stack([edge_x + np.linspace(-0.15, 0.15, 16), np.full(16, 7.05), np.full(16, 1.5)])
     settings = TraceSettings(power_tolerance_db=0.0, max_depth=1)
-    total = _field(trace_links(partial, tx, rx, settings=settings, scene_settings=NO_FLOOR), len(rx))
+    total = _field(trace_links(partial, tx, rx, trace_settings=settings, scene_settings=NO_FLOOR), len(rx))
     direct = WAVELENGTH_M / (4 * np.pi * np.linalg.norm(rx - tx, axis=1))
     before, after = 4.05 - tx[1], 7.05 - 4.05
     clearance = (rx[:, 0] - edge_x) * before / (before + after)
@@ -360,7 +360,7 @@ def test_diffracted_paths_are_reciprocal_and_need_no_rays() -> None:
     """The paths are; Sionna RT's coefficients of a dielectric wedge are not, as they depend on the lit face."""
     a, b = np.array([0.75, 0.83, 1.2]), np.array([5.21, 0.61, 2.1])
     settings = TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction=True, samples_per_tx=1)
-    there, back = (trace_links(_room(), p, q[None], settings=settings) for p, q in ((a, b), (b, a)))
+    there, back = (trace_links(_room(), p, q[None], trace_settings=settings) for p, q in ((a, b), (b, a)))
     diffracted = (there.interactions == 8).any(axis=1)
     assert diffracted.sum() == (back.interactions == 8).any(axis=1).sum() > 10
     assert ((there.interactions == 8).sum(axis=1) <= 1).all()
@@ -371,7 +371,9 @@ def test_diffracted_paths_are_reciprocal_and_need_no_rays() -> None:
 @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
 def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: PartialMap, tmp_path: Path) -> None:
     tx, rx = np.array([1.03, 2.93, 1.4]), _grid(partial, 0.3)[5::47] + np.array([0.021, 0.013, 0.3])
-    links = trace_links(partial, tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=3, open_ends=True))
+    links = trace_links(
+        partial, tx, rx, trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=3, open_ends=True)
+    )
     scene = _stock_scene(export_scene(partial, tmp_path / "scene"), tx, rx)
     paths = load_sionna().PathSolver(deterministic=True)(
         scene, max_depth=3, refraction=False, diffraction=True, edge_diffraction=True, samples_per_src=100_000
@@ -442,8 +444,8 @@ class TestMemory:
         rx = _grid(_room(), 0.04)
         assert len(rx) > 10_000
         with pytest.raises(MemoryLimitError, match=r"memory_gb = 0.01 is too little for about .* give a folder"):
-            trace_links(_room(), (1.05, 2.95, 1.5), rx, settings=SPECULAR, memory_gb=0.01)
+            trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR, memory_gb=0.01)
         (message,) = [message for message in caplog.messages if "paths" in message]
         estimate = int(message.split()[1])
-        links = trace_links(_room(), (1.05, 2.95, 1.5), rx, settings=SPECULAR)
+        links = trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR)
         assert len(links.a) == pytest.approx(estimate, rel=0.2)

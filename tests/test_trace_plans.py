@@ -90,7 +90,7 @@ class TestJunctions:
             partial,
             (1.05, 2.95, 1.5),
             _grid(partial, 0.5),
-            settings=TraceSettings(power_tolerance_db=0.0, open_ends=True),
+            trace_settings=TraceSettings(power_tolerance_db=0.0, open_ends=True),
         )
         edges = np.unique(links.vertices_m[links.interactions == 8][:, :2].round(2), axis=0)
         jambs = [[3.05, 1.45], [3.05, 2.55]]
@@ -106,7 +106,11 @@ class TestOpenEnds:
         scene = SceneSettings(floor_extent="none")
         quiet, asked = (
             trace_links(
-                partial, tx, rx, settings=TraceSettings(power_tolerance_db=0.0, open_ends=each), scene_settings=scene
+                partial,
+                tx,
+                rx,
+                trace_settings=TraceSettings(power_tolerance_db=0.0, open_ends=each),
+                scene_settings=scene,
             )
             for each in (False, True)
         )
@@ -124,7 +128,9 @@ class TestDiffractionSetting:
     def test_plans_diffract_unless_told_otherwise(self) -> None:
         tx, rx = (1.03, 0.52, 1.5), [[4.02, 0.93, 1.5]]
         default, on, off = (
-            trace_links(_room(), tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=2, diffraction=each))
+            trace_links(
+                _room(), tx, rx, trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=2, diffraction=each)
+            )
             for each in (None, True, False)
         )
         assert default.a.tobytes() == on.a.tobytes()
@@ -140,7 +146,7 @@ class TestCeiling:
         tx, rx = (1.05, 2.95, 1.5), _grid(_room(), 1.0)
         settings = TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction=diffraction)
         under, open_air = (
-            trace_links(_room(), tx, rx, settings=settings, scene_settings=SceneSettings(ceiling=each))
+            trace_links(_room(), tx, rx, trace_settings=settings, scene_settings=SceneSettings(ceiling=each))
             for each in (True, False)
         )
         below = ~(under.vertices_m[..., 2] > 3.0 - 1e-3).any(axis=1)
@@ -211,7 +217,8 @@ def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:
     )
     tx, rx = np.array([1.3, 1.7, 1.2]), np.array([[4.4, 2.2, 1.5], [3.9, 1.4, 1.9]])
     shallow, deep = (
-        trace_links(walls, tx, rx, settings=TraceSettings(power_tolerance_db=0.0, max_depth=depth)) for depth in (2, 3)
+        trace_links(walls, tx, rx, trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=depth))
+        for depth in (2, 3)
     )
     bent = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
     assert len(bent) > 3

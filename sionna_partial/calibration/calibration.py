@@ -149,7 +149,7 @@ def calibrate_materials(
     measurements: Any,
     *,
     start: Material | None = None,
-    settings: TraceSettings | None = None,
+    trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
     seed: int | None = None,
     progress: Progress | None = None,
@@ -177,11 +177,11 @@ def calibrate_materials(
         With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB] (see `measurements_of`).
     start : Material, optional
         Where the search begins; its thickness is kept. By default the material of the scene.
-    settings : TraceSettings, optional
+    trace_settings : TraceSettings, optional
         Refraction and diffuse reflection must be off; diffraction too on meshes.
     scene_settings : SceneSettings, optional
     seed : int, optional
-        Seed of the rays that find the paths of a mesh, in place of that in `settings`. Nothing else is drawn.
+        Seed of the rays that find the paths of a mesh, in place of that in `trace_settings`. Nothing else is drawn.
     progress : callable, optional
         Called as ``progress(fraction_done, message)``.
 
@@ -209,7 +209,7 @@ def calibrate_materials(
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     require(start is None or isinstance(start, Material), "start", start, "give a Material, or None for the scene's.")
-    settings, scene_settings = checked_settings(partial, settings, scene_settings)
+    settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
     require_places(partial, measured, settings.frequency_hz)

@@ -51,7 +51,7 @@ def calibrate(
             partial,
             measured,
             start=scene_settings.material if material else None,
-            settings=settings,
+            trace_settings=settings,
             scene_settings=scene_settings,
             progress=report,
         )
@@ -94,7 +94,7 @@ def place(
             partial,
             objective=objective,
             threshold_db=threshold,
-            height_m=height,
+            tx_height_m=height,
             seed=seed,
             rx_height_m=rx_height,
             predictor=predictor or None,

@@ -140,7 +140,7 @@ def place_transmitter(
         Called as ``progress(fraction_done, message)``.
     **options
         Fields of `sionna_partial.settings.PlacementSettings`: `objective` ("coverage", the default, or "percentile"),
-        `threshold_db` (-100 dB), `height_m` and `rx_height_m` (1.5 m), and `seed` (0).
+        `threshold_db` (-100 dB), `tx_height_m` and `rx_height_m` (1.5 m), and `seed` (0).
 
     Returns
     -------
@@ -173,7 +173,7 @@ def place_transmitter(
     scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
     trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     low_m, high_m = partial.height_range_m
-    for name in ("height_m", "rx_height_m"):
+    for name in ("tx_height_m", "rx_height_m"):
         height_m = getattr(settings, name)
         require_number(name, height_m, low_m, high_m, open_low=True)
         require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
@@ -182,7 +182,7 @@ def place_transmitter(
     model = None
     if not partial.is_complete:
         model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
-    area = placement_area(partial, float(settings.height_m), float(settings.rx_height_m), model)
+    area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
     thinned = area.thinned(RECEIVERS)
     with temporary_folder() as folder:
         objective = _Objective(Tracer(partial, folder, trace_settings, scene_settings), model, settings)

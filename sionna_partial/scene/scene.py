@@ -92,9 +92,9 @@ class SceneGeometry:
         return _triangles(self.floor_m, self.cell_m)
 
 
-def scene_settings_of(partial: PartialMap, settings: SceneSettings | None, name: str = "settings") -> SceneSettings:
-    """Return the settings of a map's scene, called `name` in messages, with the map's own material, if it has one."""
-    settings = settings_or_default(name, settings, SceneSettings)
+def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> SceneSettings:
+    """Return the settings of a map's scene, with the map's own material, if it has one."""
+    settings = settings_or_default("scene_settings", settings, SceneSettings)
     default = partial.material or settings.material
     used = {default} if partial.mesh is None else partial.mesh.used_materials(default)
     if used and settings.material not in (Material(), *used):
@@ -131,7 +131,7 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
 def export_scene(
     partial: PartialMap,
     folder: str | os.PathLike[str],
-    settings: SceneSettings | None = None,
+    scene_settings: SceneSettings | None = None,
     *,
     frequency_hz: float = CARRIER_FREQUENCY_HZ,
 ) -> Path:
@@ -150,7 +150,7 @@ def export_scene(
     partial : PartialMap
     folder : path-like
         New or empty folder, or an exported scene that is replaced.
-    settings : SceneSettings, optional
+    scene_settings : SceneSettings, optional
         Tolerances, floor extent and material.
     frequency_hz : float
         Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
@@ -177,7 +177,7 @@ def export_scene(
     (['map.pgm', 'map.yaml', 'meshes', 'scene.xml'], True)
     """
     require_map("partial", partial)
-    settings = scene_settings_of(partial, settings)
+    settings = scene_settings_of(partial, scene_settings)
     material = settings.material
     if partial.mesh is None:
         materials = {material}

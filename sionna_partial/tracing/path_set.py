@@ -407,7 +407,7 @@ def gain_gradients(
     tx: ArrayLike,
     rx: ArrayLike,
     *,
-    settings: TraceSettings | None = None,
+    trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
     progress: Progress | None = None,
 ) -> GainGradients:
@@ -425,7 +425,7 @@ def gain_gradients(
         Transmitter position [m].
     rx : (N, 3) array-like
         Receiver positions [m]; N may be 0.
-    settings : TraceSettings, optional
+    trace_settings : TraceSettings, optional
         Refraction and diffuse reflection must be off; diffraction too on meshes.
     scene_settings : SceneSettings, optional
     progress : callable, optional
@@ -463,7 +463,7 @@ def gain_gradients(
     [-0.3102]
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    settings, scene_settings = path_settings(partial, settings, scene_settings)
+    settings, scene_settings = path_settings(partial, trace_settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, one_transmitter(tx), rx, settings.frequency_hz)
     report = progress or no_progress
     report(0.0, "building the scene")

@@ -112,7 +112,7 @@ def trace_links(
     tx: ArrayLike,
     rx: ArrayLike,
     *,
-    settings: TraceSettings | None = None,
+    trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
     folder: str | Path | None = None,
     memory_gb: float = MEMORY_GB,
@@ -136,7 +136,7 @@ def trace_links(
         Transmitter positions [m].
     rx : (N, 3) array-like
         Receiver positions [m]; N may be 0.
-    settings : TraceSettings, optional
+    trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     folder : path, optional
         Where the paths are written while they are traced, an `.npy` file for each array. The arrays of the result are
@@ -177,7 +177,7 @@ def trace_links(
     [-67.41]
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    settings, scene_settings = checked_settings(partial, settings, scene_settings)
+    settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
     shape, report = np.shape(tx), progress or no_progress
     report(0.0, "building the scene")
@@ -322,8 +322,8 @@ def checked_settings(
 
     Raises a SettingsError unless all materials cover the frequency.
     """
-    settings = settings_or_default("settings", settings, TraceSettings)
-    scene_settings = scene_settings_of(partial, scene_settings, "scene_settings")
+    settings = settings_or_default("trace_settings", settings, TraceSettings)
+    scene_settings = scene_settings_of(partial, scene_settings)
     default = scene_settings.material
     for material in {default} if partial.mesh is None else partial.mesh.used_materials(default):
         material.require_frequency(settings.frequency_hz)
