@@ -392,8 +392,8 @@ def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz
             f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
             "those that are near each other."
         )
-    rx_m = partial.require_positions("rx of the measurements", measured.rx)
-    usable = clear_of_walls(partial, rx_m) & (np.linalg.norm(rx_m - tx_m, axis=1) >= nearest_m(frequency_hz))
+    usable = np.linalg.norm(measured.rx - tx_m, axis=1) >= nearest_m(frequency_hz)
+    usable &= clear_of_walls(partial, measured.rx)
     if not usable.any():
         raise MeasurementError(
             f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
@@ -402,7 +402,9 @@ def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz
     if not usable.all():
         message = "%d of %d measurements are not used: their receivers are in walls or at the transmitter"
         _log.warning(message, int((~usable).sum()), len(usable))
-    return measured.take(usable)
+    measured = measured.take(usable)
+    partial.require_positions("rx of the measurements", measured.rx)
+    return measured
 
 
 def _assimilated(links: _Links, measured: Measurements, at_once: int) -> Assimilation:

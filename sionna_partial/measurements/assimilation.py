@@ -30,8 +30,8 @@ UNKNOWN_COST = 3.0
 REACH_M = {"unseen": 14.0, "seen": 0.8}
 """Walk over which residuals stay correlated, by whether the transmitter is in a cell that was seen [m]."""
 
-SHARED_VARIANCE = 0.9
-"""Fraction of the variance of residuals that receivers side by side share."""
+LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
+"""Fraction of the variance of residuals that is correlated over this walk only [m]."""
 
 TRACE_STD_DB = 3.0
 """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
@@ -39,7 +39,7 @@ TRACE_STD_DB = 3.0
 NOISES_DB, LIKELY_NOISE_DB = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0
 """Standard deviations of measurements that are tried where none is given, and the likeliest before [dB]."""
 
-OFFSETS_DB = {1.0: 0.95, 40.0: 0.05}
+OFFSETS_DB = {1.0: 0.999, 40.0: 0.001}
 """Standard deviations of the offset of measurements [dB], and how likely: of path gains, and of powers as received."""
 
 MOST_POINTS = 500
@@ -138,7 +138,7 @@ class Assimilation:
         scale_db = averaged(np.hypot(prior.gain_std_db, TRACE_STD_DB))
         residual = averaged(np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db) / scale_db
         self._walks = _Walks(partial, rx_m[first], _REACHES * self._reach_m)
-        shape = _positive(self._correlation(rx_m[first]), SHARED_VARIANCE)
+        shape = _positive(self._correlation(rx_m[first]))
         given_db = None if std_db is None else np.sqrt(averaged(std_db**2) / count)
         tries = [given_db] if given_db is not None else [noise / np.sqrt(count) for noise in NOISES_DB]
         noise_db, offset_std_db = _likeliest(shape, residual, scale_db, heard, tries, is_given=given_db is not None)
@@ -175,7 +175,8 @@ class Assimilation:
 
     def _correlation(self, rx_m: Floats) -> Floats:
         """Correlation (M, N) of residuals at the measured places and at other receivers."""
-        return SHARED_VARIANCE * np.exp(-self._walks.lengths_m(rx_m) / self._reach_m)
+        walks_m = self._walks.lengths_m(rx_m)
+        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / self._reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
 def _places(rx_m: Floats, heard: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
@@ -192,12 +193,10 @@ def _places(rx_m: Floats, heard: Bools) -> tuple[NDArray[np.intp], NDArray[np.in
         edge_m *= 1.5
 
 
-def _positive(correlation: Floats, shared: float) -> Floats:
+def _positive(correlation: Floats) -> Floats:
     """Correlation (P, P) of the places among each other, made positive definite: walks are no Euclidean distances."""
-    matrix = 0.5 * (correlation + correlation.T)
-    matrix[np.diag_indices_from(matrix)] = 1.0
-    values, vectors = np.linalg.eigh(matrix)
-    return matrix if values[0] > 0.1 * (1 - shared) else (vectors * np.maximum(values, 0.1 * (1 - shared))) @ vectors.T
+    values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
+    return (vectors * np.maximum(values, _LEAST_TOLD)) @ vectors.T
 
 
 def _likeliest(

@@ -1,0 +1,192 @@
+"""Measured gains change predictions where they tell something, and nothing else."""
+
+import logging
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from extruded import drawn
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+import sionna_partial as sp
+from sionna_partial.cli import app
+from sionna_partial.errors import MeasurementError, PositionError
+from sionna_partial.measurements.assimilation import MOST_POINTS, Assimilation
+
+HOUSE = drawn(
+    """
+    ########################
+    #..........#??????????##
+    #..........#???????????#
+    #..........#???????????#
+    #......................?
+    #......................?
+    #..........#..........##
+    #..........#..........##
+    ########################
+    """,
+    resolution_m=0.4,
+)
+TX = np.array([8.0, 2.2, 1.5])
+UNSEEN = np.array([7.0, 2.8, 1.5])
+RNG = np.random.default_rng(0)
+LEFT = np.column_stack([RNG.uniform(0.6, 4.2, 30), RNG.uniform(0.6, 3.0, 30), np.full(30, 1.5)])
+RIGHT = np.column_stack([RNG.uniform(5.0, 8.4, 30), RNG.uniform(0.6, 1.8, 30), np.full(30, 1.5)])
+
+
+def prior(count: int, p_outage: float = 0.5, mean_db: float = -95.0, std_db: float = 8.0) -> sp.LinkPrediction:
+    """Links that are in NLOS or in outage."""
+    ones = np.ones(count)
+    return sp.LinkPrediction.of_parts(
+        np.stack([p_outage * ones, 0.0 * ones, (1 - p_outage) * ones]),
+        np.stack([-150.0 * ones, -70.0 * ones, mean_db * ones]),
+        np.stack([0.0 * ones, 3.0 * ones, std_db * ones]),
+    )
+
+
+def told(
+    rx_m: NDArray[np.float64],
+    gain_db: NDArray[np.float64],
+    partial: sp.PartialMap = HOUSE,
+    p_outage: float = 0.5,
+    **options: object,
+) -> Assimilation:
+    measured = sp.Measurements(UNSEEN, rx_m, gain_db, **options)
+    return Assimilation(partial, UNSEEN, measured, prior(len(rx_m), p_outage))
+
+
+def test_what_is_measured_is_what_is_predicted_there():
+    gains_db = np.where(LEFT[:, 0] > 2.5, -85.0, -100.0)
+    after = told(LEFT, gains_db, std_db=1.0).update(LEFT, prior(30))
+    assert np.abs(after.gain_mean_db - gains_db).mean() < 4.0
+    assert (after.gain_std_db < prior(30).gain_std_db / 2).all()
+    assert (after.p_outage < 0.05).all()
+
+
+@pytest.mark.parametrize(("gain_db", "rises"), [(-90.0, False), (-120.0, True)])
+def test_neighbours_hear_what_a_measurement_hears(gain_db, rises):
+    """A gain at the sensitivity is known to be no higher, which makes an outage likelier."""
+    at, beside = LEFT[:1], LEFT[:1] + [0.5, 0.0, 0.0]
+    after = told(at, np.array([gain_db]), sensitivity_db=-120.0).update(beside, prior(1))
+    assert (after.p_outage[0] > 0.6) if rises else (after.p_outage[0] < 0.3)
+
+
+def test_walls_stop_what_measurements_tell():
+    closed = drawn(
+        """
+        #######
+        #..#..#
+        #..#..#
+        #######
+        """
+    )
+    here, there = np.array([[1.0, 1.0, 1.5]]), np.array([[2.5, 1.0, 1.5]])
+    measured = told(here, np.array([-80.0]), closed)
+    before, after = prior(1), measured.update(there, prior(1))
+    assert all(getattr(before, each.name) == getattr(after, each.name) for each in fields(after))
+    assert measured.update(here, prior(1)).p_outage[0] < 0.3
+
+
+def test_a_certain_state_stays_and_its_gain_heeds_the_measurement():
+    certain = prior(30, p_outage=0.0, mean_db=-80.0, std_db=0.0)
+    measured = sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0))
+    after = Assimilation(HOUSE, UNSEEN, measured, certain).update(LEFT, certain)
+    assert (after.p_nlos == 1.0).all()
+    assert (after.gain_std_db == 0.0).all()
+    assert np.abs(after.gain_mean_db + 84.0).max() < 2.0
+
+
+def test_what_measurements_have_in_common_is_an_offset():
+    """Powers in dBm, with transmit power and antenna gains, tell as much as path gains do."""
+    gains_db = np.where(LEFT[:, 0] > 2.5, -90.0, -98.0)
+    truth, shifted = told(LEFT, gains_db, p_outage=0.0), told(LEFT, gains_db + 60.0, p_outage=0.0)
+    assert abs(truth.offset_db) < 1.0
+    assert shifted.offset_db == pytest.approx(60.0, abs=8.0)
+    after, other = (each.update(LEFT, prior(30, 0.0)).gain_mean_db for each in (truth, shifted))
+    assert np.abs(after - gains_db).max() < 4.0
+    assert np.abs(other - after).max() < 8.0
+
+
+def test_contradictions_count_as_noise():
+    twice = np.concatenate([LEFT, LEFT + [0.05, 0.0, 0.0]])
+    agreeing, contrary = (told(twice, np.repeat([-90.0, -90.0 - gap], 30)) for gap in (0.5, 18.0))
+    assert contrary.noise_db > 2 * agreeing.noise_db
+    assert contrary.update(LEFT, prior(30)).gain_std_db.mean() > agreeing.update(LEFT, prior(30)).gain_std_db.mean()
+    assert told(LEFT, np.full(30, -90.0), std_db=2.5).noise_db == pytest.approx(2.5)
+
+
+def test_thousands_of_measurements_are_averaged_where_they_are_dense():
+    many = np.column_stack([RNG.uniform(0.6, 4.2, 5000), RNG.uniform(0.6, 3.0, 5000), np.full(5000, 1.5)])
+    measured = told(many, -90.0 + 3.0 * RNG.standard_normal(5000))
+    assert len(measured._weights) <= MOST_POINTS
+    assert np.abs(measured.update(LEFT, prior(30)).gain_mean_db + 90.0).max() < 4.0
+
+
+class TestPredictMap:
+    OPTIONS = {"spacing_m": 0.4, "predictor": "paper"}
+
+    def table(self, gain_db: float = -75.0, rx: NDArray[np.float64] = LEFT) -> dict[str, object]:
+        return {"tx": TX, "rx": rx, "gain_db": np.full(len(rx), gain_db), "std_db": np.full(len(rx), 1.0)}
+
+    def test_a_hidden_transmitter_is_heard(self):
+        before = sp.predict_map(HOUSE, UNSEEN, **self.OPTIONS)
+        table = self.table() | {"tx": UNSEEN}
+        after = sp.predict_map(HOUSE, UNSEEN, measurements=table, **self.OPTIONS)
+        left = (after.x < 4.0) & (after.y < 3.0) & after.valid
+        assert float(after.p_outage.where(left).mean()) < float(before.p_outage.where(left).mean())
+        assert float(np.abs(after.gain_mean_db + 75.0).where(left).mean()) < 3.0
+        assert after.attrs["measured_links"] == len(LEFT)
+        assert after.attrs["measured_noise_db"] == pytest.approx(1.0)
+
+    def test_offsets_of_powers_are_named(self, caplog):
+        with caplog.at_level(logging.WARNING):
+            coverage = sp.predict_map(HOUSE, TX, measurements=self.table(-20.0), **self.OPTIONS)
+        assert "dB above the predicted ones: taken for an offset" in caplog.text
+        assert coverage.attrs["measured_offset_db"] > 30.0
+
+    def test_receivers_in_walls_are_left_out(self, caplog):
+        table = self.table(rx=np.concatenate([LEFT, [[0.2, 0.2, 1.5]]]))
+        with caplog.at_level(logging.WARNING):
+            coverage = sp.predict_map(HOUSE, TX, measurements=table, **self.OPTIONS)
+        assert "1 of 31 measurements are not used" in caplog.text
+        assert coverage.attrs["measured_links"] == 30
+
+    @pytest.mark.parametrize(
+        ("change", "error", "message"),
+        [
+            ({"tx": TX - 2.0}, MeasurementError, "none within 0.5 m of tx"),
+            ({"rx": np.tile([0.2, 0.2, 1.5], (30, 1))}, MeasurementError, "in walls or at the transmitter"),
+            ({"rx": LEFT + 99.0}, PositionError, "rx of the measurements"),
+            ({"std_db": -1.0}, MeasurementError, r"std_db\[\] = -1 is not allowed"),
+            ({"std_db": [1.0, 2.0]}, MeasurementError, r"std_db has shape \(2,\)"),
+            ({"sensitivity_db": -999}, MeasurementError, "sensitivity_db = -999 is not allowed"),
+            ({"gain_db": np.full(30, 3.0)}, MeasurementError, "path gains are negative"),
+        ],
+    )
+    def test_unusable_measurements_are_refused(self, change, error, message):
+        with pytest.raises(error, match=message):
+            sp.predict_map(HOUSE, TX, measurements=self.table() | change, **self.OPTIONS)
+
+    def test_too_many_measurements_are_refused(self):
+        rx = np.repeat(LEFT, 1000, axis=0)
+        with pytest.raises(MeasurementError, match="30,000 links of this transmitter, more than 20,000"):
+            sp.predict_map(HOUSE, TX, measurements=self.table(rx=rx), **self.OPTIONS)
+
+    def test_the_command_reads_a_csv(self, tmp_path):
+        sp.save_map(HOUSE, tmp_path / "house.yaml")
+        rows = [",".join(f"{value:g}" for value in (*TX, *rx, -75.0, 2.0)) for rx in LEFT]
+        header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db,std_db"
+        (tmp_path / "measured.csv").write_text("\n".join([header, *rows, ""]))
+        command = ["predict", tmp_path / "house.yaml", "--tx", *TX, "--measurements", tmp_path / "measured.csv"]
+        command += ["--out", tmp_path / "out", "--spacing", 0.8, "--predictor", "paper", "--format", ".nc"]
+        result = CliRunner().invoke(app, [str(word) for word in command])
+        assert result.exit_code == 0, result.output
+        assert (tmp_path / "out" / "coverage.nc").exists()
+
+
+def test_measurements_can_be_selected():
+    measured = sp.Measurements(TX, LEFT, np.full(30, -80.0), 2.0, -110.0)
+    some = measured.take(np.array([3, 5]))
+    assert (len(some), some.sensitivity_db, some.std_db.tolist()) == (2, -110.0, [2.0, 2.0])
+    assert replace(measured, std_db=None).take(np.array([3])).std_db is None
