@@ -18,7 +18,7 @@ from PIL import Image
 from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.style import BLUE, RED, YELLOW, corners_m, figure_png, legend_below, window_m
+from sionna_partial.plots.style import BLUE, RED, YELLOW, corners_m, figure_png, legend_below, sheet_columns, window_m
 from sionna_partial.simulation.camera import view_corners_m
 from sionna_partial.simulation.explore import Exploration
 
@@ -30,7 +30,7 @@ MAX_PANELS = 12
 
 _FREE, _WALL, _UNKNOWN, _UNSEEN_WALL = "white", "black", "0.86", "0.68"
 _VIEW_OPACITY = 0.35
-_WIDTH_IN, _SHEET_ASPECT, _DPI = 12.0, 1.5, 110
+_WIDTH_IN, _DPI = 12.0, 110
 _FRAME_IN, _FRAME_DPI = 5.6, 90
 _MIXED_COLOURS, _ALIKE = 128, 16
 
@@ -64,7 +64,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     count = min(len(exploration.steps), MAX_PANELS)
     shown = np.linspace(len(exploration.steps) - 1, 0, count).astype(np.intp)[::-1]
     x0, x1, y0, y1 = _window_m(exploration)
-    columns = _columns(count, (x1 - x0) / (y1 - y0))
+    columns = sheet_columns(count, (x1 - x0) / (y1 - y0))
     rows = math.ceil(count / columns)
     width = _WIDTH_IN / max(columns, 2)
     size = (width * columns, rows * ((width - 0.4) * (y1 - y0) / (x1 - x0) + 0.3) + 0.9)
@@ -118,16 +118,6 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) 
 def _require_exploration(value: object) -> None:
     remedy = "give an Exploration, as explore_trajectory returns it."
     require(isinstance(value, Exploration), "exploration", type(value).__name__, remedy)
-
-
-def _columns(count: int, aspect: float) -> int:
-    """Choose the columns of a sheet of panels that is neither high nor wide, and has few empty panels."""
-
-    def fault(columns: int) -> float:
-        rows = math.ceil(count / columns)
-        return abs(math.log(columns * aspect / rows / _SHEET_ASPECT)) + (rows * columns - count) / count
-
-    return min(range(1, count + 1), key=fault)
 
 
 def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> Image.Image:
