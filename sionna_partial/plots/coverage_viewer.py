@@ -104,7 +104,8 @@ def _viewer(coverage: xr.Dataset) -> Any:
     _add_hover(plot, [images[0] for images in parts.values()])
     _add_map(plot, coverage)
     titles = {name: layers[name].title for name in _LAYERS} | {"p_above": "P(path gain > threshold)"}
-    choice = Select(title="Layer", value=_LAYERS[0], options=list(titles.items()), name="layer")
+    options: list[str | tuple[Any, str]] = [*titles.items()]
+    choice = Select(title="Layer", value=_LAYERS[0], options=options, name="layer")
     slider = Slider(title="Threshold [dB]", start=-150, end=-40, step=1, value=THRESHOLD_DB, name="threshold")
     show = CustomJS(args={"layers": parts, "choice": choice, "slider": slider, "title": plot.title}, code=_SHOW)
     choice.js_on_change("value", show)
@@ -119,8 +120,8 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
     x0, x1, y0, y1 = extent_m(coverage)
     height = int(np.clip(_WIDTH * (y1 - y0) / (x1 - x0), *_HEIGHTS))
     plot: Any = figure(
-        x_range=Range1d(x0, x1),
-        y_range=Range1d(y0, y1),
+        x_range=Range1d(start=x0, end=x1),
+        y_range=Range1d(start=y0, end=y1),
         frame_width=round(height * (x1 - x0) / (y1 - y0)) if height == _HEIGHTS[1] else _WIDTH,
         frame_height=height,
         x_axis_label="x [m]",

@@ -30,7 +30,7 @@ MAX_PANELS = 12
 
 _FREE, _WALL, _UNKNOWN, _UNSEEN_WALL = "white", "black", "0.86", "0.68"
 _VIEW_OPACITY = 0.35
-_WIDTH_IN, _DPI = 12.0, 110
+_WIDTH_IN, _DPI = 8.0, 165
 _FRAME_IN, _FRAME_DPI = 5.6, 90
 _MIXED_COLOURS, _ALIKE = 128, 16
 
@@ -75,7 +75,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     for index, panel in zip(shown, axes.flat[:count], strict=True):
         _draw(panel, exploration, int(index))
         panel.label_outer()
-    _add_legend(figure, exploration, in_one_row=columns > 1)
+    _add_legend(figure, exploration)
     return figure
 
 
@@ -183,16 +183,17 @@ def _drifts(exploration: Exploration) -> bool:
     return not np.array_equal(exploration.poses, exploration.believed_poses)
 
 
-def _add_legend(figure: Figure, exploration: Exploration, *, in_one_row: bool) -> None:
+def _add_legend(figure: Figure, exploration: Exploration) -> None:
+    unseen, walls = exploration.states == CellState.UNKNOWN, exploration.home.state == CellState.WALL
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=BLUE, marker="o", markersize=4, markevery=[0], label="trajectory"),
         Line2D([], [], color=RED, marker=_arrow(0.0), markersize=10, linestyle="none", label="robot"),
-        Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="field of view"),
+        *([Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="field of view")] if any(exploration.steps) else []),
         Patch(color=_WALL, label="wall, seen"),
-        Patch(color=_UNSEEN_WALL, label="wall, not seen"),
+        *([Patch(color=_UNSEEN_WALL, label="wall, not seen")] if (unseen & walls).any() else []),
         Patch(color=_UNKNOWN, label="not seen"),
     ]
     if _drifts(exploration):
         handles[0].set_label("estimated trajectory")
         handles.insert(1, Line2D([], [], color=BLUE, linewidth=1.0, linestyle=":", label="true trajectory"))
-    legend_below(figure, handles, None if in_one_row else 3)
+    legend_below(figure, handles, 3)

@@ -56,7 +56,7 @@ def corners_m(cells: NDArray[np.bool_], origin_m: tuple[float, float], resolutio
 
 
 def sheet_columns(count: int, aspect: float) -> int:
-    """Choose the columns of a sheet of panels that is neither high nor wide, and has few empty panels, none of up to four."""
+    """Choose the columns of a sheet that is neither high nor wide, with few empty panels; none of up to four panels."""
 
     def fault(columns: int) -> float:
         rows = math.ceil(count / columns)
