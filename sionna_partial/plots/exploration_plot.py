@@ -67,7 +67,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     columns = sheet_columns(count, (x1 - x0) / (y1 - y0))
     rows = math.ceil(count / columns)
     width = _WIDTH_IN / max(columns, 2)
-    size = (width * columns, rows * ((width - 0.4) * (y1 - y0) / (x1 - x0) + 0.3) + 0.9)
+    size = (width * columns, rows * ((width - 0.4) * (y1 - y0) / (x1 - x0) + 0.3) + 1.25)
     figure = Figure(figsize=size, dpi=_DPI, layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for panel in axes.flat[count:]:
