@@ -1,5 +1,7 @@
 """The HTML page of a coverage map: what is in it, and what a browser without network makes of it."""
 
+import base64
+import gzip
 import json
 import re
 import shutil
@@ -8,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xarray as xr
 from coverage_fakes import small_coverage, use_fakes
 from matplotlib.colors import to_rgb
 from PIL import Image
@@ -55,17 +58,26 @@ def browse(page: Path, *flags: str) -> str:
     return result.stdout
 
 
+def screenshot(page: Path) -> np.ndarray:
+    """Colours of the page in the browser, 0 to 255."""
+    browse(page, f"--screenshot={page.with_suffix('.png')}")
+    with Image.open(page.with_suffix(".png")) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
 @pytest.mark.skipif(not CHROMIUM, reason="there is no browser")
 class TestInABrowser:
     def test_the_likeliest_states_are_seen_first(self, coverage, tmp_path):
         save_coverage(coverage, tmp_path / "coverage.html")
-        browse(tmp_path / "coverage.html", f"--screenshot={tmp_path / 'page.png'}")
-        with Image.open(tmp_path / "page.png") as image:
-            picture = np.asarray(image.convert("RGB")).astype(int)
+        picture = screenshot(tmp_path / "coverage.html")
         for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE):
             colour = np.rint(255 * np.array(to_rgb(STATE_COLOURS[state]))).astype(int)
             assert (np.abs(picture - colour).max(axis=2) < 2).sum() > 2000, state
-        assert (picture.max(axis=2) == 0).sum() > 500
+        assert (picture.max(axis=2) == 0).sum() > 5000
+
+    def test_a_map_without_walls_has_no_black_area(self, coverage, tmp_path):
+        save_coverage(coverage.assign(wall_parts=0 * coverage["wall_parts"]), tmp_path / "coverage.html")
+        assert (screenshot(tmp_path / "coverage.html").max(axis=2) == 0).sum() < 5000
 
     def test_the_slider_moves_the_threshold(self, coverage, tmp_path):
         save_coverage(coverage, tmp_path / "coverage.html")
@@ -85,6 +97,25 @@ def test_nothing_is_loaded_from_elsewhere(coverage, tmp_path):
     text = (tmp_path / "coverage.html").read_text(encoding="utf-8")
     assert "default-src 'none'" in text
     assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)=", re.sub(r"(?s)<script>.*?</script>", "", text))
+
+
+def test_the_outside_of_a_complete_map_has_no_values(coverage, tmp_path):
+    pages = []
+    for complete in (0, 1):
+        coverage.attrs["map_complete"] = complete
+        save_coverage(coverage, tmp_path / "coverage.html")
+        pages.append(values_of(tmp_path / "coverage.html", coverage))
+    expected = np.where(coverage["observed"], coverage["p_los"], np.nan)
+    np.testing.assert_array_equal(pages[0], coverage["p_los"])
+    np.testing.assert_array_equal(pages[1], expected)
+
+
+def values_of(page: Path, coverage: xr.Dataset) -> np.ndarray:
+    """P(LOS) as the page has it."""
+    text = page.read_text(encoding="utf-8")
+    (data,) = re.findall(r'\["p_los", \[\{"type": "ndarray", "array": \{"type": "bytes", "data": "([^"]+)"', text)
+    values = np.frombuffer(gzip.decompress(base64.b64decode(data)), dtype=np.float32)
+    return values.reshape(coverage["p_los"].shape)
 
 
 def test_names_in_a_file_are_text(coverage, tmp_path):

@@ -235,7 +235,7 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset 
     wall = wall_cells(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
     axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=layer.norm, cmap=layer.cmap)
-    axis.imshow(shade(_outside(coverage), grey=255), extent=extent, origin="lower", interpolation="nearest")
+    axis.imshow(shade(outside(coverage), grey=255), extent=extent, origin="lower", interpolation="nearest")
     _hatch_unknown(axis, coverage)
     if reference is not None:
         axis.imshow(
@@ -265,7 +265,7 @@ def wall_cells(coverage: xr.Dataset) -> NDArray[np.bool_]:
     return wall.reshape(bits.shape[0] * fine, bits.shape[1] * fine)
 
 
-def _outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
+def outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
     """Where nobody can be: the unknown cells of a complete map."""
     return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
 
@@ -285,7 +285,7 @@ def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[
 
 def _hatched(coverage: xr.Dataset) -> NDArray[np.bool_]:
     """Unobserved cells that a receiver may be in."""
-    return ~coverage["observed"].to_numpy() & ~_outside(coverage)
+    return ~coverage["observed"].to_numpy() & ~outside(coverage)
 
 
 def unobserved_area(coverage: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

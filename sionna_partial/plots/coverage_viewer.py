@@ -8,16 +8,24 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
-from matplotlib.colors import ListedColormap, to_hex
+from matplotlib.colors import to_hex
 
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import COMPONENTS, DISTRIBUTION
-from sionna_partial.plots.coverage_plot import Layer, coverage_layers, extent_m, headline, unobserved_area, wall_cells
+from sionna_partial.plots.coverage_plot import (
+    Layer,
+    coverage_layers,
+    extent_m,
+    headline,
+    outside,
+    unobserved_area,
+    wall_cells,
+)
 
 THRESHOLD_DB = -100.0
 """Threshold of P(gain > threshold) before the slider is moved [dB]."""
 
-_WIDTH, _HEIGHTS, _COLOURS = 760, (160, 1000), 256
+_WIDTH, _HEIGHT, _SHORTEST, _COLOURS = 760, 1000, 60, 256
 _LAYERS = ("link_state", "p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db", "p_above")
 _STATES = {LinkState.OUTAGE: "outage", LinkState.LOS: "LOS", LinkState.NLOS: "NLOS"}
 _TOOLTIPS = (
@@ -118,12 +126,12 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
     from bokeh.plotting import figure
 
     x0, x1, y0, y1 = extent_m(coverage)
-    height = int(np.clip(_WIDTH * (y1 - y0) / (x1 - x0), *_HEIGHTS))
+    pixels_per_m = min(_WIDTH / (x1 - x0), _HEIGHT / (y1 - y0))
     plot: Any = figure(
         x_range=Range1d(start=x0, end=x1),
         y_range=Range1d(start=y0, end=y1),
-        frame_width=round(height * (x1 - x0) / (y1 - y0)) if height == _HEIGHTS[1] else _WIDTH,
-        frame_height=height,
+        frame_width=max(round(pixels_per_m * (x1 - x0)), _SHORTEST),
+        frame_height=max(round(pixels_per_m * (y1 - y0)), _SHORTEST),
         x_axis_label="x [m]",
         y_axis_label="y [m]",
         title=coverage_layers(THRESHOLD_DB)[_LAYERS[0]].title,
@@ -139,13 +147,13 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
 
 
 def _source(coverage: xr.Dataset, layers: dict[str, Layer]) -> Any:
-    """Values (ny, nx) of one transmitter in one row; NaN where no receiver can stand."""
+    """Values (ny, nx) in one row; NaN where no receiver can stand, and outside a complete map."""
     from bokeh.models import ColumnDataSource
 
     values = {name: layer.picture(coverage) for name, layer in layers.items()}
     others = {*DISTRIBUTION, *COMPONENTS, "unobserved_distance_m"} - values.keys()
     values |= {name: coverage[name].to_numpy() for name in sorted(others)}
-    valid = coverage["valid"].to_numpy()
+    valid = coverage["valid"].to_numpy() & ~outside(coverage)
     columns = {name: [np.where(valid, each, np.nan).astype(np.float32)] for name, each in values.items()}
     return ColumnDataSource(columns, name="values")
 
@@ -157,7 +165,7 @@ def _add_layer(plot: Any, source: Any, coverage: xr.Dataset, name: str, layer: L
 
     assert layer.norm
     assert layer.cmap
-    listed = isinstance(layer.cmap, ListedColormap) and name == "link_state"
+    listed = name == "link_state"
     cmap, half = colormaps.get_cmap(layer.cmap), 0.5 * listed
     palette = [to_hex(colour) for colour in cmap(np.linspace(0.0, 1.0, len(_STATES) if listed else _COLOURS))]
     low, high = float(layer.norm.vmin or 0.0) - half, float(layer.norm.vmax or 0.0) + half
@@ -184,6 +192,8 @@ def _add_hover(plot: Any, images: list[Any]) -> None:
 
 def _add_map(plot: Any, coverage: xr.Dataset) -> None:
     """Draw the unobserved area hatched, the walls black, and the transmitter."""
+    from bokeh.models import LinearColorMapper
+
     x0, x1, y0, y1 = extent_m(coverage)
     x, y, unknown = unobserved_area(coverage)
     if unknown.any():
@@ -200,6 +210,7 @@ def _add_map(plot: Any, coverage: xr.Dataset) -> None:
             hatch_scale=40.0,
         )
     wall = wall_cells(coverage).astype(np.uint8)
-    plot.image(image=[wall], x=x0, y=y0, dw=x1 - x0, dh=y1 - y0, palette=["#00000000", "#000000"])
+    black = LinearColorMapper(palette=["#00000000", "#000000"], low=0, high=1)
+    plot.image(image=[wall], x=x0, y=y0, dw=x1 - x0, dh=y1 - y0, color_mapper=black)
     x_tx, y_tx, _ = coverage.attrs["transmitter_m"]
     plot.scatter([x_tx], [y_tx], marker="star", size=18, fill_color="white", line_color="black")
