@@ -85,7 +85,7 @@ class TestPredict:
             "receivers": "indoor",
             "memory_gb": 2.0,
         }
-        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
+        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
         assert [(coverage, path.name) for coverage, path in calls[1:]] == [("coverage", name) for name in names]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in names]
 

@@ -125,7 +125,7 @@ def plot_coverage(
     chosen = _choose(layers, threshold_db)
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
     columns = sheet_columns(len(chosen), aspect)
-    figure, axes = _panels(math.ceil(len(chosen) / columns), columns, aspect, bars=columns)
+    figure, axes = _panels(math.ceil(len(chosen) / columns), columns, aspect, keys_in=0.95 * columns)
     panels = list(itertools.chain(*axes))
     for axis in panels[len(chosen) :]:
         axis.set_axis_off()
@@ -150,7 +150,7 @@ def plot_comparison(
         require_coverage(coverage)
     first, *others = coverages.values()
     chosen = _choose(layers, -100.0)
-    figure, axes = _panels(len(chosen), len(coverages), first.sizes["x"] / first.sizes["y"], bars=1)
+    figure, axes = _panels(len(chosen), len(coverages), first.sizes["x"] / first.sizes["y"], keys_in=1.6)
     for row, layer in zip(axes, chosen, strict=True):
         for axis, coverage in zip(row, coverages.values(), strict=True):
             _draw(axis, coverage, layer, first)
@@ -184,10 +184,10 @@ def _heading(title: str, coverage: xr.Dataset) -> str:
     return f"{title}, {observed:.0%} observed" if partial else title
 
 
-def _panels(rows: int, columns: int, aspect: float, *, bars: int) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure with panels (rows, columns) of one scale, as wide as a page, with room for colour bars in a row."""
+def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
+    """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
-    height = min(max(((page - 0.55 - 0.95 * bars) / columns - 0.1) / aspect, 1.2), 12.0)
+    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 1.2), 12.0)
     figure = Figure(figsize=(page, rows * (height + 0.35) + 1.1), dpi=_DPI, layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for axis in axes.flat:
