@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from homes import perimeter_cells, plain, room_count
+from homes import area_m2, draw_sheet, perimeter_cells, plain, room_count
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import ndimage
@@ -44,20 +44,19 @@ def main() -> None:
         groups[f"{kind}s"] = [measure(sp.make_home(FIRST_SEED + k, kind), k) for k in range(arguments.count)]
     print("\n".join(table({name: buildings for name, buildings in groups.items() if buildings})))
     with atomic_write(arguments.out / "buildings_sheet.png") as stream:
-        stream.write(figure_png(draw_sheet(paths)))
+        stream.write(figure_png(draw_buildings(paths)))
     print(f"wrote {arguments.out / 'buildings_sheet.png'}")
 
 
 def measure(home: sp.PartialMap, seed: int) -> dict[str, float]:
     """Measure one building with links and a robot that the seed draws; values by their labels."""
     free, cell_m = home.state == sp.CellState.FREE, home.resolution_m
-    area_m2 = float(free.sum()) * cell_m**2
     clearance_m = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * cell_m
     distance_m, is_los = lines_of_sight(free, cell_m, seed)
     values = {
-        "free area [m2]": area_m2,
-        "perimeter per free area [1/m]": perimeter_cells(free) * cell_m / area_m2,
-        "mean room [m2]": area_m2 / room_count(free, cell_m),
+        "free area [m²]": area_m2(home),
+        "perimeter per free area [1/m]": perimeter_cells(free) * cell_m / area_m2(home),
+        "mean room [m²]": area_m2(home) / room_count(free, cell_m),
         "largest part without a closed door": float(np.bincount(ndimage.label(free)[0][free]).max() / free.sum()),
         "mean clearance [m]": float(clearance_m[free].mean()),
         "free area farther than 2 m from walls": float((clearance_m[free] > 2.0).mean()),
@@ -71,7 +70,7 @@ def measure(home: sp.PartialMap, seed: int) -> dict[str, float]:
         values[f"LOS at {low:g} to {high:g} m"] = rate
     exploration = sp.explore_trajectory(home, STEPS, seed, sensor=LIDAR)
     for step, fraction in zip(STEPS, exploration.observed_fractions, strict=True):
-        values[f"area observed after {step} steps [m2]"] = float(fraction) * area_m2
+        values[f"area observed after {step} steps [m²]"] = float(fraction) * area_m2(home)
     return values
 
 
@@ -108,21 +107,12 @@ def table(groups: dict[str, list[dict[str, float]]]) -> Iterator[str]:
         yield "| " + " | ".join([label, *cells]) + " |"
 
 
-def draw_sheet(paths: list[Path]) -> Figure:
-    """Draw real floors, if there are any, above buildings of each kind, to their own scales."""
-    real = [(path.parent.name, sp.load_map(path)) for path in paths[::2]]
-    ours = [(kind, sp.make_home(FIRST_SEED + k, kind)) for kind in KINDS for k in range(4)]
-    figure = Figure(figsize=(14.0, 11.0), dpi=100, layout="constrained")
-    axes = figure.subplots(4 if real else 3, 4).ravel()
-    shades = np.zeros(3)
-    shades[[sp.CellState.FREE, sp.CellState.WALL, sp.CellState.UNKNOWN]] = 1.0, 0.0, 0.75
-    for axis, (name, home) in zip(axes, real[:4] + ours, strict=True):
-        rows, columns = home.shape
-        extent = (0, columns * home.resolution_m, 0, rows * home.resolution_m)
-        axis.imshow(shades[home.state], cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent)
-        axis.set_title(name, fontsize=9)
-        axis.tick_params(labelsize=7)
-    return figure
+def draw_buildings(paths: list[Path]) -> Figure:
+    """Draw real floors, if there are any, above buildings of each kind."""
+    rows = {"real floors": [sp.load_map(path) for path in paths[::2]]} if paths else {}
+    rows |= {f"{kind}s": [sp.make_home(FIRST_SEED + k, kind) for k in range(4)] for kind in KINDS}
+    named = {name: [(f"{area_m2(home):.0f} m²", home) for home in row] for name, row in rows.items()}
+    return draw_sheet(named, gap_m=8.0)
 
 
 if __name__ == "__main__":

@@ -41,6 +41,7 @@ FEWEST_LINKS = 8
 REAL, OURS, OFFICES = "Gibson", "apartments, houses", "offices"
 COLOURS = {REAL: "#000000", OURS: "#bb5566", OFFICES: "#ddaa33"}
 SHEET = {"apartment": 10, "house": 10, "office": 5}
+SHEET_IN = 7.2
 
 
 @dataclass(frozen=True)
@@ -74,14 +75,14 @@ class Measured:
 
 
 LABELS = {
-    "area_m2": "free area [m2]",
+    "area_m2": "free area [m²]",
     "span_m": "largest extent [m]",
     "hull_fraction": "free fraction of the convex hull",
     "perimeter_per_area": "perimeter per free area [1/m]",
-    "islands_per_100_m2": "islands per 100 m2 free",
-    "room_m2": "mean room [m2]",
+    "islands_per_100_m2": "islands per 100 m² free",
+    "room_m2": "mean room [m²]",
     "segments_per_m": "outline segments per length [1/m]",
-    "segments_per_m2": "outline segments per free area [1/m2]",
+    "segments_per_m2": "outline segments per free area [1/m²]",
     "visible_fraction": "area visible from a free point",
     "los_fraction": "links in LOS",
     "nlos_fraction": "links in NLOS",
@@ -110,7 +111,7 @@ def main() -> None:
     }
     groups = {name: homes for name, homes in groups.items() if homes}
     print("\n".join(table(groups)))
-    for name, figure in {"homes.png": draw(groups), "homes_sheet.png": draw_sheet()}.items():
+    for name, figure in {"homes.png": draw(groups), "homes_sheet.png": draw_homes()}.items():
         with atomic_write(arguments.out / name) as stream:
             stream.write(figure_png(figure))
         print(f"wrote {arguments.out / name}")
@@ -125,21 +126,20 @@ def our_homes(count: int) -> Iterator[sp.PartialMap]:
 def measure(home: sp.PartialMap, seed: int) -> Measured:
     """Measure one home with links that the seed draws."""
     free = home.state == sp.CellState.FREE
-    area_m2 = float(free.sum()) * home.resolution_m**2
     hull = shapely.MultiPoint(np.argwhere(free) * home.resolution_m).convex_hull
     outlines = wall_outlines(home)
     outline_m = np.linalg.norm(np.diff(outlines.vertices_m[outlines.segments], axis=1), axis=2).sum()
     links, distance_m, solid_m, unobserved_m = random_links(home, seed)
     is_los, is_outage = (links.link_state.ravel() == state for state in (sp.LinkState.LOS, sp.LinkState.OUTAGE))
     statistics = Statistics(
-        area_m2=area_m2,
+        area_m2=area_m2(home),
         span_m=shapely.minimum_bounding_radius(hull) * 2,
-        hull_fraction=area_m2 / hull.area,
-        perimeter_per_area=perimeter_cells(free) * home.resolution_m / area_m2,
-        islands_per_100_m2=100 * (ndimage.label(np.pad(~free, 1, constant_values=True))[1] - 1) / area_m2,
-        room_m2=area_m2 / room_count(free, home.resolution_m),
+        hull_fraction=area_m2(home) / hull.area,
+        perimeter_per_area=perimeter_cells(free) * home.resolution_m / area_m2(home),
+        islands_per_100_m2=100 * (ndimage.label(np.pad(~free, 1, constant_values=True))[1] - 1) / area_m2(home),
+        room_m2=area_m2(home) / room_count(free, home.resolution_m),
         segments_per_m=len(outlines.segments) / outline_m,
-        segments_per_m2=len(outlines.segments) / area_m2,
+        segments_per_m2=len(outlines.segments) / area_m2(home),
         visible_fraction=float(np.mean(solid_m == 0)),
         los_fraction=float(is_los.mean()),
         nlos_fraction=float(np.mean(~is_los & ~is_outage)),
@@ -226,7 +226,7 @@ def columns(groups: dict[str, list[Measured]]) -> dict[str, dict[str, NDArray[np
 
 def draw(groups: dict[str, list[Measured]]) -> Figure:
     """Draw the distribution of each statistic, and the rates against distance with their spread over homes."""
-    figure = Figure(figsize=(11, 14), layout="constrained", dpi=90)
+    figure = Figure(figsize=(7.2, 9.4), layout="constrained", dpi=160)
     *panels, los, outage, legend = figure.subplots(6, 3).ravel()
     for axis, (key, label) in zip(panels, LABELS.items(), strict=True):
         for row, (name, homes) in enumerate(groups.items()):
@@ -243,11 +243,13 @@ def draw(groups: dict[str, list[Measured]]) -> Figure:
                 boxprops=style,
                 medianprops={"color": "black"},
             )
-            axis.plot(values, row + np.linspace(-0.2, 0.2, len(values)), ".", color=COLOURS[name], markersize=3)
-        axis.set(xlabel=label, xlim=(0, None), yticks=[], ylim=(len(groups) - 0.5, -0.5))
+            axis.plot(values, row + np.linspace(-0.2, 0.2, len(values)), ".", color=COLOURS[name], markersize=2)
+        axis.set(xlim=(0, None), yticks=[], ylim=(len(groups) - 0.5, -0.5))
+        axis.set_xlabel(label, fontsize=8)
+        axis.tick_params(labelsize=7)
     draw_rates(los, groups, "los_rate", "links in LOS")
     draw_rates(outage, groups, "outage_rate", "links in outage")
-    legend.legend(*los.get_legend_handles_labels(), loc="center", frameon=False, fontsize=12)
+    legend.legend(*los.get_legend_handles_labels(), loc="center", frameon=False, fontsize=9)
     legend.set_axis_off()
     return figure
 
@@ -261,18 +263,46 @@ def draw_rates(axis: Axes, groups: dict[str, list[Measured]], key: str, label: s
         mean, spread = np.nanmean(rates[:, counted], axis=0), np.nanstd(rates[:, counted], axis=0)
         axis.plot(middle_m[counted], mean, color=COLOURS[name], label=name)
         axis.fill_between(middle_m[counted], mean - spread, mean + spread, color=COLOURS[name], alpha=0.15, linewidth=0)
-    axis.set(xlabel="distance [m]", ylabel=label, ylim=(0, 1), xlim=(0, None))
+    axis.set(ylim=(0, 1), xlim=(0, None))
+    axis.set_xlabel("distance [m]", fontsize=8)
+    axis.set_ylabel(label, fontsize=8)
+    axis.tick_params(labelsize=7)
 
 
-def draw_sheet() -> Figure:
-    """Draw homes of each kind, each at a scale of its own [m]: free white, walls black, the rest grey."""
-    figure = Figure(figsize=(15, 16), layout="constrained", dpi=80)
-    homes = [(kind, sp.make_home(FIRST_SEED + k, kind)) for kind, count in SHEET.items() for k in range(count)]
-    for axis, (kind, home) in zip(figure.subplots(5, 5).ravel(), homes, strict=True):
-        x0, y0, x1, y1 = home.bounds_m
-        shades = np.choose(home.state, [255, 0, 200])
-        axis.imshow(shades, "gray", vmin=0, vmax=255, extent=(x0, x1, y0, y1), origin="lower", interpolation="nearest")
-        axis.set_title(f"{kind}, {(home.interior_cells or 0) * home.resolution_m**2:.0f} m2", fontsize=10)
+def draw_homes() -> Figure:
+    """Draw homes of each kind, a row each."""
+    homes = {kind: [sp.make_home(FIRST_SEED + k, kind) for k in range(count)] for kind, count in SHEET.items()}
+    rows = {f"{kind}s": [(f"{area_m2(home):.0f} m²", home) for home in each] for kind, each in homes.items()}
+    return draw_sheet(rows, gap_m=2.0)
+
+
+def area_m2(home: sp.PartialMap) -> float:
+    """Area of the free cells [m^2]."""
+    return float((home.state == sp.CellState.FREE).sum()) * home.resolution_m**2
+
+
+def draw_sheet(rows: dict[str, list[tuple[str, sp.PartialMap]]], gap_m: float) -> Figure:
+    """Draw maps with their names in rows, all at one scale: free white, walls black, the rest grey."""
+    sizes = [[np.subtract(home.bounds_m[2:], home.bounds_m[:2]) for _, home in row] for row in rows.values()]
+    width = max(sum(size[0] + gap_m for size in row) for row in sizes)
+    heights = [max(size[1] for size in row) + gap_m + 0.03 * width for row in sizes]
+    figure = Figure(figsize=(SHEET_IN, SHEET_IN * sum(heights) / width + 0.3), layout="constrained", dpi=200)
+    axis = figure.add_subplot()
+    tops = np.cumsum([0.0, *heights])
+    for row, row_sizes, y in zip(rows.values(), sizes, tops[1:], strict=True):
+        slack = (width - sum(size[0] for size in row_sizes)) / len(row)
+        x = slack / 2
+        for (name, home), (w, h) in zip(row, row_sizes, strict=True):
+            shades = np.choose(home.state, [255, 0, 200])
+            axis.imshow(shades[::-1], "gray", vmin=0, vmax=255, extent=(x, x + w, y, y - h))
+            axis.text(x + w / 2, y - h - 0.004 * width, name, ha="center", va="bottom", fontsize=6)
+            x += w + slack
+    axis.set(xlim=(0, width), ylim=(tops[-1] + gap_m / 2, 0), aspect="equal", yticks=(tops[:-1] + tops[1:]) / 2)
+    axis.set_yticklabels(rows, rotation=90, va="center", fontsize=7)
+    axis.set_xlabel("all at one scale [m]", fontsize=7)
+    axis.tick_params(axis="y", length=0)
+    axis.tick_params(axis="x", labelsize=7)
+    axis.spines[["left", "right", "top"]].set_visible(False)
     return figure
 
 

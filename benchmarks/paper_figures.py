@@ -151,8 +151,10 @@ def main() -> None:
     with atomic_files(arguments.out) as folder:
         (folder / "table.txt").write_text(table + "\n", encoding="utf-8")
         (folder / "results.json").write_text(json.dumps(results, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        (folder / "paper_curves.png").write_bytes(figure_png(draw_curves(scores)))
-        (folder / "paper_maps.png").write_bytes(figure_png(plot_comparison(coverages)))
+        (folder / "paper_curves.png").write_bytes(figure_png(draw_curves(scores, list(test))))
+        (folder / "paper_maps.png").write_bytes(
+            figure_png(plot_comparison(coverages, ("state_mixture", "gain_mean_db")))
+        )
     print(f"wrote paper_curves.png, paper_maps.png, table.txt and results.json to {arguments.out}")
     require_both_ends(ends)
 
@@ -360,11 +362,12 @@ def require_both_ends(ends: list[Ends]) -> None:
     print("both ends hold in all test homes")
 
 
-def draw_curves(scores: list[Score]) -> Figure:
+def draw_curves(scores: list[Score], test: list[str]) -> Figure:
     """Draw each measure against the steps of exploration, test and train; bands hold all repetitions."""
-    figure = Figure(figsize=(13, 3.7), layout="constrained", dpi=150)
+    figure = Figure(figsize=(7.2, 6.0), layout="constrained", dpi=170)
     steps = sorted({score.step for score in scores})
-    for axis, (name, label) in zip(figure.subplots(1, len(MEASURES)), MEASURES.items(), strict=True):
+    axes = figure.subplots(2, 2, sharex=True).ravel()
+    for axis, (name, label) in zip(axes, MEASURES.items(), strict=True):
         for kind, colour, marker in (("test", BLUE, "o"), ("train", RED, "s")):
             some = [score for score in scores if score.homes == kind]
             values = np.array([[getattr(score, name) for score in some if score.step == step] for step in steps])
@@ -372,11 +375,14 @@ def draw_curves(scores: list[Score]) -> Figure:
             axis.fill_between(steps, values.min(axis=1), values.max(axis=1), color=colour, alpha=0.2, linewidth=0)
         paper = [reported["accuracy" if name == "accuracy" else "rmse_db"] for reported in PAPER.values()]
         axis.plot(list(PAPER), paper, "*", color="black", markersize=11, fillstyle="none", label="paper, test homes")
-        axis.set(xlabel="exploration steps", title=label, ylim=(0.5, 1.0) if name == "accuracy" else (0, 26))
+        axis.set(title=label, ylim=(0.5, 1.0) if name == "accuracy" else (0, 26))
         axis.title.set_fontsize("medium")
         axis.set_xticks(steps)
         axis.grid(alpha=0.3)
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
+    for axis in axes[2:]:
+        axis.set_xlabel("exploration steps")
+    figure.suptitle(f"Test homes: {', '.join(test)}", fontsize="medium")
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 

@@ -264,6 +264,13 @@ def require_coverage(coverage: xr.Dataset) -> None:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
 
 
+def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
+    """Return P(path gain > threshold) (ny, nx), NaN where no receiver can stand; threshold in [-150, 0] dB."""
+    require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
+    columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
+    return LinkPrediction(**columns).probability_above(threshold_db)
+
+
 def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
     clear: Bools = partial.state_at(points_m) != CellState.WALL

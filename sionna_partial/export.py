@@ -1,4 +1,4 @@
-"""Coverage maps to files: NetCDF, GeoTIFF, CSV, PNG, ROS map."""
+"""Coverage maps to files: NetCDF, GeoTIFF, CSV, PNG, HTML, ROS map."""
 
 import os
 from collections.abc import Callable
@@ -21,6 +21,7 @@ from sionna_partial.errors import OutputError
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 from sionna_partial.plots.coverage_plot import plot_coverage
+from sionna_partial.plots.coverage_viewer import coverage_page
 from sionna_partial.plots.style import figure_png
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
@@ -38,6 +39,8 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
              local metres, no coordinate reference system; the settings as tags.
     `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands.
     `.png`   The picture of `plot_coverage`.
+    `.html`  A page for the browser, which needs no network: the layers, the values under the pointer, and
+             P(gain > threshold) with a slider.
     `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 100,
              is the probability of outage in percent; unknown (-1) where no receiver stands. Nav2 loads it as a
              layer that keeps a robot where it has a link (static layer, `trinary_costmap: false`).
@@ -166,6 +169,7 @@ _ENCODERS: dict[str, Callable[[xr.Dataset], bytes]] = {
     ".tif": _encode_geotiff,
     ".csv": _encode_csv,
     ".png": lambda coverage: figure_png(plot_coverage(coverage)),
+    ".html": coverage_page,
 }
 
 FORMATS = (*_ENCODERS, ".yaml")

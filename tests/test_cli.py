@@ -85,7 +85,7 @@ class TestPredict:
             "receivers": "indoor",
             "memory_gb": 2.0,
         }
-        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".yaml")]
+        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
         assert [(coverage, path.name) for coverage, path in calls[1:]] == [("coverage", name) for name in names]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in names]
 
@@ -141,7 +141,7 @@ class TestPredict:
             (["--material", "cheese"], "error: itu = 'cheese' is not allowed: choose one of vacuum"),
             (["--material", "2,3"], "--material '2,3' is neither an ITU name nor permittivity,conductivity,thickness"),
             (["--material", "0,0,1"], "error: relative_permittivity = 0.0 is not allowed"),
-            (["--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .yaml."),
+            (["--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html, .yaml."),
             (["--frequency", "1"], "error: frequency_hz = 1.0 is not allowed"),
             (["--max-depth", "11"], "error: max_depth = 11 is not allowed"),
         ],

@@ -13,7 +13,7 @@ from sionna_partial.coverage import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage
-from sionna_partial.plots.style import STATE_COLOURS, figure_png
+from sionna_partial.plots.style import STATE_COLOURS, figure_png, sheet_columns
 
 LOS, NLOS, OUTAGE = (
     np.array(to_rgb(STATE_COLOURS[state])) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)
@@ -49,26 +49,72 @@ def test_the_colours_are_told_apart_in_grey_and_by_colour_blind_eyes():
     assert (steps > 15).all()
 
 
-def test_the_picture_of_the_link_state_is_the_mixture(coverage):
-    image = panels(plot_coverage(coverage))[0].images[0].get_array()
+def at_receivers(panel, coverage):
+    """Values of a panel's picture at the cells where a receiver can stand."""
+    image = np.asarray(panel.images[0].get_array())
     refine = image.shape[0] // coverage.sizes["y"]
-    middle = image[refine // 2 :: refine, refine // 2 :: refine]
-    expected = mix_state_colours(coverage["p_los"], coverage["p_nlos"], coverage["p_outage"])
-    valid = coverage["valid"].to_numpy()
-    np.testing.assert_allclose(middle[valid], expected[valid])
     assert np.isfinite(image).all()
+    return image[refine // 2 :: refine, refine // 2 :: refine][coverage["valid"].to_numpy()]
 
 
-def test_gain_and_deviation_are_drawn_with_fixed_scales(coverage):
-    _, gain, deviation = panels(plot_coverage(coverage))
-    for panel, name, limits in ((gain, "gain_mean_db", (-150, -60)), (deviation, "gain_std_db", (0, 40))):
-        image = panel.images[0]
-        assert image.get_clim() == limits
-        refine = image.get_array().shape[0] // coverage.sizes["y"]
-        valid = coverage["valid"].to_numpy()
-        np.testing.assert_allclose(
-            image.get_array()[refine // 2 :: refine, refine // 2 :: refine][valid], coverage[name].to_numpy()[valid]
-        )
+def legend(figure):
+    return [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_the_mixture_of_the_states_is_drawn_if_asked_for(coverage):
+    (panel,) = panels(plot_coverage(coverage, layers=("state_mixture",)))
+    expected = mix_state_colours(coverage["p_los"], coverage["p_nlos"], coverage["p_outage"])
+    np.testing.assert_allclose(at_receivers(panel, coverage), expected[coverage["valid"].to_numpy()])
+
+
+def test_the_likeliest_state_has_its_colour(coverage):
+    panel = panels(plot_coverage(coverage))[0]
+    assert panel.get_title() == "Likeliest link state"
+    drawn = panel.images[0].to_rgba(at_receivers(panel, coverage))[..., :3]
+    state = coverage["link_state"].to_numpy()[coverage["valid"].to_numpy()]
+    np.testing.assert_allclose(drawn, np.array([OUTAGE, LOS, NLOS])[state])
+
+
+def test_other_panels_show_their_variable_with_fixed_scales(coverage):
+    names = {"gain_mean_db": (-150, -60), "gain_std_db": (0, 40)} | dict.fromkeys(
+        ("p_los", "p_nlos", "p_outage"), (0, 1)
+    )
+    for panel, (name, limits) in zip(panels(plot_coverage(coverage, layers=list(names))), names.items(), strict=True):
+        assert panel.images[0].get_clim() == limits
+        expected = coverage[name].to_numpy()[coverage["valid"].to_numpy()]
+        np.testing.assert_allclose(at_receivers(panel, coverage), expected)
+
+
+def test_the_probability_of_more_than_a_threshold(coverage):
+    """By integration: the gain is the mixture of a normal distribution for LOS, one for NLOS, and the outage."""
+    panel = panels(plot_coverage(coverage, threshold_db=-80.0))[3]
+    assert panel.get_title() == "P(path gain > \N{MINUS SIGN}80 dB)"
+    known = coverage.stack(rx=("y", "x")).isel(rx=coverage["valid"].to_numpy().ravel())
+    draws = np.random.default_rng(0).normal(size=(20_000, 1))
+    los, nlos = (
+        draws * known[f"gain_{s}_std_db"].to_numpy() + known[f"gain_{s}_mean_db"].to_numpy() for s in ("los", "nlos")
+    )
+    above = (los > -80.0).mean(axis=0) * known["p_los"] + (nlos > -80.0).mean(axis=0) * known["p_nlos"]
+    np.testing.assert_allclose(at_receivers(panel, coverage), above, atol=0.02)
+
+
+def test_colour_bars_say_what_the_mean_counts(coverage):
+    labels = {axis.get_ylabel() for axis in plot_coverage(coverage).axes}
+    assert {"dB; an outage counts \N{MINUS SIGN}150 dB", "dB; with outages", "probability"} <= labels
+
+
+def test_the_legend_names_what_is_drawn(coverage):
+    assert legend(plot_coverage(coverage)) == ["transmitter", "LOS", "NLOS", "outage", "wall", "not observed"]
+    seen = coverage.assign(observed=coverage["observed"] | True, wall_parts=0 * coverage["wall_parts"])
+    assert legend(plot_coverage(seen, layers=("p_los",))) == ["transmitter"]
+    assert "wall, not observed" not in legend(plot_comparison({"truth": coverage, "again": coverage}))
+    assert "wall, not observed" in legend(plot_comparison({"truth": coverage, "blind": seen}))
+
+
+def test_sheets_of_up_to_four_panels_have_no_hole():
+    for count in (1, 2, 3, 4):
+        for aspect in (0.3, 0.6, 1.0, 1.3, 1.5, 2.0, 4.0):
+            assert count % sheet_columns(count, aspect) == 0
 
 
 def test_walls_are_black_where_they_are_and_nowhere_else(coverage):
@@ -108,10 +154,12 @@ def test_the_comparison_has_a_column_for_each_map(coverage):
     figure = plot_comparison({"truth": coverage, "nothing observed": coverage, "partial map": coverage})
     shown = panels(figure)
     assert len(shown) == 6
-    assert [panel.get_title() for panel in shown[:3]] == ["truth", "nothing observed", "partial map"]
+    observed = f", {coverage.attrs['map_observed_fraction']:.0%} observed"
+    titles = [f"{name}{observed}" for name in ("truth", "nothing observed", "partial map")]
+    assert [panel.get_title() for panel in shown[:3]] == titles
     np.testing.assert_array_equal(shown[0].images[0].get_array(), shown[2].images[0].get_array())
     assert shown[3].images[0].get_clim() == (-150, -60)
-    assert [shown[row].get_ylabel().split("\n")[0] for row in (0, 3)] == ["Link state", "Mean path gain"]
+    assert [shown[row].get_ylabel().split("\n")[0] for row in (0, 3)] == ["Likeliest link state", "Mean path gain"]
 
 
 def test_the_comparison_shows_unseen_walls_of_the_first_map_in_grey(coverage):
@@ -158,3 +206,9 @@ def test_what_cannot_be_drawn_is_named(coverage):
         plot_comparison({"truth": coverage.drop_vars("wall_parts")})
     with pytest.raises(SettingsError, match=r"coverages = \{\} is not allowed: give at least one coverage map"):
         plot_comparison({})
+    with pytest.raises(SettingsError, match="layers = 'gain' is not allowed: choose one of link_state, state_mixture"):
+        plot_coverage(coverage, layers=("p_los", "gain"))
+    with pytest.raises(SettingsError, match="layers = 'p_los' is not allowed: give some of link_state"):
+        plot_coverage(coverage, layers="p_los")
+    with pytest.raises(SettingsError, match=r"threshold_db = -151 is not allowed: give a number in \[-150, 0\]"):
+        plot_coverage(coverage, threshold_db=-151)

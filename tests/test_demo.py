@@ -12,8 +12,8 @@ from sionna_partial.errors import OutputError, SceneError
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 
-FILES = ["comparison.png", "coverage.csv", "coverage.nc", "coverage.pgm", "coverage.png", "coverage.tif"]
-FILES += ["coverage.yaml", "table.txt"]
+FILES = ["comparison.png", "coverage.csv", "coverage.html", "coverage.nc", "coverage.pgm", "coverage.png"]
+FILES += ["coverage.tif", "coverage.yaml", "table.txt"]
 
 
 @pytest.fixture(scope="module")

@@ -57,7 +57,7 @@ class TestPlotReliability:
     def test_a_column_for_each_stage(self):
         figure = plot_reliability({0: calibration(), 50: calibration(0.1), 200: calibration(0.2)})
         titles = [axis.get_title() for axis in figure.axes if axis.get_title()]
-        assert titles == ["0 steps, error 0.000", "50 steps, error 0.100", "200 steps, error 0.200"]
+        assert titles == ["0 steps,\nerror 0.000", "50 steps,\nerror 0.100", "200 steps,\nerror 0.200"]
         assert len(figure.axes) == 6
 
     def test_discs_and_bars_show_the_numbers(self):

@@ -18,7 +18,7 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.style import figure_png
 
-SUFFIXES = (".nc", ".tif", ".csv", ".png", ".yaml")
+SUFFIXES = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 
 
 @pytest.fixture

@@ -45,7 +45,10 @@ ROOMS = {
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
-    "plots": (*("style", "coverage_plot", "exploration_plot", "material_plot", "placement_plot", "evaluation_plot"),),
+    "plots": (
+        *("style", "coverage_plot", "coverage_viewer", "exploration_plot"),
+        *("material_plot", "placement_plot", "evaluation_plot"),
+    ),
     "results": ("export", "demo", "info", "reports"),
     "cli": ("options", "progress", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
@@ -59,7 +62,7 @@ MODULES = tuple(
     module if room in FILES else f"{room}.{module}" for room, modules in ROOMS.items() for module in modules
 )
 
-IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit"}
+IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit", "bokeh"}
 """Imported where they are needed, after `load_llvm`, never at the top of a module."""
 
 HEAVY = IN_FUNCTIONS | {
@@ -71,7 +74,7 @@ HEAVY = IN_FUNCTIONS | {
 HOMES = {
     **dict.fromkeys(["drjit", "mitsuba", "sionna"], ("tracing.", "llvm")),
     **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable.", "training")),
-    "matplotlib": ("plots.",),
+    **dict.fromkeys(["matplotlib", "bokeh"], ("plots.",)),
 }
 """Beginnings of the modules that may import these libraries."""
 

@@ -12,7 +12,7 @@ from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEM
 from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.settings import SceneSettings, SensorSettings
 
-FORMATS = (".nc", ".tif", ".csv", ".png", ".yaml")
+FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 """Formats of a coverage map."""
 
 FRAMES = 50

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from sionna_partial.checks import Progress, no_progress, require, require_number, settings_or_default
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
@@ -221,15 +220,7 @@ def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDAr
     """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
-    covered = np.zeros(len(prediction.p_los))
-    for probability, mean_db, std_db in (
-        (prediction.p_los, prediction.gain_los_mean_db, prediction.gain_los_std_db),
-        (prediction.p_nlos, prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db),
-    ):
-        above_db = mean_db - settings.threshold_db
-        spread = ndtr(above_db / np.where(std_db > 0.0, std_db, 1.0))
-        covered += probability * np.where(std_db > 0.0, spread, above_db > 0.0)
-    return covered
+    return prediction.probability_above(settings.threshold_db)
 
 
 def placement_score(values: NDArray[np.float64], weight: NDArray[np.float64], settings: PlacementSettings) -> float:

@@ -1,7 +1,8 @@
 """Figures of coverage maps."""
 
 import itertools
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,35 +10,39 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sionna_partial.checks import require
+from sionna_partial.checks import require, require_choice
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage import WALL_PARTS, require_coverage
-from sionna_partial.plots.style import STAR, STATE_COLOURS, legend_below, shade
+from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage
+from sionna_partial.plots.style import STAR, STATE_COLOURS, legend_below, shade, sheet_columns
 
-_WIDTH_IN, _DPI, _MAX_PIXELS = 12.0, 150, 3000
-_STACKED_ASPECT = 1.8
-_HATCH, _HATCH_COLOUR = "////", (0.75, 0.75, 0.75, 0.8)
+DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
+"""Panels of `plot_coverage`."""
+
+_NARROW_IN, _WIDE_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 170, 3000
+_HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
-_STAR: dict[str, Any] = STAR | {"markersize": 13}
+_STAR: dict[str, Any] = STAR | {"markersize": 12}
 
 
 @dataclass(frozen=True)
-class _Layer:
-    """One quantity of a panel: its picture (ny, nx) or (ny, nx, 3), and the colour scale of the former."""
+class Layer:
+    """One quantity of a panel: its picture (ny, nx) or (ny, nx, 3), and the colour scale of the former.
+
+    A layer without label has no colour bar.
+    """
 
     title: str
-    picture: Callable[[xr.Dataset], NDArray[np.float64]]
+    picture: Callable[[xr.Dataset], NDArray[Any]]
     norm: Normalize | None = None
-    cmap: str | None = None
-    unit: str = ""
+    cmap: str | Colormap | None = None
+    label: str = ""
 
 
 def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> NDArray[np.float64]:
@@ -46,22 +51,56 @@ def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) 
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
 
 
-LINK_STATE = _Layer("Link state", lambda data: mix_state_colours(data["p_los"], data["p_nlos"], data["p_outage"]))
-_MEAN, _STD = "Mean path gain", "Standard deviation of the path gain"
-GAIN = _Layer(_MEAN, lambda data: data["gain_mean_db"].to_numpy(), Normalize(-150.0, -60.0), "viridis", "mean [dB]")
-STD = _Layer(_STD, lambda data: data["gain_std_db"].to_numpy(), Normalize(0.0, 40.0), "magma_r", "std. dev. [dB]")
+def coverage_layers(threshold_db: float) -> dict[str, Layer]:
+    """Return every layer that a panel can show, by name."""
+    probability = Normalize(0.0, 1.0), "cividis", "probability"
+    colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
+    layers = {
+        "link_state": Layer("Likeliest link state", _variable("link_state"), Normalize(0, 2), colours),
+        "state_mixture": Layer(
+            "Link state", lambda data: mix_state_colours(data["p_los"], data["p_nlos"], data["p_outage"])
+        ),
+        "gain_mean_db": Layer(
+            "Mean path gain",
+            _variable("gain_mean_db"),
+            Normalize(-150.0, -60.0),
+            "viridis",
+            "dB; an outage counts \N{MINUS SIGN}150 dB",
+        ),
+        "gain_std_db": Layer(
+            "Std. dev. of the path gain", _variable("gain_std_db"), Normalize(0.0, 40.0), "magma_r", "dB; with outages"
+        ),
+        "p_above": Layer(
+            f"P(path gain > {threshold_db:g} dB)".replace("-", "\N{MINUS SIGN}"),
+            lambda data: probability_above(data, threshold_db),
+            *probability,
+        ),
+    }
+    names = {"p_los": "P(LOS)", "p_nlos": "P(NLOS)", "p_outage": "P(outage)"}
+    return layers | {name: Layer(title, _variable(name), *probability) for name, title in names.items()}
 
 
-def plot_coverage(coverage: xr.Dataset) -> Figure:
-    """Draw link state, mean gain and its standard deviation.
+def _variable(name: str) -> Callable[[xr.Dataset], NDArray[Any]]:
+    return lambda data: data[name].to_numpy()
 
-    The link state is shown as the colours of the three states mixed by their probabilities. Walls are black, the
-    unobserved area is hatched, the transmitter is a star. On a complete map the outside is left blank.
+
+def plot_coverage(
+    coverage: xr.Dataset, *, layers: Sequence[str] = DEFAULT_LAYERS, threshold_db: float = -100.0
+) -> Figure:
+    """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
+
+    Walls are black, the unobserved area is hatched, the transmitter is a star. On a complete map the outside is left
+    blank.
 
     Parameters
     ----------
     coverage : xarray.Dataset
         From `predict_map`, or read from its NetCDF file.
+    layers : sequence of str
+        A panel each: "link_state" (the likeliest), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
+        three states mixed by their probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
+    threshold_db : float
+        Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
 
     Returns
     -------
@@ -71,7 +110,7 @@ def plot_coverage(coverage: xr.Dataset) -> Figure:
     Raises
     ------
     SettingsError
-        For a Dataset that is no coverage map.
+        For a Dataset that is no coverage map, another layer, or a threshold out of range.
 
     Examples
     --------
@@ -80,84 +119,94 @@ def plot_coverage(coverage: xr.Dataset) -> Figure:
     >>> coverage = xr.load_dataset("coverage.nc")  # or directly from predict_map
     >>> figure = sp.plot_coverage(coverage)
     >>> figure.savefig("coverage.png")
+    >>> states = sp.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
     """
     require_coverage(coverage)
+    chosen = _choose(layers, threshold_db)
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
-    wide = aspect > _STACKED_ASPECT
-    layers = [LINK_STATE, GAIN, STD]
-    rows = [[layer] for layer in layers] if wide else [layers]
-    figure, axes = _panels(rows, aspect, keys_right=wide)
-    for axis, layer in zip(itertools.chain(*axes), layers, strict=True):
+    columns = sheet_columns(len(chosen), aspect)
+    figure, axes = _panels(math.ceil(len(chosen) / columns), columns, aspect, keys_in=0.95 * columns)
+    panels = list(itertools.chain(*axes))
+    for axis in panels[len(chosen) :]:
+        axis.set_axis_off()
+    for axis, layer in zip(panels, chosen, strict=False):
         _draw(axis, coverage, layer)
         axis.set_title(layer.title)
-    figure.suptitle(_headline(coverage))
-    _add_legend(figure, unseen_walls=False)
+        _add_key([axis], layer)
+    figure.suptitle(headline("Coverage", coverage))
+    _add_legend(figure, [coverage], chosen)
     return figure
 
 
-def plot_comparison(coverages: Mapping[str, xr.Dataset]) -> Figure:
-    """Draw link state (above) and mean gain (below) of several coverage maps of one area by title (paper, Fig. 5).
+def plot_comparison(
+    coverages: Mapping[str, xr.Dataset], layers: Sequence[str] = ("link_state", "gain_mean_db")
+) -> Figure:
+    """Draw coverage maps of one area by title, a column each, and a row for each layer (paper, Fig. 5).
 
     The walls of the first are drawn grey in the others where these do not contain them.
     """
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
     for coverage in coverages.values():
         require_coverage(coverage)
-    first = next(iter(coverages.values()))
-    rows = [[layer] * len(coverages) for layer in (LINK_STATE, GAIN)]
-    figure, axes = _panels(rows, first.sizes["x"] / first.sizes["y"], keys_right=True)
-    for row, layer in zip(axes, (LINK_STATE, GAIN), strict=True):
+    first, *others = coverages.values()
+    chosen = _choose(layers, -100.0)
+    figure, axes = _panels(len(chosen), len(coverages), first.sizes["x"] / first.sizes["y"], keys_in=1.6)
+    for row, layer in zip(axes, chosen, strict=True):
         for axis, coverage in zip(row, coverages.values(), strict=True):
             _draw(axis, coverage, layer, first)
         row[0].set_ylabel(f"{layer.title}\n\ny [m]")
-    for axis, title in zip(axes[0], coverages, strict=True):
-        axis.set_title(title)
-    figure.suptitle(_headline(first))
-    _add_legend(figure, unseen_walls=True)
+        _add_key(row, layer)
+    for axis, (title, coverage) in zip(axes[0], coverages.items(), strict=True):
+        axis.set_title(_heading(title, coverage))
+    figure.suptitle(headline("Coverage by what is observed of the map", first))
+    _add_legend(figure, [first, *others], chosen)
     return figure
 
 
-def _headline(coverage: xr.Dataset) -> str:
+def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
+    known = coverage_layers(threshold_db)
+    require(len(layers) > 0 and not isinstance(layers, str), "layers", layers, f"give some of {', '.join(known)}.")
+    for name in layers:
+        require_choice("layers", name, known)
+    return [known[name] for name in layers]
+
+
+def headline(what: str, coverage: xr.Dataset) -> str:
+    """Title that names the transmitter's position and the frequency."""
     x, y, z = coverage.attrs["transmitter_m"]
-    return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
+    return f"{what}: transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
 
 
-def _panels(layers: list[list[_Layer]], aspect: float, *, keys_right: bool) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure with a panel for each layer, and a key for each row (`keys_right`) or column."""
-    rows, columns = len(layers), len(layers[0])
-    key_width, key_height = (1.1, 0.0) if keys_right else (0.0, 0.85)
-    width = (_WIDTH_IN - 0.8 - key_width) / columns - 0.1
-    height = min(max(width / aspect, 1.2), 12.0)
-    size = (_WIDTH_IN, rows * (height + 0.2) + 1.2 + key_height)
-    figure = Figure(figsize=size, dpi=_DPI, layout=ConstrainedLayoutEngine(h_pad=0.08))
-    grid = figure.add_gridspec(
-        rows + (not keys_right),
-        columns + keys_right,
-        width_ratios=[width] * columns + [key_width] * keys_right,
-        height_ratios=[height] * rows + [key_height] * (not keys_right),
-    )
-    axes = [[figure.add_subplot(grid[row, column]) for column in range(columns)] for row in range(rows)]
-    for row, column in itertools.product(range(rows), range(columns)):
-        lowest, leftmost = row == rows - 1, column == 0
-        axes[row][column].tick_params(labelbottom=lowest, labelleft=leftmost)
-        axes[row][column].set(xlabel="x [m]" if lowest else "", ylabel="y [m]" if leftmost else "")
-    for index, layer in enumerate([row[0] for row in layers] if keys_right else layers[0]):
-        key = figure.add_subplot(grid[index, columns] if keys_right else grid[rows, index])
-        key.set_axis_off()
-        _draw_key(key, layer, upright=keys_right)
-    return figure, axes
+def _heading(title: str, coverage: xr.Dataset) -> str:
+    """Title of a map; of a partial one with its observed fraction."""
+    observed = float(coverage.attrs["map_observed_fraction"])
+    partial = observed > 0.0 and not coverage.attrs["map_complete"]
+    return f"{title}, {observed:.0%} observed" if partial else title
 
 
-def _draw_key(key: Axes, layer: _Layer, *, upright: bool) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours."""
-    if layer.norm is None:
-        _draw_triangle(key)
-        return
-    bounds = (0.05, 0.05, 0.17, 0.9) if upright else (0.05, 0.7, 0.9, 0.2)
-    orientation = "vertical" if upright else "horizontal"
-    scale = ScalarMappable(layer.norm, layer.cmap)
-    bar = key.figure.colorbar(scale, cax=key.inset_axes(bounds), orientation=orientation, extend="max")
-    bar.set_label(layer.unit)
+def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
+    """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
+    page = _NARROW_IN if columns < 3 else _WIDE_IN
+    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 1.2), 12.0)
+    figure = Figure(figsize=(page, rows * (height + 0.35) + 1.1), dpi=_DPI, layout="compressed")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    for axis in axes.flat:
+        axis.set(xlabel="x [m]", ylabel="y [m]")
+        axis.label_outer()
+    return figure, axes.tolist()
+
+
+def _add_key(axes: Sequence[Axes], layer: Layer) -> None:
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states."""
+    if layer.label:
+        bar = axes[0].figure.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axes, extend=_beyond(layer))
+        bar.set_label(layer.label)
+    elif layer.norm is None:
+        _draw_triangle(axes[-1].inset_axes((1.02, 0.3, 0.36, 0.4)))
+
+
+def _beyond(layer: Layer) -> str:
+    return "neither" if layer.label == "probability" else "max"
 
 
 def _draw_triangle(key: Axes) -> None:
@@ -170,23 +219,27 @@ def _draw_triangle(key: Axes) -> None:
     outline = Polygon([(0.0, 0.0), (1.0, 0.0), (0.5, height)], fill=False, edgecolor="0.3", linewidth=0.6)
     key.add_patch(outline)
     image.set_clip_path(outline)
-    key.set(xlim=(-0.4, 1.4), ylim=(-0.1, 1.25), aspect="equal")
-    for x_text, y_text, name, align in ((-0.06, 0.0, "LOS", "right"), (1.06, 0.0, "NLOS", "left")):
-        key.text(x_text, y_text, name, ha=align, va="center")
-    key.text(0.5, height + 0.05, "outage", ha="center", va="bottom")
+    key.set(xlim=(-0.35, 1.35), ylim=(-0.3, 1.25), aspect="equal")
+    key.set_axis_off()
+    for x_text, y_text, name, align in (
+        (0.0, -0.08, "LOS", "top"),
+        (1.0, -0.08, "NLOS", "top"),
+        (0.5, height + 0.05, "outage", "bottom"),
+    ):
+        key.text(x_text, y_text, name, ha="center", va=align, fontsize="small")
 
 
-def _draw(axis: Axes, coverage: xr.Dataset, layer: _Layer, reference: xr.Dataset | None = None) -> None:
+def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset | None = None) -> None:
     """Draw one layer, the unknown area, the walls and the transmitter."""
-    extent = _extent(coverage)
-    wall = _walls(coverage)
+    extent = extent_m(coverage)
+    wall = wall_cells(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
     axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=layer.norm, cmap=layer.cmap)
-    axis.imshow(shade(_outside(coverage), grey=255), extent=extent, origin="lower", interpolation="nearest")
+    axis.imshow(shade(outside(coverage), grey=255), extent=extent, origin="lower", interpolation="nearest")
     _hatch_unknown(axis, coverage)
     if reference is not None:
         axis.imshow(
-            shade(_walls(reference), opacity=_UNSEEN_OPACITY), extent=_extent(reference), origin="lower", zorder=3
+            shade(wall_cells(reference), opacity=_UNSEEN_OPACITY), extent=extent_m(reference), origin="lower", zorder=3
         )
     axis.imshow(shade(wall), extent=extent, origin="lower", zorder=3)
     x, y, _ = coverage.attrs["transmitter_m"]
@@ -194,13 +247,14 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: _Layer, reference: xr.Dataset
     axis.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
 
 
-def _extent(coverage: xr.Dataset) -> tuple[float, float, float, float]:
+def extent_m(coverage: xr.Dataset) -> tuple[float, float, float, float]:
+    """Limits x0, x1, y0, y1 of the map [m]."""
     half = coverage.attrs["spacing_m"] / 2
     x, y = coverage["x"].to_numpy(), coverage["y"].to_numpy()
     return x[0] - half, x[-1] + half, y[0] - half, y[-1] + half
 
 
-def _walls(coverage: xr.Dataset) -> NDArray[np.bool_]:
+def wall_cells(coverage: xr.Dataset) -> NDArray[np.bool_]:
     """Where walls are, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
@@ -211,7 +265,7 @@ def _walls(coverage: xr.Dataset) -> NDArray[np.bool_]:
     return wall.reshape(bits.shape[0] * fine, bits.shape[1] * fine)
 
 
-def _outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
+def outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
     """Where nobody can be: the unknown cells of a complete map."""
     return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
 
@@ -229,26 +283,41 @@ def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[
     return picture[row // fine, column // fine]
 
 
-def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
-    """Hatch the unobserved cells that a receiver may be in."""
-    hatched = ~coverage["observed"].to_numpy() & ~_outside(coverage)
-    unknown = np.pad(hatched, 1, mode="edge").astype(float)
-    if not unknown.any():
-        return
+def _hatched(coverage: xr.Dataset) -> NDArray[np.bool_]:
+    """Unobserved cells that a receiver may be in."""
+    return ~coverage["observed"].to_numpy() & ~outside(coverage)
+
+
+def unobserved_area(coverage: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Cell centres x (nx + 2,) and y (ny + 2,) with one cell around the map, and 1 where to hatch (ny + 2, nx + 2)."""
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
     x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
+    return x, y, np.pad(_hatched(coverage), 1, mode="edge").astype(float)
+
+
+def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
+    x, y, unknown = unobserved_area(coverage)
+    if not unknown.any():
+        return
     area = axis.contourf(x, y, unknown, levels=[0.5, 1.5], colors="none", hatches=[_HATCH], zorder=2)
     area.set_edgecolor(_HATCH_COLOUR)
-    area.set_linewidth(0.8)
-    area.set_hatch_linewidth(0.6)
+    area.set_linewidth(0.5)
+    area.set_hatch_linewidth(0.5)
 
 
-def _add_legend(figure: Figure, *, unseen_walls: bool) -> None:
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], label="transmitter", **_STAR),
-        Patch(facecolor="black", label="wall"),
-        Patch(facecolor="0.5", hatch=_HATCH, edgecolor=_HATCH_COLOUR, label="not observed"),
-    ]
-    if unseen_walls:
-        handles.insert(2, Patch(facecolor="black", alpha=_UNSEEN_OPACITY, label="wall, not observed"))
+def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
+    """Name what is drawn; walls that only the first of several maps has are not observed in the others."""
+    handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
+    if any(layer.norm is not None and not layer.label for layer in layers):
+        states = (LinkState.LOS, "LOS"), (LinkState.NLOS, "NLOS"), (LinkState.OUTAGE, "outage")
+        handles += [Patch(facecolor=STATE_COLOURS[state], label=name) for state, name in states]
+    walls = [wall_cells(coverage) for coverage in coverages]
+    if any(wall.any() for wall in walls):
+        handles.append(Patch(facecolor="black", label="wall"))
+    if any((walls[0] & ~wall).any() for wall in walls[1:]):
+        handles.append(Patch(facecolor="black", alpha=_UNSEEN_OPACITY, label="wall, not observed"))
+    if any(_hatched(coverage).any() for coverage in coverages):
+        handles.append(
+            Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
+        )
     legend_below(figure, handles)

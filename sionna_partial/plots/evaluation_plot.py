@@ -69,7 +69,7 @@ def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
     large, a bowl one too small, a slope a mean that is too high (falling) or too low (rising).
     """
     require(len(stages) > 0, "stages", dict(stages), "give at least one calibration.")
-    figure = Figure(figsize=(max(2.6 * len(stages), 5.2), 5.4), dpi=150, layout="constrained")
+    figure = Figure(figsize=(max(1.8 * len(stages), 5.4), 4.6), dpi=170, layout="constrained")
     axes = figure.subplots(2, len(stages), squeeze=False, sharey="row")
     edges = np.linspace(0.0, 1.0, PIT_BINS + 1)
     for (above, below), (stage, calibration) in zip(axes.T, stages.items(), strict=True):
@@ -78,13 +78,17 @@ def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
         sizes = 8.0 + 400.0 * state.links[filled] / max(state.links.sum(), 1)
         above.plot([0.0, 1.0], [0.0, 1.0], **_IDEAL)
         above.scatter(state.confidence[filled], state.accuracy[filled], s=sizes, color=BLUE, alpha=0.8)
-        above.set(xlabel="confidence in the likeliest state", xlim=(0.3, 1.02), ylim=(0.0, 1.05))
+        above.set(xlim=(0.3, 1.02), ylim=(0.0, 1.05))
         above.set_xticks(np.arange(0.4, 1.01, 0.2))
         above.set_xticks(np.arange(5, CONFIDENCE_BINS + 1) / CONFIDENCE_BINS, minor=True)
-        above.set_title(f"{stage_name(stage)}, error {state.error:.3f}")
+        above.set_title(f"{stage_name(stage)},\nerror {state.error:.3f}", fontsize="medium")
         below.stairs(calibration.gain_pit * PIT_BINS, edges, fill=True, color=BLUE, alpha=0.8)
         below.axhline(1.0, **_IDEAL)
-        below.set(xlabel="probability of a smaller gain", xlim=(0.0, 1.0))
+        below.set(xlim=(0.0, 1.0))
+        below.set_xticks([0.0, 0.5, 1.0])
+    middle = axes[:, len(stages) // 2]
+    middle[0].set_xlabel("probability of the likeliest link state")
+    middle[1].set_xlabel("predicted probability of a smaller path gain")
     axes[0, 0].set_ylabel("accuracy")
     axes[1, 0].set_ylabel("density")
     figure.suptitle("Calibration of the link state (above) and of the path gain (below)")

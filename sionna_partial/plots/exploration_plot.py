@@ -18,7 +18,7 @@ from PIL import Image
 from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.style import BLUE, RED, YELLOW, corners_m, figure_png, legend_below, window_m
+from sionna_partial.plots.style import BLUE, RED, YELLOW, corners_m, figure_png, legend_below, sheet_columns, window_m
 from sionna_partial.simulation.camera import view_corners_m
 from sionna_partial.simulation.explore import Exploration
 
@@ -30,7 +30,7 @@ MAX_PANELS = 12
 
 _FREE, _WALL, _UNKNOWN, _UNSEEN_WALL = "white", "black", "0.86", "0.68"
 _VIEW_OPACITY = 0.35
-_WIDTH_IN, _SHEET_ASPECT, _DPI = 12.0, 1.5, 110
+_WIDTH_IN, _DPI = 8.0, 165
 _FRAME_IN, _FRAME_DPI = 5.6, 90
 _MIXED_COLOURS, _ALIKE = 128, 16
 
@@ -64,10 +64,10 @@ def plot_exploration(exploration: Exploration) -> Figure:
     count = min(len(exploration.steps), MAX_PANELS)
     shown = np.linspace(len(exploration.steps) - 1, 0, count).astype(np.intp)[::-1]
     x0, x1, y0, y1 = _window_m(exploration)
-    columns = _columns(count, (x1 - x0) / (y1 - y0))
+    columns = sheet_columns(count, (x1 - x0) / (y1 - y0))
     rows = math.ceil(count / columns)
     width = _WIDTH_IN / max(columns, 2)
-    size = (width * columns, rows * ((width - 0.4) * (y1 - y0) / (x1 - x0) + 0.3) + 0.9)
+    size = (width * columns, rows * ((width - 0.4) * (y1 - y0) / (x1 - x0) + 0.3) + 1.25)
     figure = Figure(figsize=size, dpi=_DPI, layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for panel in axes.flat[count:]:
@@ -75,7 +75,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     for index, panel in zip(shown, axes.flat[:count], strict=True):
         _draw(panel, exploration, int(index))
         panel.label_outer()
-    _add_legend(figure, exploration, in_one_row=columns > 1)
+    _add_legend(figure, exploration)
     return figure
 
 
@@ -118,16 +118,6 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) 
 def _require_exploration(value: object) -> None:
     remedy = "give an Exploration, as explore_trajectory returns it."
     require(isinstance(value, Exploration), "exploration", type(value).__name__, remedy)
-
-
-def _columns(count: int, aspect: float) -> int:
-    """Choose the columns of a sheet of panels that is neither high nor wide, and has few empty panels."""
-
-    def fault(columns: int) -> float:
-        rows = math.ceil(count / columns)
-        return abs(math.log(columns * aspect / rows / _SHEET_ASPECT)) + (rows * columns - count) / count
-
-    return min(range(1, count + 1), key=fault)
 
 
 def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> Image.Image:
@@ -193,16 +183,17 @@ def _drifts(exploration: Exploration) -> bool:
     return not np.array_equal(exploration.poses, exploration.believed_poses)
 
 
-def _add_legend(figure: Figure, exploration: Exploration, *, in_one_row: bool) -> None:
+def _add_legend(figure: Figure, exploration: Exploration) -> None:
+    unseen, walls = exploration.states == CellState.UNKNOWN, exploration.home.state == CellState.WALL
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=BLUE, marker="o", markersize=4, markevery=[0], label="trajectory"),
         Line2D([], [], color=RED, marker=_arrow(0.0), markersize=10, linestyle="none", label="robot"),
-        Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="field of view"),
+        *([Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="field of view")] if any(exploration.steps) else []),
         Patch(color=_WALL, label="wall, seen"),
-        Patch(color=_UNSEEN_WALL, label="wall, not seen"),
+        *([Patch(color=_UNSEEN_WALL, label="wall, not seen")] if (unseen & walls).any() else []),
         Patch(color=_UNKNOWN, label="not seen"),
     ]
     if _drifts(exploration):
         handles[0].set_label("estimated trajectory")
         handles.insert(1, Line2D([], [], color=BLUE, linewidth=1.0, linestyle=":", label="true trajectory"))
-    legend_below(figure, handles, None if in_one_row else 3)
+    legend_below(figure, handles, 3)

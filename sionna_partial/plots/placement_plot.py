@@ -63,9 +63,11 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
         Line2D([], [], label="transmitter", **_STAR),
         Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
         Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
-        Patch(color=_WALL, label="wall"),
-        Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"),
     ]
+    if (placement.partial.state == CellState.WALL).any():
+        handles.append(Patch(color=_WALL, label="wall"))
+    if (placement.partial.state == CellState.UNKNOWN).any():
+        handles.append(Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"))
     legend_below(figure, handles)
     return figure
 

@@ -1,6 +1,7 @@
 """Shared style of all figures: colours, shaded cells, legends, and equal PNG files for equal figures."""
 
 import io
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -23,6 +24,9 @@ STAR: dict[str, Any] = {"marker": "*", "markerfacecolor": "white", "markeredgeco
 
 BORDER_M = 0.3
 """Width of the border around the known cells in a picture [m]."""
+
+
+_SHEET_ASPECT = 1.5
 
 
 def figure_png(figure: Figure) -> bytes:
@@ -49,6 +53,16 @@ def corners_m(cells: NDArray[np.bool_], origin_m: tuple[float, float], resolutio
     """Lower-left and upper-right corners of cells (2N, 2) [m]."""
     corners = np.argwhere(cells)[:, ::-1]
     return np.vstack([corners, corners + 1]) * resolution_m + origin_m
+
+
+def sheet_columns(count: int, aspect: float) -> int:
+    """Choose the columns of a sheet that is neither high nor wide, with few empty panels; none of up to four panels."""
+
+    def fault(columns: int) -> float:
+        rows = math.ceil(count / columns)
+        return abs(math.log(columns * aspect / rows / _SHEET_ASPECT)) + 4 * (rows * columns - count) / count
+
+    return min(range(1, count + 1), key=fault)
 
 
 def legend_below(figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None) -> None:

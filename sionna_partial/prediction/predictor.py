@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtr
 
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
@@ -145,6 +146,18 @@ class LinkPrediction:
             np.stack([floor, self.gain_los_mean_db, self.gain_nlos_mean_db]),
             np.stack([np.zeros_like(indoors), self.gain_los_std_db, self.gain_nlos_std_db]),
         )
+
+    def probability_above(self, threshold_db: float) -> Floats:
+        """Return P(path gain > threshold) of each link (N,), for a threshold [dB] of -150 dB, an outage, or more."""
+        above = np.zeros(self.p_los.shape)
+        for probability, mean_db, std_db in (
+            (self.p_los, self.gain_los_mean_db, self.gain_los_std_db),
+            (self.p_nlos, self.gain_nlos_mean_db, self.gain_nlos_std_db),
+        ):
+            margin_db = mean_db - threshold_db
+            spread = ndtr(margin_db / np.where(std_db > 0.0, std_db, 1.0))
+            above += probability * np.where(std_db > 0.0, spread, margin_db > 0.0)
+        return above
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,137 @@
+"""The HTML page of a coverage map: what is in it, and what a browser without network makes of it."""
+
+import base64
+import gzip
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray as xr
+from coverage_fakes import small_coverage, use_fakes
+from matplotlib.colors import to_rgb
+from PIL import Image
+
+from sionna_partial.constants import LinkState
+from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, predict_map, probability_above
+from sionna_partial.export import save_coverage
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.style import STATE_COLOURS
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+FLAGS = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
+--disable-component-update --disable-sync --enable-logging=stderr --window-size=1000,900 --virtual-time-budget=30000"""
+
+PROBE = """<pre id="found"></pre><script>
+const timer = setInterval(() => {
+    const page = Bokeh.documents[0], named = name => page?.get_model_by_name(name)
+    if (!named("threshold")) return
+    named("threshold").value = -80
+    named("layer").value = "p_above"
+    if (!named("plot").title.text.includes("-80")) return
+    clearInterval(timer)
+    const found = {p_above: Array.from(named("values").data.p_above[0]),
+        shown: named("plot").renderers.filter(each => each.visible).map(each => each.glyph?.image?.field)}
+    document.getElementById("found").textContent = JSON.stringify(found)
+}, 200)
+</script>"""
+"""Moves the slider, chooses a layer, and writes what came of it."""
+
+
+@pytest.fixture
+def coverage(monkeypatch):
+    return small_coverage(monkeypatch)
+
+
+def browse(page: Path, *flags: str) -> str:
+    """Open a page, and return what the browser printed; whatever it logs to the console fails the test."""
+    command = [str(CHROMIUM), *FLAGS.split(), f"--user-data-dir={page.parent / 'profile'}", *flags, page.as_uri()]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    console = [line for line in result.stderr.splitlines() if "CONSOLE" in line]
+    expected = re.compile(r'"\[bokeh [\d.]+\] (setting log level|document idle)')
+    assert console
+    assert [line for line in console if not expected.search(line)] == []
+    return result.stdout
+
+
+def screenshot(page: Path) -> np.ndarray:
+    """Colours of the page in the browser, 0 to 255."""
+    browse(page, f"--screenshot={page.with_suffix('.png')}")
+    with Image.open(page.with_suffix(".png")) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="there is no browser")
+class TestInABrowser:
+    def test_the_likeliest_states_are_seen_first(self, coverage, tmp_path):
+        save_coverage(coverage, tmp_path / "coverage.html")
+        picture = screenshot(tmp_path / "coverage.html")
+        for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE):
+            colour = np.rint(255 * np.array(to_rgb(STATE_COLOURS[state]))).astype(int)
+            assert (np.abs(picture - colour).max(axis=2) < 2).sum() > 2000, state
+        assert (picture.max(axis=2) == 0).sum() > 5000
+
+    def test_a_map_without_walls_has_no_black_area(self, coverage, tmp_path):
+        save_coverage(coverage.assign(wall_parts=0 * coverage["wall_parts"]), tmp_path / "coverage.html")
+        assert (screenshot(tmp_path / "coverage.html").max(axis=2) == 0).sum() < 5000
+
+    def test_the_slider_moves_the_threshold(self, coverage, tmp_path):
+        save_coverage(coverage, tmp_path / "coverage.html")
+        page = tmp_path / "coverage.html"
+        with page.open("a", encoding="utf-8") as stream:
+            stream.write(PROBE)
+        (found,) = re.findall(r'<pre id="found">(.*?)</pre>', browse(page, "--dump-dom"))
+        found = json.loads(found)
+        assert [each for each in found["shown"] if each not in (None, "image")] == ["p_above"]
+        p_above = np.array(found["p_above"], dtype=float).reshape(coverage["p_los"].shape)
+        np.testing.assert_allclose(p_above, probability_above(coverage, -80.0), atol=1e-6)
+        assert 0.1 < np.nanmean(p_above) < np.nanmean(probability_above(coverage, -100.0))
+
+
+def test_nothing_is_loaded_from_elsewhere(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "coverage.html")
+    text = (tmp_path / "coverage.html").read_text(encoding="utf-8")
+    assert "default-src 'none'" in text
+    assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)=", re.sub(r"(?s)<script>.*?</script>", "", text))
+
+
+def test_the_outside_of_a_complete_map_has_no_values(coverage, tmp_path):
+    pages = []
+    for complete in (0, 1):
+        coverage.attrs["map_complete"] = complete
+        save_coverage(coverage, tmp_path / "coverage.html")
+        pages.append(values_of(tmp_path / "coverage.html", coverage))
+    expected = np.where(coverage["observed"], coverage["p_los"], np.nan)
+    np.testing.assert_array_equal(pages[0], coverage["p_los"])
+    np.testing.assert_array_equal(pages[1], expected)
+
+
+def values_of(page: Path, coverage: xr.Dataset) -> np.ndarray:
+    """P(LOS) as the page has it."""
+    text = page.read_text(encoding="utf-8")
+    (data,) = re.findall(r'\["p_los", \[\{"type": "ndarray", "array": \{"type": "bytes", "data": "([^"]+)"', text)
+    values = np.frombuffer(gzip.decompress(base64.b64decode(data)), dtype=np.float32)
+    return values.reshape(coverage["p_los"].shape)
+
+
+def test_names_in_a_file_are_text(coverage, tmp_path):
+    coverage.attrs["predictor"] = "<script>alert(1)</script>"
+    save_coverage(coverage, tmp_path / "coverage.html")
+    text = (tmp_path / "coverage.html").read_text(encoding="utf-8")
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+
+
+def test_thirty_thousand_receivers_take_less_than_5_mb(monkeypatch, tmp_path):
+    use_fakes(monkeypatch)
+    coverage = predict_map(PartialMap(np.full((150, 200), 2, dtype=np.uint8), 0.2), (9.0, 9.0), spacing_m=0.2)
+    rng = np.random.default_rng(0)
+    for name in (*DISTRIBUTION, *COMPONENTS, "unobserved_distance_m"):
+        coverage[name][:] = rng.random(coverage["p_los"].shape)
+    save_coverage(coverage, tmp_path / "coverage.html")
+    assert coverage["valid"].size == 30_000
+    assert (tmp_path / "coverage.html").stat().st_size < 5e6
