@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import (
     Progress,
-    no_progress,
     real_array,
     require,
     require_choice,
@@ -32,6 +31,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
+from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, nearest_m
 
@@ -123,7 +123,7 @@ def predict_map(
     trace_settings: TraceSettings | None = None,
     receivers: str = RECEIVERS[0],
     memory_gb: float = MEMORY_GB,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> xr.Dataset:
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
 
@@ -157,8 +157,9 @@ def predict_map(
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float
         How much memory the process may take [GB]. Receivers are traced and predicted in blocks that fit.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -199,10 +200,9 @@ def predict_map(
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
     needs_context = model is not None and model.settings.networks != "paper"
-    report = progress or no_progress
-    report(0.0, "building the scene")
     columns: list[dict[str, NDArray[Any]]] = []
-    with temporary_folder() as work:
+    with reporting(progress) as report, temporary_folder() as work:
+        report(0.0, "building the scene")
         tracer = Tracer(partial, work, trace_settings, scene_settings)
         for start in range(0, len(grid.rx_m), at_once):
 
@@ -213,6 +213,7 @@ def predict_map(
             paths = tracer.paths(tx_m, rx_m, within)
             phi = features_of_paths(partial, tx_m, rx_m, paths, context=needs_context)
             columns.append(_columns(phi, model, partial.state_at(rx_m), anywhere=receivers == "anywhere"))
+        report(1.0, "done")
     variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
@@ -222,7 +223,6 @@ def predict_map(
         "spacing_m": float(spacing_m),
         "receivers": receivers,
     }
-    report(1.0, "done")
     return _label(grid, variables, attributes)
 
 

@@ -21,7 +21,7 @@ PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("constants", "errors", "checks", "settings", "resources"),
+        *("constants", "errors", "checks", "progress", "settings", "resources"),
         *("process", "files", "planar", "cores", "llvm"),
     ),
     "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
@@ -47,7 +47,7 @@ ROOMS = {
     "training": ("training",),
     "plots": (*("style", "coverage_plot", "exploration_plot", "material_plot", "placement_plot", "evaluation_plot"),),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("options", "progress", "prediction", "learning", "planning", "app"),
+    "cli": ("options", "prediction", "learning", "planning", "app"),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 

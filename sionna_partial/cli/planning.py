@@ -8,9 +8,9 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.cli.progress import show_progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.progress import reporting
 from sionna_partial.settings import Objective, SceneSettings
 
 TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
@@ -46,7 +46,7 @@ def calibrate(
     measured = measurements_of(measurements)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "loading Sionna RT")
         result = sp.calibrate_materials(
             partial,
@@ -90,7 +90,7 @@ def place(
     trace_settings = opt.trace_settings(frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
         result = sp.place_transmitter(
             partial,

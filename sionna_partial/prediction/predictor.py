@@ -32,6 +32,7 @@ from sionna_partial.prediction.paper_networks import (
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.prediction.unobserved import Bools, Floats
+from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 
@@ -211,7 +212,7 @@ class Predictor:
         *,
         homes: Sequence[str] = (),
         settings: PredictorSettings | None = None,
-        progress: Progress | None = None,
+        progress: Progress | bool | None = None,
     ) -> "Predictor":
         """Train on links of known truth; the same links and settings give the same weights.
 
@@ -230,8 +231,9 @@ class Predictor:
             Where the links come from, to be recorded.
         settings : PredictorSettings, optional
             The paper's networks by default.
-        progress : callable, optional
-            Called as ``progress(fraction_done, message)``.
+        progress : bool or callable, optional
+            False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+            terminals and notebooks after 2 s.
 
         Returns
         -------
@@ -255,7 +257,8 @@ class Predictor:
                 raise PredictorError(f"features has no context, which all networks but the paper's need: {remedy}")
             if settings.networks == "map":
                 _require_windows(features)
-            context_networks = fit_context_networks(features, states, gains_db, settings, progress=progress)
+            with reporting(progress) as report:
+                context_networks = fit_context_networks(features, states, gains_db, settings, progress=report)
         model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
         links = {
             f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())

@@ -20,6 +20,7 @@ from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.progress import reporting
 from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Wedges
@@ -116,7 +117,7 @@ def trace_links(
     scene_settings: SceneSettings | None = None,
     folder: str | Path | None = None,
     memory_gb: float = MEMORY_GB,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> TracedLinks:
     """Trace every path from one or more transmitters to N receivers with Sionna RT.
 
@@ -143,8 +144,9 @@ def trace_links(
         then read from there when they are needed, and `memory_gb` does not limit them.
     memory_gb : float
         How much memory the paths may take [GB]. Their size is estimated first, from some of the receivers.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -179,9 +181,9 @@ def trace_links(
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
-    shape, report = np.shape(tx), progress or no_progress
-    report(0.0, "building the scene")
-    with temporary_folder() as work:
+    shape = np.shape(tx)
+    with reporting(progress) as report, temporary_folder() as work:
+        report(0.0, "building the scene")
         tracer = Tracer(partial, work, settings, scene_settings)
         tracer.require_memory(tx_m, rx_m, None if folder is not None else memory_gb)
         if folder is None:
