@@ -6,8 +6,9 @@ import logging
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +18,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import (
     Progress,
+    number_of,
     real_array,
     require,
     require_choice,
     require_number,
     settings_or_default,
+    shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, CellState, LinkState
+from sionna_partial.display import later, picture_html
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -41,9 +45,6 @@ MAX_RECEIVERS = 2_000_000
 WALL_PARTS = 6
 """`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
 
-NO_RECEIVER = 255
-"""Value of the integer variables where no receiver can stand."""
-
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
 
@@ -58,6 +59,8 @@ are predicted together [bytes]; `benchmarks/scale.py` measures it."""
 
 _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 """Number of receivers that are predicted together."""
+
+_PLOT = "plots.coverage_plot:plot_coverage"
 
 _LEAST_DEPTH = 2
 """Interactions from which on a trace is like those of the training."""
@@ -237,6 +240,83 @@ def require_coverage(coverage: xr.Dataset) -> None:
     missing += [name for name in ("transmitter_m", "spacing_m", "frequency_hz") if name not in coverage.attrs]
     if missing or not coverage["valid"].size:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
+
+
+@xr.register_dataset_accessor("radio")
+class CoverageAccessor:
+    """What can be asked of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
+
+    Every method raises a SettingsError for a Dataset that is no coverage map.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> float(coverage.radio.at(2.4, 2.4).p_los)
+    1.0
+    >>> float(coverage.radio.probability_above(-60.0).sel(x=2.25, y=2.25))
+    0.0
+    """
+
+    def __init__(self, coverage: xr.Dataset) -> None:
+        self._coverage = coverage
+
+    def plot(self) -> Any:
+        """Return the figure of `plot_coverage`."""
+        return later(_PLOT)(self._coverage)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the map as `save_coverage` does."""
+        later("export:save_coverage")(self._coverage, path)
+
+    def probability_above(self, threshold_db: float) -> xr.DataArray:
+        """Return the probability (ny, nx) that the path gain exceeds a threshold t [dB].
+
+        P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), where m
+        and s are `gain_los_mean_db`, `gain_los_std_db` and so on, and Phi is the normal distribution function: an
+        outage has a gain of -150 dB. It is NaN where no receiver can stand.
+
+        Raises
+        ------
+        SettingsError
+            For a threshold that is no number of dB.
+        """
+        require_coverage(self._coverage)
+        require_number("threshold_db", threshold_db, -1000.0, 1000.0)
+        names = (field.name for field in fields(LinkPrediction))
+        prediction = LinkPrediction(*(self._coverage[name].to_numpy() for name in names))
+        attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
+        values = self._coverage["p_los"].copy(data=prediction.probability_above(threshold_db).astype(np.float32))
+        return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
+
+    def at(self, x: float, y: float) -> xr.Dataset:
+        """Return all variables at the receiver nearest to world x and y [m].
+
+        Raises
+        ------
+        PositionError
+            If that is not on the map.
+        """
+        require_coverage(self._coverage)
+        half_m = float(self._coverage.attrs["spacing_m"]) / 2.0
+        for name, value in (("x", x), ("y", y)):
+            low_m, high_m = (float(self._coverage[name][end]) for end in (0, -1))
+            if not low_m - half_m <= number_of(value) <= high_m + half_m:
+                span = f"{low_m - half_m:g} to {high_m + half_m:g} m"
+                raise PositionError(f"{name} = {shown(value)} is not on the map: give a number of metres in {span}.")
+        return self._coverage.sel(x=x, y=y, method="nearest")
+
+    def __repr__(self) -> str:
+        require_coverage(self._coverage)
+        rows, columns = self._coverage["valid"].shape
+        attributes = self._coverage.attrs
+        grid = f"{columns} x {rows} receivers, {attributes['spacing_m']:g} m apart"
+        tx = ", ".join(f"{each:.2f}" for each in attributes["transmitter_m"])
+        return f"<coverage: {grid}, transmitter at ({tx}) m, {attributes['frequency_hz'] / 1e9:g} GHz>"
+
+    def _repr_html_(self) -> str:
+        return picture_html(repr(self), _PLOT, self._coverage)
 
 
 def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:

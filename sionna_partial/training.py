@@ -9,6 +9,7 @@ import numpy as np
 
 from sionna_partial.checks import Progress, require_number, settings_or_default
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like, settings_for
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import Evaluation, evaluate
@@ -23,7 +24,7 @@ TEST_FRACTION = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingRun:
+class TrainingRun(Shown):
     """Result of `train`: a predictor, baselines fitted to the same links, and the evaluation on test homes, if any.
 
     The predictor's card has what was measured on the test homes.

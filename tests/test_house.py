@@ -21,7 +21,7 @@ PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("constants", "errors", "checks", "progress", "settings", "resources"),
+        *("constants", "errors", "checks", "display", "progress", "settings", "resources"),
         *("process", "files", "planar", "cores", "llvm"),
     ),
     "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
@@ -45,7 +45,17 @@ ROOMS = {
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
-    "plots": (*("style", "coverage_plot", "exploration_plot", "material_plot", "placement_plot", "evaluation_plot"),),
+    "plots": (
+        *(
+            "style",
+            "map_plot",
+            "coverage_plot",
+            "exploration_plot",
+            "material_plot",
+            "placement_plot",
+            "evaluation_plot",
+        ),
+    ),
     "results": ("export", "demo", "info", "reports"),
     "cli": ("options", "prediction", "learning", "planning", "app"),
 }

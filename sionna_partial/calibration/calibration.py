@@ -29,6 +29,7 @@ from sionna_partial.calibration.measured_building import (
 )
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.display import Pictured
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
@@ -44,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class MaterialCalibration:
+class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
 
     Of a scene of one material the parameters are numbers; of a mesh with M materials they are arrays (M,), in the

@@ -9,7 +9,7 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
-from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.files import CALIBRATED_FILE, atomic_files, require_writable
 from sionna_partial.progress import reporting
 from sionna_partial.settings import Objective, SceneSettings
 
@@ -37,7 +37,8 @@ def calibrate(
 ) -> None:
     """Find the material of a building from measured path gains.
 
-    The folder --out gets the map with the calibrated material (predict takes it), the numbers as JSON, and a picture.
+    The folder --out gets the map with the calibrated material, the numbers as JSON, and a picture. predict takes the
+    folder as a map.
     """
     scene_settings = SceneSettings(material=opt.parse_material(material))
     settings = opt.trace_settings(frequency, max_depth, diffraction)
@@ -57,11 +58,11 @@ def calibrate(
             progress=report,
         )
         with atomic_files(out) as folder:
-            sp.save_map(result.scene, folder / "calibrated.npz")
+            sp.save_map(result.scene, folder / CALIBRATED_FILE)
             (folder / "calibration.json").write_text(json.dumps(result.record(), indent=1) + "\n", encoding="utf-8")
             sp.plot_calibration(result).savefig(folder / "calibration.png")
     typer.echo(_table(result))
-    opt.print_files(out, ["calibrated.npz", "calibration.json", "calibration.png"])
+    opt.print_files(out, [CALIBRATED_FILE, "calibration.json", "calibration.png"])
 
 
 def place(

@@ -25,6 +25,7 @@ from sionna_partial.datasets.home_process import (
 )
 from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
+from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
 from sionna_partial.process import cleaned_up
@@ -42,7 +43,7 @@ CONNECT_S = 30.0
 
 
 @dataclass(frozen=True)
-class DatasetReport:
+class DatasetReport(Shown):
     """What a run has done: names of the homes that it built and that were there, and why others failed."""
 
     folder: Path

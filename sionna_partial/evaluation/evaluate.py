@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sionna_partial.checks import Progress, shown
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.datasets.link_table import LinkTable, stage_name
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import MAJORITY_FILE, Baselines, baseline_predictions
 from sionna_partial.evaluation.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
@@ -73,7 +74,7 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class Evaluation(Shown):
     """Result of `evaluate`.
 
     Parameters

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from sionna_partial.checks import Progress, no_progress, require, require_number, settings_or_default
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -43,7 +43,7 @@ FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class TransmitterPlacement:
+class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement"):
     """A position for a transmitter, and the search that found it.
 
     Parameters
@@ -222,15 +222,7 @@ def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDAr
     """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
-    covered = np.zeros(len(prediction.p_los))
-    for probability, mean_db, std_db in (
-        (prediction.p_los, prediction.gain_los_mean_db, prediction.gain_los_std_db),
-        (prediction.p_nlos, prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db),
-    ):
-        above_db = mean_db - settings.threshold_db
-        spread = ndtr(above_db / np.where(std_db > 0.0, std_db, 1.0))
-        covered += probability * np.where(std_db > 0.0, spread, above_db > 0.0)
-    return covered
+    return prediction.probability_above(settings.threshold_db)
 
 
 def placement_score(values: NDArray[np.float64], weight: NDArray[np.float64], settings: PlacementSettings) -> float:

@@ -10,7 +10,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
-from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
@@ -20,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from sionna_partial.checks import require
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import WALL_PARTS, require_coverage
-from sionna_partial.plots.style import STAR, STATE_COLOURS, legend_below, shade
+from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade
 
 _WIDTH_IN, _DPI, _MAX_PIXELS = 12.0, 150, 3000
 _STACKED_ASPECT = 1.8

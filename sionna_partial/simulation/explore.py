@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.checks import Progress, are_stages, is_whole, require, settings_or_default
 from sionna_partial.constants import CellState
+from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
@@ -33,7 +34,7 @@ _REPORT_STEPS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Exploration:
+class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     """The trajectory of a robot through a home, and what it had seen at several moments.
 
     Parameters

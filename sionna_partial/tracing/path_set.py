@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -36,7 +37,7 @@ Part = tuple[Candidates, SolvedPaths]
 
 
 @dataclass(frozen=True)
-class PathParameters:
+class PathParameters(Shown):
     """What the power of paths depends on.
 
     Parameters
@@ -362,7 +363,7 @@ def path_settings(
 
 
 @dataclass(frozen=True)
-class GainGradients:
+class GainGradients(Shown):
     """Path gain from one transmitter to N receivers, and its derivatives.
 
     The derivatives are those of the paths that exist: they do not include paths that appear or vanish. They are 0 in
