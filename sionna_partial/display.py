@@ -46,7 +46,7 @@ def _brief(value: Any) -> str:
     if isinstance(value, Mapping) or (isinstance(value, tuple | list) and len(value) > _FEW):
         return f"{type(value).__name__} of {len(value)}"
     if isinstance(value, tuple | list):
-        return f"({', '.join(map(_brief, value))})"
+        return f"({', '.join(map(_brief, value))}{',' * (len(value) == 1)})"
     return shown(value)
 
 
