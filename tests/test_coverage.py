@@ -424,7 +424,8 @@ class TestAccessor:
         assert above.dims == ("y", "x")
         assert above.units == "1"
         los, nlos = (
-            coverage[f"p_{state}"] * norm.sf(-70.0, coverage[f"gain_{state}_mean_db"], coverage[f"gain_{state}_std_db"])
+            coverage[f"p_{state}"]
+            * norm.sf(-70.0, coverage[f"gain_{state}_mean_db"], coverage[f"gain_{state}_std_db"] + 1e-9)
             for state in ("los", "nlos")
         )
         valid = (coverage["valid"] & (coverage["gain_los_std_db"] > 0.0)).to_numpy()

@@ -492,7 +492,7 @@ class TestTables:
     TX = ((1.0, 1.0, 1.5), (5.0, 1.0, 1.5))
     RX = ((2.0, 1.0, 1.5), (4.0, 3.0, 1.5), (9.0, 1.0, 1.5))
 
-    @pytest.fixture(scope="class")
+    @pytest.fixture
     def links(self) -> TracedLinks:
         return trace_links(_room(), self.TX, self.RX, invalid="nan")
 
