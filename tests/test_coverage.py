@@ -430,7 +430,7 @@ class TestAccessor:
         )
         valid = (coverage["valid"] & (coverage["gain_los_std_db"] > 0.0)).to_numpy()
         assert np.allclose(above.to_numpy()[valid], (los + nlos).to_numpy()[valid], atol=1e-5)
-        assert ((above > 0.1) & (above < 0.9)).any()
+        assert ((above > 0.01) & (above < 0.99)).any()
         assert np.array_equal(np.isnan(above), ~coverage["valid"])
 
     def test_an_outage_has_150_db(self, coverage):
