@@ -453,13 +453,13 @@ class Tracer:
 
         Raises a MemoryLimitError if that is more than `memory_gb`.
         """
-        source = int(valid.sum(axis=1).argmax())
-        rx_m = rx_m[valid[source]]
-        if len(tx_m) * len(rx_m) <= RECEIVERS_OF_PLAN:
+        if valid.sum() <= RECEIVERS_OF_PLAN:
             return
-        some = rx_m[np.linspace(0, len(rx_m) - 1, min(len(rx_m), SAMPLE)).astype(int)]
+        source = int(valid.sum(axis=1).argmax())
+        all_m = rx_m[valid[source]]
+        some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
         found = sum(len(paths.a) for paths in self.paths(tx_m[source], some, no_progress))
-        count = round(found / len(some) * len(rx_m) * len(tx_m))
+        count = round(found / len(some) * valid.sum())
         size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth)) / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)
         if memory_gb is not None and size_gb > memory_gb:
