@@ -10,6 +10,7 @@ from sionna_partial.datasets.shards import read_dataset as read_dataset
 from sionna_partial.differentiable.scene import DifferentiableScene as DifferentiableScene
 from sionna_partial.errors import SionnaPartialError as SionnaPartialError
 from sionna_partial.evaluation.evaluate import evaluate as evaluate
+from sionna_partial.export import load_coverage as load_coverage
 from sionna_partial.export import save_coverage as save_coverage
 from sionna_partial.maps.map_files import load_map as load_map
 from sionna_partial.maps.map_files import map_from_array as map_from_array
@@ -24,6 +25,7 @@ from sionna_partial.placement.placement import place_transmitter as place_transm
 from sionna_partial.plots.coverage_plot import plot_coverage as plot_coverage
 from sionna_partial.plots.exploration_plot import animate_exploration as animate_exploration
 from sionna_partial.plots.exploration_plot import plot_exploration as plot_exploration
+from sionna_partial.plots.map_plot import plot_map as plot_map
 from sionna_partial.plots.material_plot import plot_calibration as plot_calibration
 from sionna_partial.plots.placement_plot import plot_placement as plot_placement
 from sionna_partial.prediction.features import LinkFeatures as LinkFeatures

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 Progress = Callable[[float, str], None]
 """Called with the fraction of the work that is done, and a message."""
 
+CountProgress = Callable[[int, int, str], None]
+"""Called with the number of things that are done, their number in all, and a message."""
+
 _Settings = TypeVar("_Settings")
 
 _short = reprlib.Repr()

@@ -11,6 +11,9 @@ CARRIER_FREQUENCY_HZ = 28e9
 GAIN_FLOOR_DB = -150.0
 """Smallest omnidirectional path gain, and the gain of an outage [dB] (paper, eq. 5)."""
 
+NO_RECEIVER = 255
+"""Link state where no receiver can stand, and no link was traced."""
+
 DEFAULT_HEIGHT_M = 1.5
 """Height of transmitters and receivers where none is given [m] (the paper's reference trace)."""
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,16 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.checks import (
     Progress,
     no_progress,
+    number_of,
     real_array,
     require,
     require_choice,
     require_number,
     settings_or_default,
+    shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, CellState, LinkState
+from sionna_partial.display import later, picture_html
 from sionna_partial.errors import MeasurementError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -34,6 +38,7 @@ from sionna_partial.measurements.measurements import Measurements, measurements_
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
+from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, nearest_m
 
@@ -42,9 +47,6 @@ MAX_RECEIVERS = 2_000_000
 
 WALL_PARTS = 6
 """`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
-
-NO_RECEIVER = 255
-"""Value of the integer variables where no receiver can stand."""
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
@@ -69,6 +71,8 @@ LARGE_OFFSET_DB = 15.0
 
 MOST_MEASUREMENTS = 20_000
 """Number of measurements that are held against predictions."""
+
+_PLOT = "plots.coverage_plot:plot_coverage"
 
 _LEAST_DEPTH = 2
 """Interactions from which on a trace is like those of the training."""
@@ -135,7 +139,7 @@ def predict_map(
     measurements: Any = None,
     receivers: str = RECEIVERS[0],
     memory_gb: float = MEMORY_GB,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> xr.Dataset:
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
 
@@ -172,8 +176,9 @@ def predict_map(
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float
         How much memory the process may take [GB]. Receivers are traced and predicted in blocks that fit.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -215,11 +220,10 @@ def predict_map(
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    report = progress or no_progress
-    report(0.0, "building the scene")
-    measured = None if measurements is None else _measured(partial, tx_m, measurements, trace_settings.frequency_hz)
     columns: list[dict[str, NDArray[Any]]] = []
-    with temporary_folder() as work:
+    measured = None if measurements is None else _measured(partial, tx_m, measurements, trace_settings.frequency_hz)
+    with reporting(progress) as report, temporary_folder() as work:
+        report(0.0, "building the scene")
         links = _Links(partial, tx_m, Tracer(partial, work, trace_settings, scene_settings), model)
         told = None if measured is None else _assimilated(links, measured, at_once)
         for start in range(0, len(grid.rx_m), at_once):
@@ -232,6 +236,7 @@ def predict_map(
             if told is not None:
                 prediction = told.update(rx_m, prediction)
             columns.append(_columns(phi, prediction, links.p_indoor(rx_m, phi), anywhere=receivers == "anywhere"))
+        report(1.0, "done")
     variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
@@ -247,7 +252,6 @@ def predict_map(
             "measured_noise_db": told.noise_db,
             "measured_offset_db": told.offset_db,
         }
-    report(1.0, "done")
     return _label(grid, variables, attributes)
 
 
@@ -269,6 +273,81 @@ def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
     columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
     return LinkPrediction(**columns).probability_above(threshold_db)
+
+
+@xr.register_dataset_accessor("radio")
+class CoverageAccessor:
+    """What can be asked of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
+
+    Every method raises a SettingsError for a Dataset that is no coverage map.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> float(coverage.radio.at(2.4, 2.4).p_los)
+    1.0
+    >>> float(coverage.radio.probability_above(-60.0).sel(x=2.25, y=2.25))
+    0.0
+    """
+
+    def __init__(self, coverage: xr.Dataset) -> None:
+        self._coverage = coverage
+
+    def plot(self) -> Any:
+        """Return the figure of `plot_coverage`."""
+        return later(_PLOT)(self._coverage)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the map as `save_coverage` does."""
+        later("export:save_coverage")(self._coverage, path)
+
+    def probability_above(self, threshold_db: float) -> xr.DataArray:
+        """Return the probability (ny, nx) that the path gain exceeds a threshold t [dB].
+
+        P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), where m
+        and s are `gain_los_mean_db`, `gain_los_std_db` and so on, and Phi is the normal distribution function: an
+        outage has a gain of -150 dB. It is NaN where no receiver can stand.
+
+        Raises
+        ------
+        SettingsError
+            For a threshold that is no number of dB.
+        """
+        require_coverage(self._coverage)
+        above = probability_above(self._coverage, threshold_db)
+        attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
+        values = self._coverage["p_los"].copy(data=above.astype(np.float32))
+        return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
+
+    def at(self, x: float, y: float) -> xr.Dataset:
+        """Return all variables at the receiver nearest to world x and y [m].
+
+        Raises
+        ------
+        PositionError
+            If that is not on the map.
+        """
+        require_coverage(self._coverage)
+        half_m = float(self._coverage.attrs["spacing_m"]) / 2.0
+        for name, value in (("x", x), ("y", y)):
+            low_m, high_m = (float(self._coverage[name][end]) for end in (0, -1))
+            if not low_m - half_m <= number_of(value) <= high_m + half_m:
+                span = f"{low_m - half_m:g} to {high_m + half_m:g} m"
+                raise PositionError(f"{name} = {shown(value)} is not on the map: give a number of metres in {span}.")
+        return self._coverage.sel(x=x, y=y, method="nearest")
+
+    def __repr__(self) -> str:
+        require_coverage(self._coverage)
+        rows, columns = self._coverage["valid"].shape
+        attributes = self._coverage.attrs
+        grid = f"{columns} x {rows} receivers, {attributes['spacing_m']:g} m apart"
+        tx = ", ".join(f"{each:.2f}" for each in attributes["transmitter_m"])
+        return f"<coverage: {grid}, transmitter at ({tx}) m, {attributes['frequency_hz'] / 1e9:g} GHz>"
+
+    def _repr_html_(self) -> str:
+        return picture_html(repr(self), _PLOT, self._coverage)
 
 
 def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:

@@ -1,5 +1,6 @@
 """Coverage maps to files: NetCDF, GeoTIFF, CSV, PNG, HTML, ROS map."""
 
+import io
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -16,9 +17,10 @@ from rasterio import Affine
 from rasterio.io import MemoryFile
 from xarray.backends import H5NetCDFStore
 
-from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, require_coverage
-from sionna_partial.errors import OutputError
-from sionna_partial.files import atomic_write, output_path
+from sionna_partial.constants import NO_RECEIVER
+from sionna_partial.coverage import ATTRIBUTES, require_coverage
+from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.files import atomic_write, output_path, read_bytes
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.coverage_viewer import coverage_page
@@ -26,6 +28,9 @@ from sionna_partial.plots.style import figure_png
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
 """Variables in CSV and GeoTIFF; `wall_parts` is for pictures alone."""
+
+MAX_BYTES = 500_000_000
+"""Largest file that is read [bytes]."""
 
 LINK_STATES = ("link_state", "partial_link_state")
 
@@ -79,6 +84,40 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
         content = _ENCODERS[suffix](coverage)  # complete before the disk is touched
         with atomic_write(target) as stream:
             stream.write(content)
+
+
+def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Read a coverage map that `save_coverage` wrote as NetCDF.
+
+    Parameters
+    ----------
+    path : path-like
+        A `.nc` file.
+
+    Returns
+    -------
+    xarray.Dataset
+        Equal to the one that was saved, with ``coverage.radio`` (`plot`, `save`, `probability_above`, `at`).
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read, or holds something else.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> coverage = sp.load_coverage("coverage.nc")  # that save_coverage wrote
+    >>> coverage.sizes["x"]
+    8
+    """
+    content = read_bytes(path, "path", SettingsError, MAX_BYTES)
+    try:
+        coverage = xr.load_dataset(io.BytesIO(content), engine="h5netcdf")
+    except Exception as error:
+        raise SettingsError(f"path = '{path}' is no NetCDF file ({error}): give one of save_coverage.") from error
+    require_coverage(coverage)
+    return coverage
 
 
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:

@@ -17,6 +17,9 @@ from sionna_partial.process import own_folder, signals_held
 SCENE_FILES = ("scene.xml", "map.yaml")
 """Files by which an exported scene folder is recognised."""
 
+CALIBRATED_FILE = "calibrated.npz"
+"""File with the map in a folder of `sionna-partial calibrate`."""
+
 LOCK_FILE = ".lock"
 """File in a locked folder that names the process that writes there."""
 

@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.checks import Progress, no_progress, require_number, settings_or_default
+from sionna_partial.checks import Progress, require_number, settings_or_default
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like, settings_for
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import Evaluation, evaluate
 from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.progress import reporting
 from sionna_partial.settings import PredictorSettings
 
 PREDICTOR_FILE, SPLIT_FILE = "predictor.keras", "split.json"
@@ -22,7 +24,7 @@ TEST_FRACTION = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingRun:
+class TrainingRun(Shown):
     """Result of `train`: a predictor, baselines fitted to the same links, and the evaluation on test homes, if any.
 
     The predictor's card has what was measured on the test homes.
@@ -75,7 +77,7 @@ def train(
     *,
     test_fraction: float = TEST_FRACTION,
     settings: PredictorSettings | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> TrainingRun:
     """Train a predictor and the fitted baselines on some homes, and measure them on the others.
 
@@ -92,8 +94,9 @@ def train(
     settings : PredictorSettings, optional
         Networks "map" by default. Frequency and diffraction must be those of the data set, and are by default; the seed
         splits the homes, too.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -120,29 +123,29 @@ def train(
     settings = settings_or_default("settings", settings, PredictorSettings)
     remedy = "give PredictorSettings with the frequency and diffraction of the data set."
     require_like(traces, LinkTraces.of_settings(settings), "settings are for links", remedy)
-    report = progress or no_progress
     train_homes, test_homes = split_homes(list(dict.fromkeys(map(str, table.home))), test_fraction, settings.seed)
     links = table.take(np.isin(table.home, train_homes))
     indoors, unsure = links.take(~links.anywhere), links.take(links.anywhere & ~links.context.rx_seen)
-    report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
-    predictor = Predictor.fit(
-        indoors.phi if settings.networks == "map" else indoors.features,
-        indoors.link_state,
-        indoors.gain_db,
-        homes=train_homes,
-        settings=settings,
-        progress=lambda done, message: report(0.6 * done, message),
-    )
-    predictor = predictor.fit_indoor(unsure.features, unsure.inside)
-    report(0.6, "training the baselines")
-    baselines = Baselines.fit(indoors, settings)
-    run = TrainingRun(predictor, baselines, train_homes, test_homes, test_fraction, None)
-    if not test_homes:
-        return run
-    tests = table.take(np.isin(table.home, test_homes))
-    result = evaluate(
-        predictor, tests, baselines=baselines, progress=lambda done, message: report(0.7 + 0.3 * done, message)
-    )
+    with reporting(progress) as report:
+        report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
+        predictor = Predictor.fit(
+            indoors.phi if settings.networks == "map" else indoors.features,
+            indoors.link_state,
+            indoors.gain_db,
+            homes=train_homes,
+            settings=settings,
+            progress=lambda done, message: report(0.6 * done, message),
+        )
+        predictor = predictor.fit_indoor(unsure.features, unsure.inside)
+        report(0.6, "training the baselines")
+        baselines = Baselines.fit(indoors, settings)
+        run = TrainingRun(predictor, baselines, train_homes, test_homes, test_fraction, None)
+        if not test_homes:
+            return run
+        tests = table.take(np.isin(table.home, test_homes))
+        result = evaluate(
+            predictor, tests, baselines=baselines, progress=lambda done, message: report(0.7 + 0.3 * done, message)
+        )
     return replace(run, predictor=replace(predictor, metrics=_card_metrics(result)), evaluation=result)
 
 

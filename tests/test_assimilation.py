@@ -32,7 +32,7 @@ TX = np.array([8.0, 2.2, 1.5])
 UNSEEN = np.array([7.0, 2.8, 1.5])
 RNG = np.random.default_rng(0)
 LEFT = np.column_stack([RNG.uniform(0.6, 4.2, 30), RNG.uniform(0.6, 3.0, 30), np.full(30, 1.5)])
-RIGHT = np.column_stack([RNG.uniform(5.0, 8.4, 30), RNG.uniform(0.6, 1.8, 30), np.full(30, 1.5)])
+OPTIONS = {"spacing_m": 0.4, "predictor": "paper"}
 
 
 def prior(count: int, p_outage: float = 0.5, mean_db: float = -95.0, std_db: float = 8.0) -> sp.LinkPrediction:
@@ -67,7 +67,7 @@ def test_what_is_measured_is_what_is_predicted_there():
 @pytest.mark.parametrize(("gain_db", "rises"), [(-90.0, False), (-120.0, True)])
 def test_neighbours_hear_what_a_measurement_hears(gain_db, rises):
     """A gain at the sensitivity is known to be no higher, which makes an outage likelier."""
-    at, beside = LEFT[:1], LEFT[:1] + [0.5, 0.0, 0.0]
+    at, beside = LEFT[:1], LEFT[:1] + np.array([0.5, 0.0, 0.0])
     after = told(at, np.array([gain_db]), sensitivity_db=-120.0).update(beside, prior(1))
     assert (after.p_outage[0] > 0.6) if rises else (after.p_outage[0] < 0.3)
 
@@ -109,7 +109,7 @@ def test_what_measurements_have_in_common_is_an_offset():
 
 
 def test_contradictions_count_as_noise():
-    twice = np.concatenate([LEFT, LEFT + [0.05, 0.0, 0.0]])
+    twice = np.concatenate([LEFT, LEFT + np.array([0.05, 0.0, 0.0])])
     agreeing, contrary = (told(twice, np.repeat([-90.0, -90.0 - gap], 30)) for gap in (0.5, 18.0))
     assert contrary.noise_db > 2 * agreeing.noise_db
     assert contrary.update(LEFT, prior(30)).gain_std_db.mean() > agreeing.update(LEFT, prior(30)).gain_std_db.mean()
@@ -124,15 +124,13 @@ def test_thousands_of_measurements_are_averaged_where_they_are_dense():
 
 
 class TestPredictMap:
-    OPTIONS = {"spacing_m": 0.4, "predictor": "paper"}
-
     def table(self, gain_db: float = -75.0, rx: NDArray[np.float64] = LEFT) -> dict[str, object]:
         return {"tx": TX, "rx": rx, "gain_db": np.full(len(rx), gain_db), "std_db": np.full(len(rx), 1.0)}
 
     def test_a_hidden_transmitter_is_heard(self):
-        before = sp.predict_map(HOUSE, UNSEEN, **self.OPTIONS)
+        before = sp.predict_map(HOUSE, UNSEEN, **OPTIONS)
         table = self.table() | {"tx": UNSEEN}
-        after = sp.predict_map(HOUSE, UNSEEN, measurements=table, **self.OPTIONS)
+        after = sp.predict_map(HOUSE, UNSEEN, measurements=table, **OPTIONS)
         left = (after.x < 4.0) & (after.y < 3.0) & after.valid
         assert float(after.p_outage.where(left).mean()) < float(before.p_outage.where(left).mean())
         assert float(np.abs(after.gain_mean_db + 75.0).where(left).mean()) < 3.0
@@ -141,14 +139,14 @@ class TestPredictMap:
 
     def test_offsets_of_powers_are_named(self, caplog):
         with caplog.at_level(logging.WARNING):
-            coverage = sp.predict_map(HOUSE, TX, measurements=self.table(-20.0), **self.OPTIONS)
+            coverage = sp.predict_map(HOUSE, TX, measurements=self.table(-20.0), **OPTIONS)
         assert "dB above the predicted ones: taken for an offset" in caplog.text
         assert coverage.attrs["measured_offset_db"] > 30.0
 
     def test_receivers_in_walls_are_left_out(self, caplog):
         table = self.table(rx=np.concatenate([LEFT, [[0.2, 0.2, 1.5]]]))
         with caplog.at_level(logging.WARNING):
-            coverage = sp.predict_map(HOUSE, TX, measurements=table, **self.OPTIONS)
+            coverage = sp.predict_map(HOUSE, TX, measurements=table, **OPTIONS)
         assert "1 of 31 measurements are not used" in caplog.text
         assert coverage.attrs["measured_links"] == 30
 
@@ -166,12 +164,12 @@ class TestPredictMap:
     )
     def test_unusable_measurements_are_refused(self, change, error, message):
         with pytest.raises(error, match=message):
-            sp.predict_map(HOUSE, TX, measurements=self.table() | change, **self.OPTIONS)
+            sp.predict_map(HOUSE, TX, measurements=self.table() | change, **OPTIONS)
 
     def test_too_many_measurements_are_refused(self):
         rx = np.repeat(LEFT, 1000, axis=0)
         with pytest.raises(MeasurementError, match="30,000 links of this transmitter, more than 20,000"):
-            sp.predict_map(HOUSE, TX, measurements=self.table(rx=rx), **self.OPTIONS)
+            sp.predict_map(HOUSE, TX, measurements=self.table(rx=rx), **OPTIONS)
 
     def test_the_command_reads_a_csv(self, tmp_path):
         sp.save_map(HOUSE, tmp_path / "house.yaml")

@@ -8,11 +8,13 @@ import xarray as xr
 from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, small_coverage, use_fakes
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from scipy.stats import norm
 
 from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import ATTRIBUTES, NO_RECEIVER, WALL_PARTS, predict_map, require_coverage
 from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
+from sionna_partial.export import load_coverage
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.windows import map_windows
@@ -414,3 +416,86 @@ class TestMemory:
         for name in ("_FEWEST_RECEIVERS", "_MOST_RECEIVERS"):
             monkeypatch.setattr(coverage_module, name, 7)
         assert predict_map(map_of(PICTURE), TX, spacing_m=0.25).identical(coverage)
+
+
+class TestAccessor:
+    def test_probability_above_is_that_of_the_mixture(self, coverage):
+        above = coverage.radio.probability_above(-70.0)
+        assert above.dims == ("y", "x")
+        assert above.units == "1"
+        los, nlos = (
+            coverage[f"p_{state}"]
+            * norm.sf(-70.0, coverage[f"gain_{state}_mean_db"], coverage[f"gain_{state}_std_db"] + 1e-9)
+            for state in ("los", "nlos")
+        )
+        valid = (coverage["valid"] & (coverage["gain_los_std_db"] > 0.0)).to_numpy()
+        assert np.allclose(above.to_numpy()[valid], (los + nlos).to_numpy()[valid], atol=1e-5)
+        assert ((above > 0.01) & (above < 0.99)).any()
+        assert np.array_equal(np.isnan(above), ~coverage["valid"])
+
+    def test_an_outage_has_150_db(self, coverage):
+        valid = coverage["valid"].to_numpy()
+        at_floor = coverage.radio.probability_above(-150.0).to_numpy()[valid]
+        outage = coverage["p_outage"].to_numpy()[valid]
+        assert (at_floor <= 1.0 - outage + 1e-6).all()
+        assert outage.max() > 0.5
+
+    def test_without_uncertainty_it_is_a_step(self, fakes):
+        known = predict_map(map_of(COMPLETE), TX, spacing_m=0.5)
+        above = known.radio.probability_above(-75.0).to_numpy()
+        expected = (known["gain_mean_db"] > -75.0).where(known["valid"].astype(bool))
+        assert np.array_equal(above, expected, equal_nan=True)
+
+    def test_at_is_the_nearest_receiver(self, coverage):
+        here = coverage.radio.at(0.7, 3.1)
+        assert abs(float(here.x) - 0.7) <= 0.125
+        assert abs(float(here.y) - 3.1) <= 0.125
+        assert here.p_los.item() == coverage.p_los.sel(x=here.x, y=here.y).item()
+
+    @pytest.mark.parametrize(
+        ("x", "y", "message"),
+        [
+            (5.1, 3.0, r"x = 5.1 is not on the map: give a number of metres in -1 to 5 m"),
+            (0.0, np.nan, r"y = nan is not on the map: give a number of metres in 2 to 6 m"),
+            ("0", 3.0, r"x = '0' is not on the map"),
+        ],
+    )
+    def test_beyond_the_map(self, coverage, x, y, message):
+        with pytest.raises(PositionError, match=message):
+            coverage.radio.at(x, y)
+
+    def test_plot_and_save(self, coverage, tmp_path):
+        assert len(coverage.radio.plot().axes) > 3
+        coverage.radio.save(tmp_path / "coverage.nc")
+        loaded = load_coverage(tmp_path / "coverage.nc")
+        assert loaded.identical(coverage)
+        assert loaded.radio.at(0.7, 3.1).identical(coverage.radio.at(0.7, 3.1))
+
+    @pytest.mark.parametrize("call", ["probability_above", "at", "__repr__"])
+    def test_other_datasets_are_refused(self, call):
+        other = xr.Dataset({"p_los": ("x", [0.5])})
+        arguments = {"probability_above": [-90.0], "at": [0.0, 0.0]}.get(call, [])
+        with pytest.raises(SettingsError, match="coverage lacks "):
+            getattr(other.radio, call)(*arguments)
+
+    @pytest.mark.parametrize("threshold", [np.nan, "low", True, -151.0])
+    def test_thresholds_are_refused(self, coverage, threshold):
+        with pytest.raises(SettingsError, match=r"threshold_db = .* is not allowed"):
+            coverage.radio.probability_above(threshold)
+
+
+class TestLoad:
+    @pytest.mark.parametrize("content", [b"", b"no NetCDF file", b"\x89HDF\r\n\x1a\n" + bytes(64)])
+    def test_other_files_are_refused(self, tmp_path, content):
+        (tmp_path / "coverage.nc").write_bytes(content)
+        with pytest.raises(SettingsError, match=r"path = '.*coverage.nc' is no NetCDF file .*: give one of save_cov"):
+            load_coverage(tmp_path / "coverage.nc")
+
+    def test_no_file(self, tmp_path):
+        with pytest.raises(SettingsError, match="cannot be read"):
+            load_coverage(tmp_path / "coverage.nc")
+
+    def test_other_datasets_are_refused(self, tmp_path):
+        xr.Dataset({"p_los": ("x", [0.5])}).to_netcdf(tmp_path / "coverage.nc", engine="h5netcdf")
+        with pytest.raises(SettingsError, match="coverage lacks p_los"):
+            load_coverage(tmp_path / "coverage.nc")

@@ -16,7 +16,7 @@ from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
-from sionna_partial.simulation.explore import explore
+from sionna_partial.simulation.explore import Exploration, explore_trajectory
 from sionna_partial.tracing.trace import trace_links
 
 SETTINGS = DatasetSettings(
@@ -137,11 +137,12 @@ class TestTruthAndFeatures:
     def test_features_are_those_of_the_partial_map(self, home: PartialMap, table: LinkTable, monkeypatch: Any) -> None:
         maps: list[PartialMap] = []
 
-        def noted(*args: Any, **options: Any) -> list[PartialMap]:
-            maps.extend(explore(*args, **options))
-            return maps
+        def noted(*args: Any, **options: Any) -> Exploration:
+            exploration = explore_trajectory(*args, **options)
+            maps.extend(exploration.maps)
+            return exploration
 
-        monkeypatch.setattr(module, "explore", noted)
+        monkeypatch.setattr(module, "explore_trajectory", noted)
         assert_same(home_links(home, "two rooms", SETTINGS), table)
         assert table.maps == tuple(maps)
         np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.map_index], table.stage)

@@ -21,7 +21,7 @@ PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("constants", "errors", "checks", "settings", "resources"),
+        *("constants", "errors", "checks", "display", "progress", "settings", "resources"),
         *("process", "files", "planar", "cores", "llvm"),
     ),
     "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
@@ -46,11 +46,11 @@ ROOMS = {
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
     "plots": (
-        *("style", "coverage_plot", "coverage_viewer", "exploration_plot"),
+        *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
         *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("options", "progress", "prediction", "learning", "planning", "app"),
+    "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""

@@ -57,7 +57,8 @@ def test_calibrate(place: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert sorted(file.name for file in out.iterdir()) == ["calibrated.npz", "calibration.json", "calibration.png"]
     numbers = json.loads((out / "calibration.json").read_text())
-    calibrated = sp.load_map(out / "calibrated.npz")
+    calibrated = sp.load_map(out)
+    assert calibrated == sp.load_map(out / "calibrated.npz")
     assert calibrated.material == sp.Material(numbers["permittivity"], numbers["conductivity"], 0.01)
     assert numbers["rmse_db"]["after"] < numbers["rmse_db"]["before"]
     assert numbers["start"][0]["relative_permittivity"] == 2.94

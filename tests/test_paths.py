@@ -36,7 +36,7 @@ class TestPathColumns:
         assert np.isnan(paths.vertices_m[:3, 1]).all()
 
     def test_between_names_both_ends(self) -> None:
-        paths = _paths((0, 5, 2e-8, 1), (0, 4, 1e-8, 2)).between(3, 100)
+        paths = _paths((0, 5, 2e-8, 1), (0, 4, 1e-8, 2)).between(3, np.arange(100, 110, dtype=np.int32))
         assert paths.path_tx.tolist() == [3, 3]
         assert paths.path_rx.tolist() == [105, 104]
         assert paths.path_tx.dtype == paths.path_rx.dtype == np.int32

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,13 +12,14 @@ from numpy.typing import NDArray
 from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
+from sionna_partial.errors import MemoryLimitError, PositionError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import link_features
+from sionna_partial.prediction.features import LinkFeatures, link_features
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import load_sionna
-from sionna_partial.tracing.trace import TracedLinks, trace_each, trace_links
+from sionna_partial.tracing.trace import InvalidLinks, TracedLinks, trace_each, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 NO_FLOOR = SceneSettings(floor_extent="none")
@@ -421,7 +423,7 @@ class TestPathsOnDisk:
             if not field.name.endswith("settings"):
                 np.testing.assert_array_equal(getattr(stored, field.name), getattr(here, field.name))
         phi = link_features(_room(), stored)
-        np.testing.assert_array_equal(phi.gain_db, here.gain_db.ravel())
+        np.testing.assert_array_equal(phi.gain_db, here.gain_db)
 
     def test_a_link_without_paths_leaves_empty_files(self, tmp_path: Path) -> None:
         stored = trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)), folder=tmp_path)
@@ -449,3 +451,95 @@ class TestMemory:
         estimate = int(message.split()[1])
         links = trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR)
         assert len(links.a) == pytest.approx(estimate, rel=0.2)
+
+
+class TestInvalidLinks:
+    RX = ((2.0, 1.0, 1.5), (3.05, 0.5, 1.5), (1.0, 1.0, 1.5), (9.0, 1.0, 1.5), (np.nan, 1.0, 1.5), (4.0, 3.0, 1.5))
+    """Good; in a wall; at the first transmitter; outside; not finite; good."""
+
+    @pytest.mark.parametrize("folder", [False, True])
+    def test_the_others_are_traced(self, folder: bool, tmp_path: Path) -> None:
+        tx, good = [(1.0, 1.0, 1.5), (5.0, 1.0, 1.5)], [0, 2, 5]
+        where = {"folder": tmp_path / "paths"} if folder else {}
+        links = trace_links(_room(), tx, self.RX, invalid="nan", **where)
+        expected = trace_links(_room(), tx[1], np.array(self.RX)[good])
+        assert links.valid.tolist() == [
+            [True, False, False, False, False, True],
+            [True, False, True, False, False, True],
+        ]
+        assert np.array_equal(links.valid, np.isfinite(links.gain_db))
+        assert (links.link_state[~links.valid] == 255).all()
+        assert np.array_equal(links.gain_db[1, good], expected.gain_db)
+        assert np.array_equal(np.array(good)[expected.path_rx], links.path_rx[links.path_tx == 1])
+        assert not np.isin(links.path_rx, [1, 3, 4]).any()
+
+    def test_none_is_valid(self) -> None:
+        links = trace_links(_room(), (1.0, 1.0, 1.5), self.RX[1:5], invalid="nan")
+        assert np.isnan(links.gain_db).all()
+        assert len(links.a) == 0
+        with pytest.raises(PredictorError, match=r"links has 4 that were not traced: trace rx\[links.valid\]"):
+            link_features(_room(), links)
+
+    @pytest.mark.parametrize(("invalid", "tx"), [("raise", (1.0, 1.0, 1.5)), ("nan", (3.05, 0.5, 1.5))])
+    def test_positions_are_refused(self, invalid: InvalidLinks, tx: tuple[float, ...]) -> None:
+        with pytest.raises(PositionError):
+            trace_links(_room(), tx, self.RX, invalid=invalid)
+
+    def test_other_values_are_refused(self) -> None:
+        with pytest.raises(SettingsError, match="invalid = 'skip' is not allowed: choose one of raise, nan"):
+            trace_links(_room(), (1.0, 1.0, 1.5), self.RX, invalid="skip")  # type: ignore[arg-type]
+
+
+class TestTables:
+    TX = ((1.0, 1.0, 1.5), (5.0, 1.0, 1.5))
+    RX = ((2.0, 1.0, 1.5), (4.0, 3.0, 1.5), (9.0, 1.0, 1.5))
+
+    @pytest.fixture
+    def links(self) -> TracedLinks:
+        return trace_links(_room(), self.TX, self.RX, invalid="nan")
+
+    def test_to_xarray(self, links: TracedLinks, tmp_path: Path) -> None:
+        table = links.to_xarray()
+        assert dict(table.gain_db.sizes) == {"tx": 2, "rx": 3}
+        assert table.rx_m.sel(axis="y").values.tolist() == [1.0, 3.0, 1.0]
+        assert table.departure_rad.sel(angle="azimuth").shape == table.a.shape == (len(links.a),)
+        assert {name: table[name].units for name in ("delay_s", "vertices_m", "gain_db", "arrival_rad")} == {
+            **{"delay_s": "s", "vertices_m": "m", "gain_db": "dB", "arrival_rad": "rad"}
+        }
+        assert table.attrs["frequency_hz"] == 28e9
+        assert json.loads(table.attrs["settings"])["max_depth"] == 6
+        assert trace_links(_room(), self.TX[0], self.RX[:2]).to_xarray().gain_db.dims == ("rx",)
+
+    def test_rows_of_links(self, links: TracedLinks) -> None:
+        table = links.to_dataframe()
+        assert table["tx"].tolist() == [0, 0, 0, 1, 1, 1]
+        assert table["rx_y_m"].tolist() == [1.0, 3.0, 1.0] * 2
+        assert np.array_equal(table["gain_db"], links.gain_db.ravel(), equal_nan=True)
+        assert table["paths"].tolist() == np.bincount(3 * links.path_tx + links.path_rx, minlength=6).tolist()
+        assert np.isnan(table["delay_s"][[2, 5]]).all()
+        linked = table[table["link_state"] == LinkState.LOS]
+        assert linked["delay_s"].tolist() == pytest.approx(linked["distance_m"] / SPEED_OF_LIGHT_M_S, rel=1e-5)
+
+    def test_rows_of_paths(self, links: TracedLinks) -> None:
+        table = links.to_dataframe("paths")
+        power = (10.0 ** (table["gain_db"] / 10.0)).groupby([table["tx"], table["rx"]]).sum()
+        assert 10.0 * np.log10(power.loc[0, 0]) == pytest.approx(links.gain_db[0, 0])
+        assert table["interactions"][0] == ""
+        assert set("".join(table["interactions"])) <= set("18-")
+        with pytest.raises(SettingsError, match="of = 'rays' is not allowed: choose one of links, paths"):
+            links.to_dataframe("rays")  # type: ignore[arg-type]
+
+    def test_features_keep_their_shape(self) -> None:
+        partial, predictor = _half_seen_room(), Predictor.load("paper")
+        links = trace_links(partial, self.TX, self.RX[:2])
+        phi = link_features(partial, links, windows=False)
+        assert phi.shape == phi.gain_db.shape == phi.link_state.shape == (2, 2)
+        assert len(phi) == 4
+        prediction, indoor = predictor.predict(phi), predictor.predict_indoor(phi)
+        for row, tx in enumerate(self.TX):
+            own = link_features(partial, trace_links(partial, tx, self.RX[:2]), windows=False)
+            assert np.array_equal(phi.distance_m[row], own.distance_m)
+            assert np.allclose(prediction.p_los[row], predictor.predict(own).p_los, atol=1e-6)
+            assert np.allclose(indoor[row], predictor.predict_indoor(own), atol=1e-6)
+        assert prediction.anywhere(indoor).gain_mean_db.shape == prediction.link_state.shape == (2, 2)
+        assert LinkFeatures.concatenate([phi, phi]).shape == (8,)

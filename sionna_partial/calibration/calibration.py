@@ -27,11 +27,13 @@ from sionna_partial.calibration.measured_building import (
     start_materials,
     usable_links,
 )
-from sionna_partial.checks import Progress, no_progress, require
+from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.display import Pictured
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
+from sionna_partial.progress import reporting
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 from sionna_partial.tracing.trace import checked_settings
@@ -43,7 +45,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class MaterialCalibration:
+class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
 
     Of a scene of one material the parameters are numbers; of a mesh with M materials they are arrays (M,), in the
@@ -152,7 +154,7 @@ def calibrate_materials(
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
     seed: int | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> MaterialCalibration:
     """Find the permittivity and the conductivity of walls, floor and ceiling from measured path gains.
 
@@ -182,8 +184,9 @@ def calibrate_materials(
     scene_settings : SceneSettings, optional
     seed : int, optional
         Seed of the rays that find the paths of a mesh, in place of that in `trace_settings`. Nothing else is drawn.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -215,14 +218,14 @@ def calibrate_materials(
     require_places(partial, measured, settings.frequency_hz)
     links, link, variance = merged(measured)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))
-    report = progress or no_progress
-    report(0.0, "building the scene")
-    paths = building.paths(links, settings, scene_settings, report)
-    used, left_out = usable_links(partial, paths, links, np.bincount(link))
-    target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used])
-    begin = tuple(building.start.values())
-    fit = _fit(target, begin, settings.frequency_hz, report)
-    report(1.0, "done")
+    with reporting(progress) as report:
+        report(0.0, "building the scene")
+        paths = building.paths(links, settings, scene_settings, report)
+        used, left_out = usable_links(partial, paths, links, np.bincount(link))
+        target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used])
+        begin = tuple(building.start.values())
+        fit = _fit(target, begin, settings.frequency_hz, report)
+        report(1.0, "done")
     materials = tuple(
         Material(float(permittivity), float(conductivity_s_m), each.thickness_m)
         for (permittivity, conductivity_s_m), each in zip(fit.point.values.T, begin, strict=True)

@@ -19,6 +19,7 @@ from scipy.special import log_ndtr
 
 from sionna_partial.calibration.measured_building import LinkPaths, link_gains_db
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.display import Shown
 from sionna_partial.tracing.slab import reflection_loss_db
 
 NOISES_DB = np.geomspace(0.7, 15.0, 24)
@@ -175,7 +176,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Posterior:
+class Posterior(Shown):
     """What measurements leave open about one material: K values with weights that sum to 1, all (K,)."""
 
     permittivity: NDArray[np.float64]

@@ -9,9 +9,9 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.cli.progress import show_progress, show_rate
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.files import require_writable
+from sionna_partial.progress import counting, reporting
 from sionna_partial.settings import (
     HOME_KINDS,
     SHORT_LINK_M,
@@ -100,7 +100,7 @@ def dataset(
     seeds = range(first_seed, first_seed + count)
     in_turn = itertools.cycle(cast("list[HomeKind]", kinds or []))
     sources = [*(zip(seeds, in_turn, strict=False) if kinds else seeds), *(maps or [])]
-    with show_rate("homes") as report:
+    with counting(None, "homes", command=True) as report:
         where = {"scheduler": scheduler, "workers": workers}
         result = sp.build_dataset(out, sources, settings, home_time_limit_s=time_limit, progress=report, **where)  # type: ignore[arg-type]
     built = f"{len(result.built)} built in {result.elapsed_s / 60.0:.1f} min"
@@ -129,7 +129,7 @@ def train(
     the homes.
     """
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "reading links")
         from sionna_partial.datasets.dataset_links import open_links, settings_for
         from sionna_partial.reports import summary
@@ -156,7 +156,7 @@ def evaluate(
     set that the predictor was not trained on are test homes.
     """
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "reading links")
         from sionna_partial.reports import REPORT_FILES, save_report, summary
 

@@ -8,9 +8,9 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.cli.progress import show_progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
-from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.files import CALIBRATED_FILE, atomic_files, require_writable
+from sionna_partial.progress import reporting
 from sionna_partial.settings import Objective
 
 TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
@@ -37,7 +37,8 @@ def calibrate(
 ) -> None:
     """Find the material of a building from measured path gains.
 
-    The folder --out gets the map with the calibrated material (predict takes it), the numbers as JSON, and a picture.
+    The folder --out gets the map with the calibrated material, the numbers as JSON, and a picture. predict takes the
+    folder as a map.
     """
     scene_settings, settings = opt.settings_of(material, frequency, max_depth, diffraction)
     from sionna_partial.measurements.measurements import measurements_of
@@ -45,7 +46,7 @@ def calibrate(
     measured = measurements_of(measurements)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "loading Sionna RT")
         result = sp.calibrate_materials(
             partial,
@@ -56,11 +57,11 @@ def calibrate(
             progress=report,
         )
         with atomic_files(out) as folder:
-            sp.save_map(result.scene, folder / "calibrated.npz")
+            sp.save_map(result.scene, folder / CALIBRATED_FILE)
             (folder / "calibration.json").write_text(json.dumps(result.record(), indent=1) + "\n", encoding="utf-8")
             sp.plot_calibration(result).savefig(folder / "calibration.png")
     typer.echo(_table(result))
-    opt.print_files(out, ["calibrated.npz", "calibration.json", "calibration.png"])
+    opt.print_files(out, [CALIBRATED_FILE, "calibration.json", "calibration.png"])
 
 
 def place(
@@ -88,7 +89,7 @@ def place(
     scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
         result = sp.place_transmitter(
             partial,

@@ -7,9 +7,9 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.cli.progress import show_progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
 from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, SensorSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
@@ -51,7 +51,7 @@ def predict(
     scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
         coverage = sp.predict_map(
             partial,
@@ -111,7 +111,7 @@ def explore(
     """
     sensor = SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "reading the home" if home else "making a home")
         complete = sp.load_map(home, height_band_m=height_band, up=up) if home else sp.make_home(seed)
         frames = range(0, max(steps) + 1, max(1, max(steps) // FRAMES))
@@ -140,7 +140,7 @@ def demo(
 ) -> None:
     """Predict a half-explored home, and compare with the truth."""
     require_writable(out)
-    with show_progress() as report:
+    with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
         from sionna_partial.demo import run_demo
 

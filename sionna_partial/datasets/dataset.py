@@ -14,7 +14,7 @@ from typing import Any
 
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 
-from sionna_partial.checks import require, require_number, require_whole, settings_or_default
+from sionna_partial.checks import CountProgress, require, require_number, require_whole, settings_or_default
 from sionna_partial.datasets.home_process import (
     HomeResult,
     HomeTask,
@@ -25,13 +25,12 @@ from sionna_partial.datasets.home_process import (
 )
 from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
+from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
 from sionna_partial.process import cleaned_up
+from sionna_partial.progress import counting
 from sionna_partial.settings import DatasetSettings
-
-HomeProgress = Callable[[int, int, str], None]
-"""Called with the number of homes that are done, their number in all, and a message."""
 
 POLL_S = 1.0
 """Time between two checks of the workers [s]: more may have come."""
@@ -44,7 +43,7 @@ CONNECT_S = 30.0
 
 
 @dataclass(frozen=True)
-class DatasetReport:
+class DatasetReport(Shown):
     """What a run has done: names of the homes that it built and that were there, and why others failed."""
 
     folder: Path
@@ -62,7 +61,7 @@ def build_dataset(
     scheduler: str | None = None,
     workers: int | None = None,
     home_time_limit_s: float = 900.0,
-    progress: HomeProgress | None = None,
+    progress: CountProgress | bool | None = None,
 ) -> DatasetReport:
     """Build a data set: the links of many homes, on all cores or on a dask cluster.
 
@@ -88,8 +87,9 @@ def build_dataset(
         Number of homes that this machine makes at a time; by default one for each core it may use.
     home_time_limit_s : float
         Time that a home may take [s].
-    progress : callable, optional
-        Called as ``progress(homes_done, homes, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(homes_done, homes, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def build_dataset(
     target, sources = Path(os.path.abspath(output_path(folder))), home_sources(homes)
     built: list[str] = []
     failed: dict[str, str] = {}
-    with locked_folder(target):
+    with counting(progress, "homes") as count, locked_folder(target):
         tasks = _prepare(target, sources, settings, home_time_limit_s)
         skipped = tuple(task.source.name for task in tasks if task.is_done)
         missing = [task for task in tasks if task.source.name not in skipped]
@@ -135,8 +135,7 @@ def build_dataset(
             _failure_path(target, name).unlink(missing_ok=True)
 
         def report(message: str) -> None:
-            if progress:
-                progress(len(skipped) + len(built) + len(failed), len(tasks), message)
+            count(len(skipped) + len(built) + len(failed), len(tasks), message)
 
         if missing:
             report("starting the workers")

@@ -14,7 +14,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings
-from sionna_partial.simulation.explore import explore
+from sionna_partial.simulation.explore import explore_trajectory
 from sionna_partial.tracing.trace import trace_each
 
 NEAREST_M = 0.1
@@ -58,7 +58,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     settings = settings or DatasetSettings()
     home = map_area(_closed(home, name), settings.margin_m)
     rng = np.random.default_rng(_home_seed(name, settings))
-    maps = explore(home, steps=settings.stages, seed=int(rng.integers(2**31)), sensor=home_sensor(name, settings))
+    seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
+    maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps
     positions = _draw_positions(home, maps, name, settings, rng)
     inside, link_state, gain_db = _truth(home, positions, settings)
     return LinkTable.concatenate(

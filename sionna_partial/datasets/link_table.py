@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states
@@ -14,7 +15,7 @@ from sionna_partial.prediction.link_context import LinkContext
 
 
 @dataclass(frozen=True, eq=False)
-class LinkTable:
+class LinkTable(Shown):
     """N links; a transmitter and a receiver at one stage of exploration of one home are a link.
 
     Parameters
@@ -56,8 +57,8 @@ class LinkTable:
     def __post_init__(self) -> None:
         if self.features.context is None:
             raise PredictorError("features has no context: give the LinkFeatures of link_features.")
-        link_states("link_state", self.link_state, len(self))
-        link_numbers("gain_db", self.gain_db, len(self))
+        link_states("link_state", self.link_state, (len(self),))
+        link_numbers("gain_db", self.gain_db, (len(self),))
 
     def __len__(self) -> int:
         """Return the number of links N."""

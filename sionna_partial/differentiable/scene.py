@@ -164,7 +164,7 @@ class DifferentiableScene:
         names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in names for weight in self.networks[name].trainable_variables]
 
-    def links(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | None = None) -> "DifferentiableLinks":
+    def links(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> "DifferentiableLinks":
         """Trace the links from a transmitter to N receivers.
 
         Parameters
@@ -173,8 +173,9 @@ class DifferentiableScene:
             Transmitter position [m].
         rx : (N, 3) array-like
             Receiver positions [m].
-        progress : callable, optional
-            Called as ``progress(fraction_done, message)``.
+        progress : bool or callable, optional
+            False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+            terminals and notebooks after 2 s.
 
         Raises
         ------

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.prediction.features import LinkFeatures
@@ -54,7 +55,7 @@ class Majority:
 
 
 @dataclass(frozen=True, eq=False)
-class Baselines:
+class Baselines(Shown):
     """The baselines that are fitted to the training links of a predictor; `distance` uses the distance alone."""
 
     majority: Majority

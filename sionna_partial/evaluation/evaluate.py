@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from sionna_partial.checks import Progress, shown
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.datasets.link_table import LinkTable, stage_name
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import MAJORITY_FILE, Baselines, baseline_predictions
 from sionna_partial.evaluation.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
@@ -72,7 +74,7 @@ class Difference:
 
 
 @dataclass(frozen=True, eq=False)
-class Evaluation:
+class Evaluation(Shown):
     """Result of `evaluate`.
 
     Parameters
@@ -107,7 +109,7 @@ def evaluate(
     dataset: Dataset,
     *,
     baselines: Baselines | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> Evaluation:
     """Measure a predictor and its baselines on the links of a data set, stage by stage.
 
@@ -122,8 +124,9 @@ def evaluate(
         Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
     baselines : Baselines, optional
         Those fitted to other links; by default those in the folder of the predictor, else the shipped ones.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -158,26 +161,26 @@ def evaluate(
     fitted, paper = baselines or Baselines.load(_baselines_folder(model)), _paper(model)
     rows, differences, calibrations = [], [], {}
     parts = list(itertools.product(homes, map(float, np.unique(links.stage))))
-    for index, (name, stage) in enumerate(parts):
-        if progress:
-            progress(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
-        part = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
-        prediction = model.predict(part.phi if model.reads_maps else part.features)
-        for receivers in ("indoor", "anywhere"):
-            drawn = part.anywhere == (receivers == "anywhere")
-            if not drawn.any():
-                continue
-            some, own = part.take(drawn), prediction.take(drawn)
-            if receivers == "indoor":
-                others = baseline_predictions(fitted, paper, some.features, model.settings.frequency_hz)
-                predictions = {"predictor": own, **others}
-            else:
-                predictions = _anywhere(model, some, own)
-            rows += list(_rows(name, receivers, stage, some, predictions))
-            if name == "test":
-                differences += list(_differences(receivers, stage, some, predictions))
+    with reporting(progress) as report:
+        for index, (name, stage) in enumerate(parts):
+            report(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
+            part = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
+            prediction = model.predict(part.phi if model.reads_maps else part.features)
+            for receivers in ("indoor", "anywhere"):
+                drawn = part.anywhere == (receivers == "anywhere")
+                if not drawn.any():
+                    continue
+                some, own = part.take(drawn), prediction.take(drawn)
                 if receivers == "indoor":
-                    calibrations[stage] = calibration(own, some.link_state, some.gain_db)
+                    others = baseline_predictions(fitted, paper, some.features, model.settings.frequency_hz)
+                    predictions = {"predictor": own, **others}
+                else:
+                    predictions = _anywhere(model, some, own)
+                rows += list(_rows(name, receivers, stage, some, predictions))
+                if name == "test":
+                    differences += list(_differences(receivers, stage, some, predictions))
+                    if receivers == "indoor":
+                        calibrations[stage] = calibration(own, some.link_state, some.gain_db)
     notes = tuple(_notes(model, fitted.distance, paper, homes["test"]))
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.display import Shown
 from sionna_partial.prediction.predictor import LinkPrediction
 
 CONFIDENCE_BINS = 15
@@ -66,7 +67,7 @@ class Metrics:
 
 
 @dataclass(frozen=True, eq=False)
-class Reliability:
+class Reliability(Shown):
     """Links, mean confidence and accuracy in bins of the confidence (`CONFIDENCE_BINS`,); 0 in an empty bin."""
 
     links: NDArray[np.int64]
@@ -81,7 +82,7 @@ class Reliability:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(Shown):
     """Calibration of link state and gain.
 
     `gain_pit` (PIT_BINS,) has the fractions of the randomised probability integral transforms of the true gains in bins

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation
 from sionna_partial.checks import number_of, require, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.files import SCENE_FILES, atomic_write, output_path, read_bytes
+from sionna_partial.files import CALIBRATED_FILE, SCENE_FILES, atomic_write, output_path, read_bytes
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.files import MAX_MESH_BYTES, MESH_SUFFIXES, read_mesh, read_mitsuba_scene
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
@@ -26,6 +26,7 @@ from sionna_partial.settings import Material
 
 ACCEPTED = (
     "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), an exported scene (folder or scene.xml), "
+    "the folder of a calibration, "
     f"a Mitsuba scene (folder or .xml), or a mesh ({', '.join(MESH_SUFFIXES)})"
 )
 """What load_map reads."""
@@ -59,8 +60,9 @@ def load_map(
     ----------
     path : path-like
         A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image); an `.npz` of `save_map`; an
-        exported scene: its folder or its `scene.xml`; a mesh in metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene
-        of meshes, with the radio materials of Sionna RT: its `.xml`, or a folder with one.
+        exported scene: its folder or its `scene.xml`; the folder that `sionna-partial calibrate` wrote; a mesh in
+        metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene of meshes, with the radio materials of Sionna RT: its
+        `.xml`, or a folder with one.
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
@@ -369,12 +371,15 @@ def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDAr
 
 
 def _read_scene(source: Path, reading: MeshReading) -> PartialMap:
-    """Read an exported scene, or else the Mitsuba scene that a path leads to."""
+    """Read an exported scene, or else the Mitsuba scene that a path leads to, or the map of a calibration."""
     folder = source if source.is_dir() else source.parent
     scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
     if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):
         reading.require_unused(source, "an exported map (remove its map.yaml to read the meshes of its scene alone)")
         return read_ros_map(folder / "map.yaml", confined=True)
+    if source.is_dir() and not scenes and (folder / CALIBRATED_FILE).is_file():
+        reading.require_unused(source, "the map of a calibration")
+        return _read_npz(folder / CALIBRATED_FILE)
     if len(scenes) != 1:
         remedy = f"give the path of one, or {ACCEPTED}."
         raise MapError(f"path = '{source}' is no scene: it has {len(scenes)} .xml files; {remedy}")

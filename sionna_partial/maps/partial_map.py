@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from sionna_partial.checks import is_whole, number_of, real_array, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.settings import Material
@@ -34,7 +35,7 @@ _RANK = np.argsort(_FREEST)
 
 
 @dataclass(frozen=True, eq=False)
-class PartialMap:
+class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     """A floor plan of free, wall and unknown cells on a regular grid.
 
     World axes: x right, y up, z up, in metres. Everything outside the grid is unknown.
@@ -180,31 +181,44 @@ class PartialMap:
             For another shape, a value that is not finite, or a point outside the map, inside a wall, or not between
             floor and ceiling. Unknown cells are allowed (the paper asks for them).
         """
-        points = real_array(name, points_m, PositionError, "give x, y, z in metres.").astype(np.float64)
-        if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
-            raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
-        x0, y0, x1, y1 = self.bounds_m
-        low, high = self.height_range_m
+        points = position_array(name, points_m)
         flat = points.reshape(-1, 3)
-        finite = np.asarray(np.isfinite(flat).all(axis=1))
-        x, y, z = np.where(finite[:, None], flat, 0.0).T
-        state = self.state_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1)]))
-        outside = (x < x0) | (x > x1) | (y < y0) | (y > y1)
-        beyond = f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m"
-        too_high = f"is not between floor and ceiling ({low:g} to {high:g} m)"
-        faults = (
-            (~finite, "is not finite", "give finite numbers in metres."),
-            (outside, beyond, "move it inside, or extend the map with unknown cells."),
-            ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
-            (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
-        )
-        for fault, what, remedy in faults:
+        for fault, what, remedy in self._position_faults(flat):
             if fault.any():
                 index = int(np.argmax(fault))
                 which = name if points.ndim == 1 else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
+
+    def radios_can_stand(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Whether `require_positions` takes each of the points (N, 3) [m]."""
+        return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
+
+    def _position_faults(self, points_m: NDArray[np.float64]) -> list[tuple[NDArray[np.bool_], str, str]]:
+        """Which points (N, 3) [m] have each fault, what it is, and the remedy."""
+        x0, y0, x1, y1 = self.bounds_m
+        low, high = self.height_range_m
+        finite = np.asarray(np.isfinite(points_m).all(axis=1))
+        x, y, z = np.where(finite[:, None], points_m, 0.0).T
+        state = self.state_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1)]))
+        outside = (x < x0) | (x > x1) | (y < y0) | (y > y1)
+        beyond = f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m"
+        too_high = f"is not between floor and ceiling ({low:g} to {high:g} m)"
+        return [
+            (~finite, "is not finite", "give finite numbers in metres."),
+            (outside, beyond, "move it inside, or extend the map with unknown cells."),
+            ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
+            (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
+        ]
+
+
+def position_array(name: str, points_m: object) -> NDArray[np.float64]:
+    """Return positions (3,) or (N, 3) [m] as a float64 array, or raise a PositionError that names them."""
+    points = real_array(name, points_m, PositionError, "give x, y, z in metres.").astype(np.float64)
+    if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
+        raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
+    return points
 
 
 def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
+from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
 from sionna_partial.files import read_bytes
 
@@ -42,7 +43,7 @@ _GIVE = (
 
 
 @dataclass(frozen=True, eq=False)
-class Measurements:
+class Measurements(Shown):
     """Measured gains of N links.
 
     Parameters

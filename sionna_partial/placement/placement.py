@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 
 from sionna_partial.checks import Progress, no_progress, require, require_number, settings_or_default
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import PlacementArea, placement_area
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.progress import reporting
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import Tracer, checked_settings, nearest_m
 
@@ -41,7 +43,7 @@ FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 
 
 @dataclass(frozen=True, eq=False)
-class TransmitterPlacement:
+class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement"):
     """A position for a transmitter, and the search that found it.
 
     Parameters
@@ -114,7 +116,7 @@ def place_transmitter(
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
     **options: Any,
 ) -> TransmitterPlacement:
     """Find the transmitter position that covers a partly known building best, as predicted from what is known.
@@ -135,8 +137,9 @@ def place_transmitter(
         As for `predict_map`.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
     **options
         Fields of `sionna_partial.settings.PlacementSettings`: `objective` ("coverage", the default, or "percentile"),
         `threshold_db` (-100 dB), `tx_height_m` and `rx_height_m` (1.5 m), and `seed` (0).
@@ -176,14 +179,13 @@ def place_transmitter(
         height_m = getattr(settings, name)
         require_number(name, height_m, low_m, high_m, open_low=True)
         require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
-    report = progress or no_progress
-    report(0.0, "building the scene")
     model = None
     if not partial.is_complete:
         model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
     area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
     thinned = area.thinned(RECEIVERS)
-    with temporary_folder() as folder:
+    with reporting(progress) as report, temporary_folder() as folder:
+        report(0.0, "building the scene")
         objective = _Objective(Tracer(partial, folder, trace_settings, scene_settings), model, settings)
         report(0.1, "comparing positions")
         starts_m = _starts(thinned, settings, trace_settings.frequency_hz)
@@ -191,9 +193,9 @@ def place_transmitter(
         routes = _refined(objective, thinned, starts_m, start_scores, report)
         report(0.9, "evaluating the best positions")
         values = [objective.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
+        report(1.0, "done")
     scores = [placement_score(each, area.weight, settings) for each in values]
     best = int(np.argmax(scores))
-    report(1.0, "done")
     return TransmitterPlacement(
         position_m=routes[best][0][-1],
         score=scores[best],

@@ -11,7 +11,6 @@ import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
@@ -20,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from sionna_partial.checks import require, require_choice
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage
-from sionna_partial.plots.style import STAR, STATE_COLOURS, legend_below, shade, sheet_columns
+from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade, sheet_columns
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""

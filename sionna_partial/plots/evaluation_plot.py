@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from sionna_partial.checks import require
 from sionna_partial.datasets.link_table import stage_name
 from sionna_partial.evaluation.evaluate import Evaluation, Row
 from sionna_partial.evaluation.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration
-from sionna_partial.plots.style import BLUE
+from sionna_partial.plots.style import BLUE, Figure
 
 _PANELS = {
     "accuracy": "accuracy of the link state",

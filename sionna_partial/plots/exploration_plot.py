@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.path import Path as MarkerPath
@@ -18,7 +17,17 @@ from PIL import Image
 from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
-from sionna_partial.plots.style import BLUE, RED, YELLOW, corners_m, figure_png, legend_below, sheet_columns, window_m
+from sionna_partial.plots.style import (
+    BLUE,
+    RED,
+    YELLOW,
+    Figure,
+    corners_m,
+    figure_png,
+    legend_below,
+    sheet_columns,
+    window_m,
+)
 from sionna_partial.simulation.camera import view_corners_m
 from sionna_partial.simulation.explore import Exploration
 

@@ -4,11 +4,10 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from sionna_partial.calibration.calibration import MaterialCalibration
-from sionna_partial.plots.style import BLUE, RED
+from sionna_partial.plots.style import BLUE, RED, Figure
 from sionna_partial.settings import Material
 from sionna_partial.tracing.slab import reflection_loss_db
 

@@ -7,19 +7,17 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import PercentFormatter
 
 from sionna_partial.checks import require
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.style import RED, STAR, corners_m, legend_below, shade, window_m
+from sionna_partial.plots.map_plot import draw_map
+from sionna_partial.plots.style import RED, STAR, UNKNOWN, WALL, Figure, corners_m, legend_below, window_m
 
 _WIDTH_IN, _DPI = 9.0, 130
-_WALL, _UNKNOWN = "black", "0.86"
 _STAR: dict[str, Any] = STAR | {"markersize": 15}
 
 
@@ -50,7 +48,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     height = min(max((_WIDTH_IN - 1.8) * (y1 - y0) / (x1 - x0), 3.0), 14.0)
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
-    _draw_map(axis, placement.partial)
+    draw_map(axis, placement.partial)
     scale = _draw_receivers(axis, placement)
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
@@ -65,9 +63,9 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
         Line2D([], [], linestyle="none", marker="o", markerfacecolor="white", markeredgecolor="black", label="start"),
     ]
     if (placement.partial.state == CellState.WALL).any():
-        handles.append(Patch(color=_WALL, label="wall"))
+        handles.append(Patch(color=WALL, label="wall"))
     if (placement.partial.state == CellState.UNKNOWN).any():
-        handles.append(Patch(facecolor=_UNKNOWN, edgecolor="0.6", label="not observed"))
+        handles.append(Patch(facecolor=UNKNOWN, edgecolor="0.6", label="not observed"))
     legend_below(figure, handles)
     return figure
 
@@ -86,14 +84,6 @@ def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, flo
     known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     counting_m = placement.rx_m[placement.weight > 0.2, :2]
     return window_m(np.vstack([known_m, counting_m - half, counting_m + half]))
-
-
-def _draw_map(axis: Axes, partial: PartialMap) -> None:
-    x0, y0, x1, y1 = partial.bounds_m
-    axis.set_facecolor(_UNKNOWN)
-    for state, grey, order in ((CellState.FREE, 255, 0.5), (CellState.WALL, 0, 3.0)):
-        picture, extent = shade(partial.state == state, grey), (x0, x1, y0, y1)
-        axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
 
 
 def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> ScalarMappable:

@@ -5,8 +5,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import matplotlib.figure
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -28,11 +28,26 @@ BORDER_M = 0.3
 
 _SHEET_ASPECT = 1.5
 
+WALL, UNKNOWN = "black", "0.86"
+"""Colours of cells on maps; free ones are white."""
 
-def figure_png(figure: Figure) -> bytes:
-    """Return a figure as a PNG file; equal figures give equal bytes."""
+_POINTS = 72
+"""Pixels of a notebook for each inch of a figure."""
+
+
+class Figure(matplotlib.figure.Figure):
+    """A figure that a notebook shows when a cell ends with it, although pyplot has no part in it."""
+
+    def _repr_png_(self) -> tuple[bytes, dict[str, float]]:
+        width, height = self.get_size_inches() * _POINTS
+        return figure_png(self), {"width": round(width), "height": round(height)}
+
+
+def figure_png(figure: matplotlib.figure.Figure, width_px: float = math.inf) -> bytes:
+    """Return a figure as a PNG file, at most so wide; equal figures give equal bytes."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
+    dpi = min(figure.dpi, width_px / figure.get_figwidth())
+    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
     return buffer.getvalue()
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.link_context import IndirectPaths, LinkContext
@@ -16,22 +17,22 @@ from sionna_partial.tracing.trace import TracedLinks, link_summary
 
 
 @dataclass(frozen=True, eq=False)
-class LinkFeatures:
-    """Features of N links: those of the paper (eq. 8), and what the other predictors need beside them.
+class LinkFeatures(Shown):
+    """Features of N links, or T N: those of the paper (eq. 8), and what the other predictors need beside them.
 
     Parameters
     ----------
-    link_state : (N,) uint8 array of LinkState
+    link_state : (N,) or (T, N) uint8 array of LinkState
         Link state traced on the partial map.
-    unobserved_distance_m : (N,) float64 array
+    unobserved_distance_m : (N,) or (T, N) float64 array
         Length of the segment from transmitter to receiver inside unknown cells [m].
-    distance_m : (N,) float64 array
+    distance_m : (N,) or (T, N) float64 array
         Distance from transmitter to receiver [m].
-    gain_db : (N,) float64 array
+    gain_db : (N,) or (T, N) float64 array
         Omnidirectional path gain traced on the partial map [dB], at least -150.
     context : LinkContext, optional
-        What the map shows along and around the links, as arrays, from `link_features`. The paper's predictor does not
-        use it.
+        What the map shows along and around the links, as arrays, from `link_features`; one link after the other. The
+        paper's predictor does not use it.
 
     Raises
     ------
@@ -53,10 +54,11 @@ class LinkFeatures:
     context: LinkContext | None = None
 
     def __post_init__(self) -> None:
-        count = np.size(self.distance_m)
-        object.__setattr__(self, "link_state", link_states("link_state", self.link_state, count))
+        count, shape = np.size(self.distance_m), np.shape(self.distance_m)
+        shape = shape if len(shape) == 2 else (count,)
+        object.__setattr__(self, "link_state", link_states("link_state", self.link_state, shape))
         for name in ("distance_m", "unobserved_distance_m", "gain_db"):
-            object.__setattr__(self, name, link_numbers(name, getattr(self, name), count))
+            object.__setattr__(self, name, link_numbers(name, getattr(self, name), shape))
         require_each(self.distance_m >= 0.0, "distance_m", self.distance_m, "a distance is not negative.")
         inside = (self.unobserved_distance_m >= 0.0) & (self.unobserved_distance_m <= self.distance_m)
         require_each(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
@@ -66,22 +68,31 @@ class LinkFeatures:
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
 
     def __len__(self) -> int:
-        """Return the number of links N."""
-        return len(self.distance_m)
+        """Return the number of links, N or T N."""
+        return self.distance_m.size
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(N,) or (T, N)."""
+        return self.distance_m.shape
+
+    def flat(self) -> "LinkFeatures":
+        """Return the links one after the other, transmitter by transmitter."""
+        return self if self.distance_m.ndim == 1 else self.take(slice(None))
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
-        """Return the links that an index array, a mask (N,) or a slice selects."""
+        """Return the links that an index array, a mask or a slice selects, one after the other."""
         context = None if self.context is None else self.context.take(index)
-        return LinkFeatures(**{name: getattr(self, name)[index] for name in _PAPER}, context=context)
+        return LinkFeatures(**{name: getattr(self, name).ravel()[index] for name in _PAPER}, context=context)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkFeatures"]) -> "LinkFeatures":
-        """Return the links of all `parts`, one part after the other."""
+        """Return the links of all `parts`, one after the other."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _PAPER}
+        columns = {name: np.concatenate([getattr(part, name).ravel() for part in parts]) for name in _PAPER}
         return cls(**columns, context=context)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
@@ -94,21 +105,22 @@ class LinkFeatures:
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name != "context")
 
 
-def link_numbers(name: str, values: ArrayLike, count: int) -> Floats:
-    """Return numbers of links as a (count,) array; a PredictorError for another shape, or what is not finite."""
+def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
+    """Return numbers of links as an array of a shape; a PredictorError for another shape, or what is not finite."""
+    count = " x ".join(map(str, shape))
     try:
         numbers = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise PredictorError(f"{name} = {values!r} is not numeric: give an array of {count} numbers.") from error
-    if numbers.shape != (count,):
+    if numbers.shape != shape:
         raise PredictorError(f"{name} has shape {numbers.shape}: give one number for each of the {count} links.")
     require_each(np.isfinite(numbers), name, numbers, "give finite numbers.")
     return numbers
 
 
-def link_states(name: str, values: ArrayLike, count: int) -> NDArray[np.uint8]:
-    """Return link states as a (count,) uint8 array; a PredictorError for another shape, or what is none."""
-    states = link_numbers(name, values, count)
+def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Return link states as a uint8 array of a shape; a PredictorError for another shape, or what is none."""
+    states = link_numbers(name, values, shape)
     known = ", ".join(f"{state.name} {state.value}" for state in LinkState)
     require_each(np.isin(states, [*LinkState]), name, states, f"use LinkState: {known}.")
     return states.astype(np.uint8)
@@ -129,17 +141,23 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     Returns
     -------
     LinkFeatures
-        Of N or T N links, transmitter by transmitter.
+        Of shape (N,) or (T, N), as `links`.
 
     Raises
     ------
     MapError
         If `partial` is no PartialMap.
+    PredictorError
+        For links that were not traced (``invalid="nan"``).
     """
     require_map("partial", partial)
+    if not links.valid.all():
+        count = int((~links.valid).sum())
+        raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")
     paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx)
     paths.add(links)
-    return _features(paths, links.link_state.ravel(), links.gain_db.ravel(), windows=windows)
+    phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), windows=windows)
+    return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
 
 def features_of_paths(
@@ -173,5 +191,6 @@ def _features(
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
     """Raise a PredictorError that names the first value that is not good."""
     if not good.all():
-        index = int(np.argmin(good))
-        raise PredictorError(f"{name}[{index}] = {values[index]:g} is not allowed: {remedy}")
+        index = np.unravel_index(int(np.argmin(good)), np.shape(values))
+        where = ", ".join(map(str, index))
+        raise PredictorError(f"{name}[{where}] = {values[index]:g} is not allowed: {remedy}")

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import CellState, LinkState
+from sionna_partial.display import Shown
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.unobserved import (
     GRAZE,
@@ -39,7 +40,7 @@ _ASIDE_CELLS = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class LinkContext:
+class LinkContext(Shown):
     """What the paths of N links cross, what the map leaves possible, and what it shows around their transmitters.
 
     Parameters

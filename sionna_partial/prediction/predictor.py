@@ -13,6 +13,7 @@ from scipy.special import ndtr
 
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states, require_each
 from sionna_partial.prediction.map_networks import (
@@ -33,6 +34,7 @@ from sionna_partial.prediction.paper_networks import (
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.prediction.unobserved import Bools, Floats
+from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 
@@ -44,8 +46,8 @@ SHIPPED = ("map", "paper")
 
 
 @dataclass(frozen=True, eq=False)
-class LinkPrediction:
-    """Predictive distribution of link state and path gain of N links; every array is (N,) float64.
+class LinkPrediction(Shown):
+    """Predictive distribution of link state and path gain of links; every array is (N,) or (T, N) float64.
 
     `Predictor.predict` returns it for receivers that are indoors, `anywhere` for receivers that may be outdoors.
 
@@ -104,6 +106,22 @@ class LinkPrediction:
         probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
+    def probability_above(self, threshold_db: float) -> Floats:
+        """Return the probability (N,) that the path gain exceeds a threshold t [dB], an outage counting -150 dB.
+
+        ``p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t)``, where m and s are
+        means and standard deviations given the link state, and Phi is the normal distribution function.
+        """
+        probability = self.p_outage * (threshold_db < GAIN_FLOOR_DB)
+        for p_state, mean_db, std_db in (
+            (self.p_los, self.gain_los_mean_db, self.gain_los_std_db),
+            (self.p_nlos, self.gain_nlos_mean_db, self.gain_nlos_std_db),
+        ):
+            above_db, spread = mean_db - threshold_db, std_db > 0.0
+            normal = ndtr(above_db / np.where(spread, std_db, 1.0))
+            probability = probability + p_state * np.where(spread, normal, above_db > 0.0)
+        return probability
+
     def take(self, index: NDArray[np.generic] | slice) -> "LinkPrediction":
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
@@ -112,6 +130,10 @@ class LinkPrediction:
     def concatenate(cls, parts: Sequence["LinkPrediction"]) -> "LinkPrediction":
         """Return the links of all `parts`, one part after the other."""
         return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+
+    def reshaped(self, shape: tuple[int, ...]) -> "LinkPrediction":
+        """Return the same links in another shape, as (T, N)."""
+        return LinkPrediction(*(getattr(self, column.name).reshape(shape) for column in fields(self)))
 
     def where(self, taken: Bools, other: "LinkPrediction") -> "LinkPrediction":
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
@@ -138,7 +160,7 @@ class LinkPrediction:
         PredictorError
             For another shape, or a value outside [0, 1].
         """
-        indoors = link_numbers("p_indoor", p_indoor, len(self.p_los))
+        indoors = link_numbers("p_indoor", p_indoor, self.p_los.shape)
         require_each((indoors >= 0.0) & (indoors <= 1.0), "p_indoor", indoors, "it lies between 0 and 1.")
         floor = np.full_like(indoors, GAIN_FLOOR_DB)
         return LinkPrediction.of_parts(
@@ -147,21 +169,9 @@ class LinkPrediction:
             np.stack([np.zeros_like(indoors), self.gain_los_std_db, self.gain_nlos_std_db]),
         )
 
-    def probability_above(self, threshold_db: float) -> Floats:
-        """Return P(path gain > threshold) of each link (N,), for a threshold [dB] of -150 dB, an outage, or more."""
-        above = np.zeros(self.p_los.shape)
-        for probability, mean_db, std_db in (
-            (self.p_los, self.gain_los_mean_db, self.gain_los_std_db),
-            (self.p_nlos, self.gain_nlos_mean_db, self.gain_nlos_std_db),
-        ):
-            margin_db = mean_db - threshold_db
-            spread = ndtr(margin_db / np.where(std_db > 0.0, std_db, 1.0))
-            above += probability * np.where(std_db > 0.0, spread, margin_db > 0.0)
-        return above
-
 
 @dataclass(frozen=True, eq=False)
-class Predictor:
+class Predictor(Shown):
     """A predictor of link state and path gain, from `fit` or `load`.
 
     That of the paper (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on
@@ -201,7 +211,7 @@ class Predictor:
     array([1., 0.])
     """
 
-    model: "keras.Model"
+    model: "keras.Model" = field(repr=False)
     archive: bytes = field(repr=False)
     settings: PredictorSettings
     homes: tuple[str, ...] = ()
@@ -229,7 +239,7 @@ class Predictor:
         *,
         homes: Sequence[str] = (),
         settings: PredictorSettings | None = None,
-        progress: Progress | None = None,
+        progress: Progress | bool | None = None,
     ) -> "Predictor":
         """Train on links of known truth; the same links and settings give the same weights.
 
@@ -248,8 +258,9 @@ class Predictor:
             Where the links come from, to be recorded.
         settings : PredictorSettings, optional
             The paper's networks by default.
-        progress : callable, optional
-            Called as ``progress(fraction_done, message)``.
+        progress : bool or callable, optional
+            False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+            terminals and notebooks after 2 s.
 
         Returns
         -------
@@ -264,8 +275,9 @@ class Predictor:
         _require_features(features)
         if len(features) == 0:
             raise PredictorError("features has no links: give at least one.")
-        states = link_states("link_state", link_state, len(features))
-        gains_db = np.maximum(link_numbers("gain_db", gain_db, len(features)), GAIN_FLOOR_DB)
+        states = link_states("link_state", link_state, features.shape).ravel()
+        gains_db = np.maximum(link_numbers("gain_db", gain_db, features.shape), GAIN_FLOOR_DB).ravel()
+        features = features.flat()
         context_networks = {}
         if settings.networks != "paper":
             if features.context is None:
@@ -273,7 +285,8 @@ class Predictor:
                 raise PredictorError(f"features has no context, which all networks but the paper's need: {remedy}")
             if settings.networks == "map":
                 _require_windows(features)
-            context_networks = fit_context_networks(features, states, gains_db, settings, progress=progress)
+            with reporting(progress) as report:
+                context_networks = fit_context_networks(features, states, gains_db, settings, progress=report)
         model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
         links = {
             f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
@@ -307,21 +320,22 @@ class Predictor:
             For arrays of other shapes or values, or a training that diverges.
         """
         _require_features(features)
-        indoors = link_numbers("inside", inside, len(features)) > 0.0
-        model = fit_indoor_networks(self.model, features, indoors, self.settings)
+        indoors = link_numbers("inside", inside, features.shape).ravel() > 0.0
+        model = fit_indoor_networks(self.model, features.flat(), indoors, self.settings)
         return replace(self, model=model, archive=pack(model))
 
     def predict(self, features: LinkFeatures) -> LinkPrediction:
-        """Predict link state and path gain of N links whose receivers are indoors.
+        """Predict link state and path gain of links whose receivers are indoors.
 
         Parameters
         ----------
         features : LinkFeatures
-            N may be 0.
+            Of shape (N,) or (T, N); N may be 0.
 
         Returns
         -------
         LinkPrediction
+            Of the shape of the features.
 
         Raises
         ------
@@ -330,6 +344,8 @@ class Predictor:
         """
         _require_features(features)
         networks = parts(self.model)
+        if len(features.shape) == 2:
+            return self.predict(features.flat()).reshaped(features.shape)
         if features.context is None or LINK_NETWORK not in networks:
             return LinkPrediction.of_parts(*evaluate_paper(networks, features))
         if self.reads_maps:
@@ -338,9 +354,9 @@ class Predictor:
         return prediction.where(features.context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
-        """Predict the probability (N,) that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
+        """Predict the probability that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
         _require_features(features)
-        return evaluate_indoor(parts(self.model), features)
+        return evaluate_indoor(parts(self.model), features.flat()).reshape(features.shape)
 
     def save(self, path: str | Path) -> None:
         """Write a `.keras` file, and a `.json` card of the same stem beside it.

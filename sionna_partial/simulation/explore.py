@@ -2,17 +2,19 @@
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.checks import are_stages, is_whole, require, settings_or_default
+from sionna_partial.checks import Progress, are_stages, is_whole, require, settings_or_default
 from sionna_partial.constants import CellState
+from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.progress import reporting
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.robot import Robot
 
@@ -32,7 +34,7 @@ _REPORT_STEPS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Exploration:
+class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     """The trajectory of a robot through a home, and what it had seen at several moments.
 
     Parameters
@@ -148,7 +150,7 @@ def explore_trajectory(
     seed: int = 0,
     *,
     sensor: SensorSettings | None = None,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress | bool | None = None,
 ) -> Exploration:
     """Explore a home as `explore` does, and return the trajectory of the robot too.
 
@@ -156,8 +158,9 @@ def explore_trajectory(
     ----------
     home, steps, seed, sensor
         As of `explore`.
-    progress : callable or None
-        Is called with the fraction that is done, in [0, 1], and what is being done.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -190,28 +193,29 @@ def explore_trajectory(
     reached: list[int] = []
     states: list[NDArray[np.uint8]] = []
     poses: list[NDArray[np.float64]] = []
-    for step in itertools.count():
-        if step:
-            robot.act()
-        positions_m = corner_m + np.array([robot.position, robot.believed_position]) * home.resolution_m
-        poses.append(np.column_stack([positions_m, [robot.heading_deg] * 2]))
-        done, gives_up = float(step), False
-        if by_fraction:
-            done = int((robot.seen == _FREE).sum()) / len(free) if step else 0.0
-            if done > best + PROGRESS:
-                best, last_progress = done, step
-            gives_up = robot.is_finished or step >= last_progress + VAIN_STEPS
-        while len(reached) < len(steps) and (gives_up or steps[len(reached)] <= done):
-            reached.append(step)
-            state = np.full_like(padded, _UNKNOWN)
+    with reporting(progress) as report:
+        for step in itertools.count():
             if step:
-                state[row0:row1, column0:column1] = robot.seen
-            states.append(state[margin:-margin, margin:-margin])
-        is_last = len(reached) == len(steps)
-        if progress and (step % _REPORT_STEPS == 0 or is_last):
-            fraction = len(reached) / len(steps) if by_fraction else step / max(1.0, float(steps[-1]))
-            progress(fraction, f"exploring: step {step}")
-        if is_last:
-            break
+                robot.act()
+            positions_m = corner_m + np.array([robot.position, robot.believed_position]) * home.resolution_m
+            poses.append(np.column_stack([positions_m, [robot.heading_deg] * 2]))
+            done, gives_up = float(step), False
+            if by_fraction:
+                done = int((robot.seen == _FREE).sum()) / len(free) if step else 0.0
+                if done > best + PROGRESS:
+                    best, last_progress = done, step
+                gives_up = robot.is_finished or step >= last_progress + VAIN_STEPS
+            while len(reached) < len(steps) and (gives_up or steps[len(reached)] <= done):
+                reached.append(step)
+                state = np.full_like(padded, _UNKNOWN)
+                if step:
+                    state[row0:row1, column0:column1] = robot.seen
+                states.append(state[margin:-margin, margin:-margin])
+            is_last = len(reached) == len(steps)
+            if step % _REPORT_STEPS == 0 or is_last:
+                fraction = len(reached) / len(steps) if by_fraction else step / max(1.0, float(steps[-1]))
+                report(fraction, f"exploring: step {step}")
+            if is_last:
+                break
     true, believed = np.array(poses).transpose(1, 0, 2)
     return Exploration(home, sensor, tuple(reached), np.array(states), true, believed)

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import Progress, no_progress, require
+from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
@@ -35,7 +37,7 @@ Part = tuple[Candidates, SolvedPaths]
 
 
 @dataclass(frozen=True)
-class PathParameters:
+class PathParameters(Shown):
     """What the power of paths depends on.
 
     Parameters
@@ -98,13 +100,13 @@ class PathScene:
             frequency_hz=np.array(self.settings.frequency_hz),
         )
 
-    def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | None = None) -> "PathSet":
+    def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> "PathSet":
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], as `trace_links` does."""
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.settings.frequency_hz)
         tx_m, rx_m = tx_m.reshape(np.shape(tx)).copy(), rx_m.copy()
-        report = progress or no_progress
-        found = PathSet.joined([PathSet(self, tx_m, rx_m, []), *self.blocks(tx_m, rx_m, report)])
-        report(1.0, "traced")
+        with reporting(progress) as report:
+            found = PathSet.joined([PathSet(self, tx_m, rx_m, []), *self.blocks(tx_m, rx_m, report)])
+            report(1.0, "traced")
         return found
 
     def blocks(
@@ -359,7 +361,7 @@ def path_settings(
 
 
 @dataclass(frozen=True)
-class GainGradients:
+class GainGradients(Shown):
     """Path gain from one transmitter to N receivers, and its derivatives.
 
     The derivatives are those of the paths that exist: they do not include paths that appear or vanish. They are 0 in
@@ -409,7 +411,7 @@ def gain_gradients(
     *,
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
-    progress: Progress | None = None,
+    progress: Progress | bool | None = None,
 ) -> GainGradients:
     """Differentiate the path gain from a transmitter to N receivers with Sionna RT and Dr.Jit.
 
@@ -428,8 +430,9 @@ def gain_gradients(
     trace_settings : TraceSettings, optional
         Refraction and diffuse reflection must be off; diffraction too on meshes.
     scene_settings : SceneSettings, optional
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -465,20 +468,20 @@ def gain_gradients(
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = path_settings(partial, trace_settings, scene_settings)
     tx_m, rx_m = checked_positions(partial, one_transmitter(tx), rx, settings.frequency_hz)
-    report = progress or no_progress
-    report(0.0, "building the scene")
     power, is_direct, slopes = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool), np.zeros((7, len(rx_m)))
-    if len(rx_m):
-        paths = PathScene(partial, settings=settings, scene_settings=scene_settings)
+    with reporting(progress) as report:
+        report(0.0, "building the scene")
+        if len(rx_m):
+            paths = PathScene(partial, settings=settings, scene_settings=scene_settings)
 
-        def part(fraction: float, message: str) -> None:
-            report(0.1 + 0.9 * fraction, message.replace("verifying", "differentiating"))
+            def part(fraction: float, message: str) -> None:
+                report(0.1 + 0.9 * fraction, message.replace("verifying", "differentiating"))
 
-        for block in paths.blocks(tx_m[0], rx_m, part):
-            is_direct[block.path_rx[block.is_direct]] = True
-            columns = np.concatenate(list(block.slopes(block.base, together=True).values()), axis=1)
-            for total, values in zip((power, *slopes), (block.power, *columns.T), strict=True):
-                total += np.bincount(block.path_rx, weights=values, minlength=len(rx_m))
+            for block in paths.blocks(tx_m[0], rx_m, part):
+                is_direct[block.path_rx[block.is_direct]] = True
+                columns = np.concatenate(list(block.slopes(block.base, together=True).values()), axis=1)
+                for total, values in zip((power, *slopes), (block.power, *columns.T), strict=True):
+                    total += np.bincount(block.path_rx, weights=values, minlength=len(rx_m))
     link_state, gain_db = link_summary(power, is_direct)
     above = gain_db > GAIN_FLOOR_DB
     slopes_db = np.where(above, 10.0 / math.log(10.0) * slopes / np.where(above, power, 1.0), 0.0)

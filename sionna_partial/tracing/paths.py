@@ -35,10 +35,9 @@ class SolvedPaths:
         """Return the paths that an index array or a mask (P,) selects."""
         return SolvedPaths(*(getattr(self, field.name)[index] for field in fields(self)))
 
-    def between(self, tx: int, first_rx: int) -> "SolvedPaths":
-        """Return the paths of transmitter `tx`, with receivers counted from `first_rx`."""
-        path_tx = np.full(len(self.a), tx, np.int32)
-        return replace(self, path_tx=path_tx, path_rx=self.path_rx + np.int32(first_rx))
+    def between(self, tx: int, rx: NDArray[np.int32]) -> "SolvedPaths":
+        """Return the paths of transmitter `tx`, with receivers numbered by `rx`."""
+        return replace(self, path_tx=np.full(len(self.a), tx, np.int32), path_rx=rx[self.path_rx])
 
     @classmethod
     def concatenate(cls, parts: Sequence["SolvedPaths"], depth: int) -> "SolvedPaths":

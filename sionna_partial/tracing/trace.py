@@ -1,25 +1,28 @@
 """Scene + transmitters + receivers -> TracedLinks."""
 
+import json
 import logging
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sionna_partial.checks import Progress, no_progress, settings_or_default
-from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.checks import Progress, no_progress, require_choice, settings_or_default
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, position_array
+from sionna_partial.progress import reporting
 from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Wedges
@@ -35,6 +38,12 @@ from sionna_partial.tracing.paths import (
     path_bytes,
 )
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+InvalidLinks = Literal["raise", "nan"]
+"""What becomes of links that cannot be traced."""
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +68,7 @@ SAMPLE = 100
 
 
 @dataclass(frozen=True)
-class TracedLinks:
+class TracedLinks(Shown):
     """Every traced path from one or T transmitters to N receivers.
 
     Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
@@ -71,8 +80,9 @@ class TracedLinks:
     rx : (N, 3) float64 array
         Receiver positions [m].
     link_state : (N,) or (T, N) uint8 array of LinkState
+        255 where a link was not traced (``invalid="nan"``).
     gain_db : (N,) or (T, N) float64 array
-        Omnidirectional path gain [dB], at least -150 (paper, eq. 5).
+        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where a link was not traced.
     path_tx, path_rx : (P,) int32 arrays
         Indices of the transmitter and the receiver that each path joins.
     a : (P,) complex128 array
@@ -106,6 +116,137 @@ class TracedLinks:
     settings: TraceSettings
     scene_settings: SceneSettings
 
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which links were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
+        return self.link_state != NO_RECEIVER
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Return the links and their paths as a labelled Dataset.
+
+        Its dimensions are "rx", "tx" where there are several transmitters, "path" and "interaction". Variables have
+        `units`, and settings are attributes.
+
+        Returns
+        -------
+        xarray.Dataset
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
+        >>> links.to_xarray().sizes["rx"], links.to_xarray().gain_db.units
+        (2, 'dB')
+        """
+        import xarray as xr
+
+        link = ("tx", "rx")[2 - self.gain_db.ndim :]
+        shapes = {
+            **{"tx": (*link[:-1], "axis"), "rx": ("rx", "axis"), "link_state": link, "gain_db": link},
+            **dict.fromkeys(("departure_rad", "arrival_rad"), ("path", "angle")),
+            **{"interactions": ("path", "interaction"), "vertices_m": ("path", "interaction", "axis")},
+        }
+        names = [field.name for field in fields(self) if not field.name.endswith("settings")]
+        axes = {"axis": ["x", "y", "z"], "angle": ["zenith", "azimuth"]}
+        table = xr.Dataset(
+            {
+                f"{name}_m" if name in ("tx", "rx") else name: (
+                    shapes.get(name, ("path",)),
+                    getattr(self, name),
+                    _VARIABLES[name],
+                )
+                for name in names
+            },
+            coords=axes,
+            attrs={"frequency_hz": self.settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB},
+        )
+        for name in ("settings", "scene_settings"):
+            table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
+        return table
+
+    def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
+        """Return a row for each link, or for each path, as a pandas.DataFrame.
+
+        Parameters
+        ----------
+        of : {"links", "paths"}
+            Links have the numbers `tx` and `rx` and the positions [m] of their ends, `link_state`, `gain_db`,
+            `distance_m`, the number of `paths` and the shortest `delay_s` (NaN without paths). Paths have `tx`, `rx`,
+            `gain_db`, `phase_rad`, `delay_s`, angles [rad], and `interactions` by Sionna RT's `InteractionType`, such
+            as "1-1-8".
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Raises
+        ------
+        SettingsError
+            For another value of `of`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
+        >>> links.to_dataframe().distance_m.tolist()
+        [0.5, 1.0]
+        """
+        import xarray as xr
+
+        require_choice("of", of, ("links", "paths"))
+        columns = self._link_columns() if of == "links" else self._path_columns()
+        return (
+            xr.Dataset({name: ("row", values) for name, values in columns.items()})
+            .to_dataframe()
+            .reset_index(drop=True)
+        )
+
+    def _link_columns(self) -> dict[str, NDArray[Any]]:
+        tx_m, count = self.tx.reshape(-1, 3), len(self.rx)
+        tx, rx = np.repeat(np.arange(len(tx_m)), count), np.tile(np.arange(count), len(tx_m))
+        link = self.path_tx.astype(np.int64) * count + self.path_rx
+        first, paths = np.unique(link, return_index=True, return_counts=True)[1:]  # the shortest is listed first
+        delay_s, number = np.full(len(tx), np.nan), np.zeros(len(tx), np.int64)
+        delay_s[link[first]], number[link[first]] = self.delay_s[first], paths
+        ends = {"tx": tx_m[tx], "rx": self.rx[rx]}
+        return {
+            **{"tx": tx, "rx": rx},
+            **{f"{end}_{axis}_m": at for end, at_m in ends.items() for axis, at in zip("xyz", at_m.T, strict=True)},
+            **{"link_state": self.link_state.ravel(), "gain_db": self.gain_db.ravel()},
+            **{"distance_m": np.linalg.norm(ends["rx"] - ends["tx"], axis=1), "paths": number, "delay_s": delay_s},
+        }
+
+    def _path_columns(self) -> dict[str, NDArray[Any]]:
+        angles = {"departure": self.departure_rad, "arrival": self.arrival_rad}
+        kinds = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
+        return {
+            **{"tx": self.path_tx, "rx": self.path_rx},
+            **{"gain_db": 20.0 * np.log10(np.abs(self.a)), "phase_rad": np.angle(self.a), "delay_s": self.delay_s},
+            **{f"{end}_zenith_rad": values[:, 0] for end, values in angles.items()},
+            **{f"{end}_azimuth_rad": values[:, 1] for end, values in angles.items()},
+            "interactions": np.array(kinds, dtype=object),
+        }
+
+
+def _variable(long_name: str, units: str = "1") -> dict[str, str]:
+    return {"long_name": long_name, "units": units}
+
+
+_VARIABLES = {
+    "tx": _variable("transmitter position", "m"),
+    "rx": _variable("receiver position", "m"),
+    "link_state": _variable("link state: 0 outage, 1 LOS, 2 NLOS, 255 not traced"),
+    "gain_db": _variable("omnidirectional path gain", "dB"),
+    "path_tx": _variable("transmitter of the path"),
+    "path_rx": _variable("receiver of the path"),
+    "a": _variable("complex path gain"),
+    "delay_s": _variable("propagation delay", "s"),
+    "departure_rad": _variable("angles of departure", "rad"),
+    "arrival_rad": _variable("angles of arrival", "rad"),
+    "interactions": _variable("Sionna RT's InteractionType in order from the transmitter, 0 for none"),
+    "vertices_m": _variable("points of interaction", "m"),
+}
+
 
 def trace_links(
     scene: PartialMap | str | Path,
@@ -116,7 +257,8 @@ def trace_links(
     scene_settings: SceneSettings | None = None,
     folder: str | Path | None = None,
     memory_gb: float = MEMORY_GB,
-    progress: Progress | None = None,
+    invalid: InvalidLinks = "raise",
+    progress: Progress | bool | None = None,
 ) -> TracedLinks:
     """Trace every path from one or more transmitters to N receivers with Sionna RT.
 
@@ -143,8 +285,13 @@ def trace_links(
         then read from there when they are needed, and `memory_gb` does not limit them.
     memory_gb : float
         How much memory the paths may take [GB]. Their size is estimated first, from some of the receivers.
-    progress : callable, optional
-        Called as ``progress(fraction_done, message)``.
+    invalid : {"raise", "nan"}
+        What becomes of links whose receiver can stand nowhere (it is not finite, outside the map, in a wall, not
+        between floor and ceiling) or is at the transmitter: an error, or a link without paths, of link state 255 and
+        gain NaN.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
 
     Returns
     -------
@@ -156,9 +303,9 @@ def trace_links(
         If the paths would take more than `memory_gb`.
     PositionError
         For a transmitter or receiver that is not finite, outside the map or inside a wall, or a receiver within 1.1 cm
-        of a transmitter (at low frequencies, where Friis' formula is above 0 dB).
+        of a transmitter (at low frequencies, where Friis' formula is above 0 dB); with "nan" for a transmitter only.
     SettingsError
-        For a frequency that a material does not cover, or settings of another kind.
+        For a frequency that a material does not cover, settings of another kind, or another value of `invalid`.
     BackendError
         If LLVM or Sionna RT cannot be used.
     OutputError
@@ -178,17 +325,22 @@ def trace_links(
     """
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
-    tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
-    shape, report = np.shape(tx), progress or no_progress
-    report(0.0, "building the scene")
-    with temporary_folder() as work:
+    require_choice("invalid", invalid, get_args(InvalidLinks))
+    if invalid == "nan":
+        tx_m, rx_m, valid = valid_links(partial, tx, rx, settings.frequency_hz)
+    else:
+        tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
+        valid = np.ones((len(tx_m), len(rx_m)), dtype=bool)
+    shape = np.shape(tx)
+    with reporting(progress) as report, temporary_folder() as work:
+        report(0.0, "building the scene")
         tracer = Tracer(partial, work, settings, scene_settings)
-        tracer.require_memory(tx_m, rx_m, None if folder is not None else memory_gb)
+        tracer.require_memory(tx_m, rx_m, None if folder is not None else memory_gb, valid)
         if folder is None:
-            return tracer.links(tx_m.reshape(shape), rx_m, report)
+            return tracer.links(tx_m.reshape(shape), rx_m, report, valid)
         with atomic_files(folder) as files:
             columns = PathFiles(max(1, settings.max_depth), files)
-            link_state, gain_db = tracer.fill(columns, tx_m.reshape(shape), rx_m, report)
+            link_state, gain_db = tracer.fill(columns, tx_m.reshape(shape), rx_m, report, valid)
             columns.close()
             ends = ("tx", tx_m.reshape(shape)), ("rx", rx_m)
             for name, values in (*ends, ("link_state", link_state), ("gain_db", gain_db)):
@@ -244,45 +396,70 @@ class Tracer:
             _log.warning(message, " and ".join(names), self.settings.samples_per_tx)
         return None if names or engine_fault() else SceneSolver(self._scene.xml, self._scene.shapes, self.settings)
 
-    def links(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> TracedLinks:
-        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3)."""
+    def links(
+        self,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+        report: Progress,
+        valid: NDArray[np.bool_] | None = None,
+    ) -> TracedLinks:
+        """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
         columns = PathColumns(max(1, self.settings.max_depth))
-        link_state, gain_db = self.fill(columns, tx_m, rx_m, report)
+        link_state, gain_db = self.fill(columns, tx_m, rx_m, report, valid)
         found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
         return TracedLinks(
             tx_m, rx_m, link_state, gain_db, **found, settings=self.settings, scene_settings=self.scene_settings
         )
 
     def fill(
-        self, columns: PathColumns | PathFiles, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
+        self,
+        columns: PathColumns | PathFiles,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+        report: Progress,
+        valid: NDArray[np.bool_] | None = None,
     ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
         """Trace the same links into columns of paths; return their states and gains [dB], (N,) or (T, N)."""
         at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
         sources, count = tx_m.reshape(-1, 3), len(rx_m)
-        power, is_direct = np.zeros((len(sources), count)), np.zeros((len(sources), count), bool)
-        starts = [(tx, start) for tx in range(len(sources)) for start in range(0, count, at_once)]
-        for number, (tx, start) in enumerate(starts):
-            ends = (0.1 + 0.9 * (number + each) / len(starts) for each in (0, 1))
-            block = self.paths(sources[tx], rx_m[start : start + at_once], part_of(report, *ends))
-            parts = [paths.between(tx, start) for paths in block]
+        valid = np.ones((len(sources), count), dtype=bool) if valid is None else valid
+        power, is_direct = np.zeros(valid.shape), np.zeros(valid.shape, dtype=bool)
+        blocks = [
+            (tx, chosen[start : start + at_once].astype(np.int32))
+            for tx, chosen in enumerate(map(np.flatnonzero, valid))
+            for start in range(0, len(chosen), at_once)
+        ]
+        for number, (tx, chosen) in enumerate(blocks):
+            ends = (0.1 + 0.9 * (number + each) / len(blocks) for each in (0, 1))
+            block = self.paths(sources[tx], rx_m[chosen], part_of(report, *ends))
+            parts = [paths.between(tx, chosen) for paths in block]
             columns.append(parts)
             for paths in parts:
                 np.add.at(power[tx], paths.path_rx, np.abs(paths.a) ** 2)
                 is_direct[tx, paths.path_rx[paths.is_direct]] = True
         link_state, gain_db = link_summary(power, is_direct)
+        link_state[~valid], gain_db[~valid] = NO_RECEIVER, np.nan
         shape = (*tx_m.shape[:-1], count)
         return link_state.reshape(shape), gain_db.reshape(shape)
 
-    def require_memory(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], memory_gb: float | None) -> None:
+    def require_memory(
+        self,
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+        memory_gb: float | None,
+        valid: NDArray[np.bool_],
+    ) -> None:
         """Log how much memory the paths of a large job take, estimated from some of its receivers.
 
         Raises a MemoryLimitError if that is more than `memory_gb`.
         """
-        if len(tx_m) * len(rx_m) <= RECEIVERS_OF_PLAN:
+        if valid.sum() <= RECEIVERS_OF_PLAN:
             return
-        some = rx_m[np.linspace(0, len(rx_m) - 1, min(len(rx_m), SAMPLE)).astype(int)]
-        found = sum(len(paths.a) for paths in self.paths(tx_m[0], some, no_progress))
-        count = round(found / len(some) * len(rx_m) * len(tx_m))
+        source = int(valid.sum(axis=1).argmax())
+        all_m = rx_m[valid[source]]
+        some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
+        found = sum(len(paths.a) for paths in self.paths(tx_m[source], some, no_progress))
+        count = round(found / len(some) * valid.sum())
         size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth)) / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)
         if memory_gb is not None and size_gb > memory_gb:
@@ -341,12 +518,8 @@ def checked_positions(
     partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
-    tx_m = partial.require_positions("tx", tx)
-    with suppress(ValueError):  # nested lists of unequal lengths have no size
-        rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
-    rx_m = partial.require_positions("rx", rx)
-    if rx_m.ndim != 2:
-        raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
+    tx_m, rx_m = partial.require_positions("tx", tx), _receivers(rx)
+    partial.require_positions("rx", rx_m)
     tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
     for source_m in tx_m:
         distance_m = np.linalg.norm(rx_m - source_m, axis=1)
@@ -357,6 +530,24 @@ def checked_positions(
                 f"the path gain has no meaning: leave out receivers nearer than {limit_m:.3g} m."
             )
     return tx_m, rx_m
+
+
+def valid_links(
+    partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Return transmitters (T, 3) and receivers (N, 3) [m], and whether `checked_positions` takes each link (T, N)."""
+    tx_m, rx_m = partial.require_positions("tx", tx).reshape(-1, 3), _receivers(rx)
+    far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
+    return tx_m, rx_m, far & partial.radios_can_stand(rx_m)
+
+
+def _receivers(rx: ArrayLike) -> NDArray[np.float64]:
+    with suppress(ValueError):  # nested lists of unequal lengths have no size
+        rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
+    rx_m = position_array("rx", rx)
+    if rx_m.ndim != 2:
+        raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
+    return rx_m
 
 
 def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:

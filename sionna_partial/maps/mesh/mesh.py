@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
+from sionna_partial.display import Shown
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cut import SEAM_M, close_seams, cut_triangles, merge_points
 from sionna_partial.settings import Material
@@ -29,7 +30,7 @@ DEGENERATE_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class SceneMesh:
+class SceneMesh(Shown):
     """Triangles in world axes (x right, y up, z up), in metres. There may be none: nothing has been observed then.
 
     Triangles are kept in the order of their materials, and vertices in the order in which triangles use them; both

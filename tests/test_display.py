@@ -1,0 +1,136 @@
+"""How results are shown: every public class in one line, and some with a picture."""
+
+import base64
+import io
+import re
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from coverage_fakes import PICTURE, TX, map_of, small_coverage
+from PIL import Image
+
+import sionna_partial as sp
+from sionna_partial.display import LONGEST, THUMBNAIL_PX, later
+from sionna_partial.settings import PlacementSettings, PredictorSettings
+
+LINKS = sp.LinkFeatures(np.ones(50), np.zeros(50), np.full(50, 3.0), np.full(50, -71.0))
+PARTIAL = map_of(PICTURE)
+EXPLORATION = sp.explore_trajectory(PARTIAL, (0, 4), 0)
+PLACEMENT = sp.TransmitterPlacement(
+    position_m=np.array([0.6, 3.6, 1.5]),
+    score=0.5,
+    **dict.fromkeys(("trajectory_m", "starts_m"), np.array([[0.6, 3.6, 1.5]])),
+    **dict.fromkeys(("scores", "start_scores"), np.array([0.5])),
+    rx_m=np.array([[0.6, 3.0, 1.5], [1.0, 3.0, 1.5]]),
+    weight=np.ones(2),
+    values=np.array([0.2, 0.9]),
+    spacing_m=0.5,
+    partial=PARTIAL,
+    settings=PlacementSettings(),
+    provenance={},
+)
+SETTINGS = (
+    *(sp.SceneSettings, sp.TraceSettings, sp.SensorSettings, sp.DatasetSettings, sp.Material),
+    *(sp.PredictorSettings, sp.PlacementSettings),
+)
+
+
+@pytest.mark.parametrize(
+    ("value", "start"),
+    [
+        (PARTIAL, "PartialMap(state=uint8 (8, 12), resolution_m=0.5, origin_m=(-1, 2), "),
+        (sp.make_home(3), "PartialMap(state=uint8 ("),
+        (
+            EXPLORATION,
+            "Exploration(home=PartialMap(...), sensor=SensorSettings(...), steps=(0, 4), states=uint8 (",
+        ),
+        (PLACEMENT, "TransmitterPlacement(position_m=(0.6, 3.6, 1.5), score=0.5, "),
+        (LINKS, "LinkFeatures(link_state=uint8 (50,), unobserved_distance_m=float64 (50,), "),
+        (sp.Predictor.load(), "Predictor(settings=PredictorSettings(...), homes=tuple of "),
+        (sp.Predictor.load("paper").predict(LINKS), "LinkPrediction(p_los=float64 (50,), "),
+        *((kind(), f"{kind.__name__}(") for kind in SETTINGS),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_one_line(value: Any, start: str) -> None:
+    line = repr(value)
+    assert line.startswith(start)
+    assert "\n" not in line
+    assert len(line) <= (1000 if isinstance(value, SETTINGS) else LONGEST)  # settings can be pasted
+
+
+def test_every_public_class_is_shown_in_one_line() -> None:
+    classes = {name for name in sp.__all__ if isinstance(getattr(sp, name), type)}
+    own = {name for name in classes if getattr(getattr(sp, name).__repr__, "__module__", "").endswith(".display")}
+    others = {"CellState", "LinkState", "SionnaPartialError", "DifferentiableScene"}
+    assert classes - own == others | ({kind.__name__ for kind in SETTINGS} & classes)
+
+
+def picture(html: str) -> Image.Image:
+    (png,) = re.findall(r'<img src="data:image/png;base64,([^"]+)">', html)
+    return Image.open(io.BytesIO(base64.b64decode(png)))
+
+
+@pytest.mark.parametrize("value", [PARTIAL, EXPLORATION, PLACEMENT], ids=lambda value: type(value).__name__)
+def test_picture(value: Any) -> None:
+    html = value._repr_html_()
+    assert f"<code>{type(value).__name__}(" in html
+    assert THUMBNAIL_PX / 2 < picture(html).width <= THUMBNAIL_PX
+
+
+def test_coverage(monkeypatch: pytest.MonkeyPatch) -> None:
+    coverage = small_coverage(monkeypatch)
+    line = "<coverage: 24 x 16 receivers, 0.25 m apart, transmitter at (0.60, 3.60, 1.50) m, 28 GHz>"
+    assert repr(coverage.radio) == line
+    assert picture(coverage.radio._repr_html_()).width <= THUMBNAIL_PX
+
+
+@pytest.mark.parametrize("kind", ["PartialMap", "Exploration", "TransmitterPlacement", "MaterialCalibration"])
+def test_plots_are_there(kind: str) -> None:
+    assert callable(later(getattr(sp, kind)._plot))
+
+
+def test_a_line_loads_no_matplotlib() -> None:
+    code = "import sys, sionna_partial as sp\nrepr(sp.make_home(3))\nassert 'matplotlib' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+class TestPlotMap:
+    def test_positions_beyond_the_map_are_drawn(self) -> None:
+        figure = sp.plot_map(PARTIAL, tx=TX, rx=[(20.0, 3.0, 1.5), (1.0, 3.0, 1.5)])
+        (axis,) = figure.axes
+        assert axis.get_xlim()[0] < -1.0
+        assert axis.get_xlim()[1] > 20.0
+        texts = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert texts == ["transmitter", "receiver", "wall", "not observed"]
+
+    def test_the_legend_has_what_is_drawn(self) -> None:
+        texts = [text.get_text() for text in sp.plot_map(sp.PartialMap([[0, 2]], 1.0)).legends[0].get_texts()]
+        assert texts == ["not observed"]
+
+    def test_row_0_is_at_the_bottom(self) -> None:
+        figure = sp.plot_map(sp.PartialMap([[0, 1], [0, 0]], 1.0))
+        walls = figure.axes[0].get_images()[1]
+        assert walls.origin == "lower"
+        assert walls.get_extent() == [0.0, 2.0, 0.0, 2.0]
+        assert walls.get_array()[0, 1, 3] == 255
+
+    @pytest.mark.parametrize(
+        ("tx", "message"),
+        [
+            ([1.0], r"tx has shape \(1,\): give x and y"),
+            ([[[1.0, 2.0]]], r"tx has shape \(1, 1, 2\)"),
+            ((np.nan, 1.0), "tx has values that are not finite"),
+            ("here", "tx = 'here' is not numeric"),
+        ],
+    )
+    def test_positions_are_refused(self, tx: Any, message: str) -> None:
+        with pytest.raises(sp.SionnaPartialError, match=message):
+            sp.plot_map(PARTIAL, tx=tx)
+
+    def test_other_maps_are_refused(self) -> None:
+        with pytest.raises(sp.SionnaPartialError, match="partial is of type str: give a PartialMap"):
+            sp.plot_map("map.yaml")  # type: ignore[arg-type]
