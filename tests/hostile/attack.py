@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from cases import FAMILIES, Case, cases_of
 
 SECONDS, GIGABYTES = 120.0, 4.0
-"""Limits of a case: processor time, which other programs do not change, or time without any; and resident memory."""
+"""Limits of a case: processor time, which other programs do not change (or time without any), and memory it adds."""
 
 ALLOWED = ("works", "refused")
 ENDINGS = (*ALLOWED, "wrong", "traceback", "crash", "hang", "memory", "left behind")
@@ -88,6 +88,7 @@ class _Worker:
         """Yield the outcome of each case, until one takes the process down."""
         for reported, case in enumerate(self._cases):
             began_s = busy_s = self._processor_s()
+            began_gb = self._resident_gb()
             busy = looked = time.monotonic()
             while True:
                 lines = self._reports.read_text(encoding="utf-8").splitlines()
@@ -106,7 +107,7 @@ class _Worker:
                 if used_s - began_s > seconds or looked - busy > seconds:
                     yield Outcome(case, "hang", f"{used_s - began_s:.0f} s of work, {looked - busy:.0f} s without")
                     return
-                if self._family(lambda process: process.memory_info().rss / 1e9) > gigabytes:
+                if self._resident_gb() - began_gb > gigabytes:
                     yield Outcome(case, "memory", f"more than {gigabytes:g} GB")
                     return
             yield Outcome(case, ending, message)
@@ -120,6 +121,9 @@ class _Worker:
     def _processor_s(self) -> float:
         """Return the processor time of the worker and its children, those that have ended too."""
         return self._family(lambda process: sum(process.cpu_times()[:4]))
+
+    def _resident_gb(self) -> float:
+        return self._family(lambda process: process.memory_info().rss / 1e9)
 
     def _family(self, measure: Callable[[psutil.Process], float]) -> float:
         total = 0.0
@@ -154,10 +158,10 @@ PAGE = """# Hostile inputs
 
 [README](../README.md) · [Security](../SECURITY.md) · [Development](development.md)
 
-`make hostile` makes inputs by rules (`tests/hostile/`) and runs each of them in a process with limits:
-{seconds:.0f} s of processor time, {gigabytes:g} GB of memory. "works" and "refused" (one line that names the field, the
-value and the remedy) are right; everything else is a defect. This table is of {minutes:.0f} minutes with one worker, at
-commit {commit}.
+`make hostile` makes inputs by rules (`tests/hostile/`) and runs each of them in a process with limits: {seconds:.0f} s
+of processor time, and {gigabytes:g} GB of memory beyond what the process had before. "works" and "refused" (one line
+that names the field, the value and the remedy) are right; everything else is a defect. This table is of {minutes:.0f}
+minutes with one worker, at commit {commit}.
 
 {table}
 """
