@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import shutil
 import socket
 import stat
 import tempfile
@@ -146,16 +147,19 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Open a folder whose files appear in the folder `path` together, when all have been written completely.
 
-    Files of the same names are replaced, all or none, others are kept.
+    Files of the same names are replaced, all or none, others are kept. Links stay, and their files are replaced.
     """
     target = output_path(path)
     with _hidden_folder(target, target) as hidden:
         folder = hidden / "new"
         folder.mkdir()
         yield folder
-        for file in folder.iterdir():
-            _require_file(target / file.name)
-        _swap_entries(folder, target, hidden / "old")
+        with ExitStack() as linked:
+            for file in [*folder.iterdir()]:
+                _require_file(target / file.name)
+                if (target / file.name).is_symlink():
+                    shutil.move(file, linked.enter_context(atomic_path(target / file.name)))
+            _swap_entries(folder, target, hidden / "old")
 
 
 @contextmanager

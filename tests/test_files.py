@@ -82,6 +82,11 @@ def test_links_stay_and_pipes_are_refused(tmp_path: Path) -> None:
         stream.write(b"new")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "file").read_bytes() == b"new"
+    with atomic_files(tmp_path) as folder:
+        (folder / "link").write_bytes(b"newer")
+        (folder / "other").write_bytes(b"whole")
+    assert (tmp_path / "link").is_symlink()
+    assert tree(tmp_path) == {"link": b"newer", "file": b"newer", "other": b"whole"}
     os.mkfifo(tmp_path / "pipe")
     message = r"pipe' is a pipe or a device: give the name of a file"
     with pytest.raises(OutputError, match=message), atomic_write(tmp_path / "pipe"):

@@ -59,6 +59,9 @@ def test_what_is_not_written(tmp_path: Path) -> None:
         save_map(SMALL.state, tmp_path / "home.npz")  # type: ignore[arg-type]
     with pytest.raises(OutputError, match=r"home.pgm' has the suffix '.pgm': choose .yaml, .yml or .npz"):
         save_map(SMALL, tmp_path / "home.pgm")
+    message = r"extra = {'score': 1} cannot be held by '.*home\.npz': leave it out, or choose \.yaml\."
+    with pytest.raises(OutputError, match=message):
+        save_map(SMALL, tmp_path / "home.npz", extra={"score": 1})
     assert list(tmp_path.iterdir()) == []
 
 

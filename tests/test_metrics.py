@@ -98,12 +98,17 @@ class TestMeasure:
         state = np.where(np.arange(1000) < 600, LOS, NLOS).astype(np.uint8)
         assert measure(confident, state, np.full(1000, -60.0)).calibration_error == pytest.approx(0.3)
 
-    def test_a_trace_has_no_likelihood_and_no_interval(self):
+    def test_a_trace_has_no_interval(self):
         phi, state, gain_db = make_links(500)
         found = measure(LinkPrediction.of_trace(phi), state, gain_db)
-        assert all(map(math.isnan, (found.nll, found.coverage_90)))
+        assert math.isnan(found.coverage_90)
         assert found.calibration_error == pytest.approx(1.0 - found.accuracy)
         assert found.rmse_db > 0.0
+
+    def test_a_gain_held_certain_has_a_least_spread_and_density(self):
+        answer, los = prediction([0.0, 0.0], [1.0, 1.0], [0.0, 0.0], los_db=(-60.0, 0.0)), np.full(2, LOS, np.uint8)
+        right, wrong = math.log(0.1 * math.sqrt(2.0 * math.pi)), -math.log(1e-4 / 150.0)
+        assert measure(answer, los, np.array([-60.0, -35.0])).nll == pytest.approx((right + wrong) / 2)
 
     def test_a_state_held_impossible_has_the_least_probability(self):
         answer = prediction([0.0, 0.5], [1.0, 0.5], [0.0, 0.0])
@@ -122,7 +127,7 @@ class TestMeasure:
     def test_every_figure_is_defined_and_fits_json(self):
         found = measure(LinkPrediction.of_trace(make_links(9)[0]), *make_links(9)[1:]).as_json()
         assert list(found) == list(DEFINITIONS) == list(Metrics.__dataclass_fields__)
-        assert json.loads(json.dumps(found, allow_nan=False))["nll"] is None
+        assert json.loads(json.dumps(found, allow_nan=False))["coverage_90"] is None
 
 
 class TestPitShares:

@@ -39,6 +39,14 @@ class TestSignals:
         assert (process.returncode, errors) == (128 + number, "interrupted\n")
         assert [path.name for path in tmp_path.iterdir()] == ["ready"]
 
+    def test_an_interrupt_while_the_command_line_is_imported_is_one_line(self) -> None:
+        code = (
+            "import signal, sys\nclass Press:\n    def find_spec(name, *_):\n"
+            "        name == 'typer' and signal.raise_signal(signal.SIGINT)\nsys.meta_path.insert(0, Press)\n" + COMMAND
+        )
+        process = python(code)
+        assert (process.communicate(timeout=60.0)[1], process.returncode) == ("interrupted\n", 130)
+
     def test_held_signals_come_later(self) -> None:
         done = False
         with pytest.raises(KeyboardInterrupt), signals_held():  # noqa: PT012

@@ -27,6 +27,9 @@ _NO_SPREAD_DB = 1e-6
 LEAST_PROBABILITY = 1e-4
 """Of the true link state in a likelihood: a map with errors excludes true states now and then."""
 
+LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
+"""Of the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, and now and then wrong."""
+
 DEFINITIONS = {
     "links": "number of links that were measured.",
     "accuracy": "fraction of links whose likeliest link state is the true one.",
@@ -34,7 +37,7 @@ DEFINITIONS = {
     "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
     "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
     "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat], P as before; an outage has no "
-    "second term.",
+    f"second term, a standard deviation counts at least {LEAST_STD_DB:g} dB, p at least {LEAST_DENSITY:.1g} per dB.",
     "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
     f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
     "likeliest state.",
@@ -48,8 +51,8 @@ DEFINITIONS = {
 class Metrics:
     """Figures of merit of one prediction of N links, see `DEFINITIONS`; nan where one has no finite value.
 
-    That is so without links; for `rmse_linked_db` if all links are in outage; for `nll` if a gain is predicted without
-    spread; and for `coverage_90` of a prediction without any spread.
+    That is so without links; for `rmse_linked_db` if all links are in outage; and for `coverage_90` of a prediction
+    without any spread.
     """
 
     links: int
@@ -174,17 +177,15 @@ def _gain_probabilities(
 def _negative_log_likelihoods(
     prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Of the link state, and of link state and gain; nan where it is not finite."""
+    """Of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
     mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)
-    std_db = np.where(los, prediction.gain_los_std_db, prediction.gain_nlos_std_db)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        state = -np.log(np.maximum(p, LEAST_PROBABILITY))
-        gain = 0.5 * ((gain_db - mean_db) / std_db) ** 2 + np.log(std_db * math.sqrt(2.0 * math.pi))
-        means = _mean(state), _mean(state + np.where(outage, 0.0, gain))
-    nll_state, nll = (value if math.isfinite(value) else math.nan for value in means)
-    return nll_state, nll
+    std_db = np.maximum(np.where(los, prediction.gain_los_std_db, prediction.gain_nlos_std_db), LEAST_STD_DB)
+    state = -np.log(np.maximum(p, LEAST_PROBABILITY))
+    gain = 0.5 * ((gain_db - mean_db) / std_db) ** 2 + np.log(std_db * math.sqrt(2.0 * math.pi))
+    gain = np.where(outage, 0.0, np.minimum(gain, -math.log(LEAST_DENSITY)))
+    return _mean(state), _mean(state + gain)
 
 
 def _mean(values: NDArray[Any]) -> float:

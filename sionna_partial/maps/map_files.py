@@ -133,14 +133,15 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     path : path-like
         `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem; not for a map with a mesh) or `.npz`.
     extra : mapping or None
-        Further keys for the YAML.
+        Further keys for the YAML; `.npz` has none.
 
     Raises
     ------
     MapError
         If `partial` is no PartialMap.
     OutputError
-        For another suffix, for a map with a mesh as YAML, or if writing fails; nothing half written is left behind.
+        For another suffix, for a map with a mesh as YAML, for `extra` with `.npz`, or if writing fails; nothing half
+        written is left behind.
 
     Examples
     --------
@@ -159,6 +160,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             raise OutputError(f"path = '{target}' cannot hold the map's mesh: choose .npz, or use export_scene.")
         write_ros_map(partial, target, extra)
     elif suffix == ".npz":
+        if extra is not None:
+            raise OutputError(f"extra = {shown(extra)} cannot be held by '{target}': leave it out, or choose .yaml.")
         content: dict[str, Any] = {
             "state": partial.state,
             "resolution_m": partial.resolution_m,

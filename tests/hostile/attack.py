@@ -17,7 +17,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from cases import FAMILIES, Case, cases_of
 
 SECONDS, GIGABYTES = 120.0, 4.0
-"""Limits of a case: wall time, and resident memory beyond that of an idle worker."""
+"""Limits of a case: processor time, which other programs do not change (or time without any), and memory it adds."""
 
 ALLOWED = ("works", "refused")
 ENDINGS = (*ALLOWED, "wrong", "traceback", "crash", "hang", "memory", "left behind")
@@ -85,8 +86,10 @@ class _Worker:
 
     def outcomes(self, seconds: float, gigabytes: float) -> Iterator[Outcome]:
         """Yield the outcome of each case, until one takes the process down."""
-        reported, began = 0, time.monotonic()
-        for case in self._cases:
+        for reported, case in enumerate(self._cases):
+            began_s = busy_s = self._processor_s()
+            began_gb = self._resident_gb()
+            busy = looked = time.monotonic()
             while True:
                 lines = self._reports.read_text(encoding="utf-8").splitlines()
                 if len(lines) > reported and lines[-1].endswith("]"):
@@ -95,14 +98,18 @@ class _Worker:
                 if self._process.poll() is not None:
                     yield Outcome(case, "crash", f"exit {self._process.returncode}: {self._last_words()}")
                     return
-                if time.monotonic() - began > seconds + (60.0 if reported == 0 else 0.0):
-                    yield Outcome(case, "hang", f"more than {seconds:g} s")
+                time.sleep(0.02)
+                if time.monotonic() - looked < 0.5:
+                    continue
+                looked, used_s = time.monotonic(), self._processor_s()
+                if used_s > busy_s + 0.5:
+                    busy_s, busy = used_s, looked
+                if used_s - began_s > seconds or looked - busy > seconds:
+                    yield Outcome(case, "hang", f"{used_s - began_s:.0f} s of work, {looked - busy:.0f} s without")
                     return
-                if self._resident_gb() > gigabytes:
+                if self._resident_gb() - began_gb > gigabytes:
                     yield Outcome(case, "memory", f"more than {gigabytes:g} GB")
                     return
-                time.sleep(0.02)
-            reported, began = reported + 1, time.monotonic()
             yield Outcome(case, ending, message)
 
     def kill(self) -> None:
@@ -111,13 +118,21 @@ class _Worker:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
+    def _processor_s(self) -> float:
+        """Return the processor time of the worker and its children, those that have ended too."""
+        return self._family(lambda process: sum(process.cpu_times()[:4]))
+
     def _resident_gb(self) -> float:
-        try:
+        return self._family(lambda process: process.memory_info().rss / 1e9)
+
+    def _family(self, measure: Callable[[psutil.Process], float]) -> float:
+        total = 0.0
+        with suppress(psutil.Error):
             process = psutil.Process(self._process.pid)
-            family = [process, *process.children(recursive=True)]
-            return float(sum(each.memory_info().rss for each in family)) / 1e9
-        except psutil.Error:
-            return 0.0
+            for each in [process, *process.children(recursive=True)]:
+                with suppress(psutil.Error):
+                    total += measure(each)
+        return total
 
     def _last_words(self) -> str:
         return " | ".join(self._log.read_text(encoding="utf-8", errors="replace").splitlines()[-5:])
@@ -139,15 +154,36 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join([f"| inputs | cases | {' | '.join(ENDINGS)} |", "|---" * (len(ENDINGS) + 2) + "|", *rows])
 
 
+PAGE = """# Hostile inputs
+
+[README](../README.md) · [Security](../SECURITY.md) · [Development](development.md)
+
+`make hostile` makes inputs by rules (`tests/hostile/`) and runs each of them in a process with limits: {seconds:.0f} s
+of processor time, and {gigabytes:g} GB of memory beyond what the process had before. "works" and "refused" (one line
+that names the field, the value and the remedy) are right; everything else is a defect. This table is of {minutes:.0f}
+minutes with one worker, at commit {commit}.
+
+{table}
+"""
+
+
+def page(table: str, minutes: float) -> str:
+    """Return the page of the documentation that holds the table."""
+    words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=10", "HEAD"]
+    commit = subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
+    return PAGE.format(seconds=SECONDS, gigabytes=GIGABYTES, minutes=minutes, commit=commit, table=table)
+
+
 def main() -> None:
-    """Run every fixed case once, and random ones until the time is up."""
+    """Run the fixed cases once, in a random order, and then random ones, until the time is up."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--family", choices=FAMILIES, action="append")
     parser.add_argument("--table", type=Path)
     given = parser.parse_args()
-    end, outcomes = time.monotonic() + 60.0 * given.minutes, []
+    began, outcomes = time.monotonic(), []
+    end = began + 60.0 * given.minutes
     for round_number in range(1_000_000):
         cases = [case for family in given.family or FAMILIES for case in cases_of(family, given.seed + round_number)]
         if round_number:
@@ -157,14 +193,14 @@ def main() -> None:
             outcomes.append(outcome)
             if outcome.is_defect:
                 print(f"{outcome.ending}: {outcome.case.name}: {outcome.message[:600]}", flush=True)
-            if time.monotonic() > end and round_number:
+            if time.monotonic() > end:
                 break
         if time.monotonic() > end:
             break
     text = table(outcomes)
     print(text)
     if given.table:
-        given.table.write_text(f"# Hostile inputs\n\n`make hostile` made this table.\n\n{text}\n", encoding="utf-8")
+        given.table.write_text(page(text, (time.monotonic() - began) / 60.0), encoding="utf-8")
     sys.exit(any(outcome.is_defect for outcome in outcomes))
 
 

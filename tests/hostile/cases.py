@@ -68,7 +68,7 @@ COMMANDS = {
     "dataset": "OUT --homes 0",
     "train": "LINKS --out OUT",
     "evaluate": "LINKS --predictor paper --out OUT",
-    "calibrate": "MAP CSV --out OUT",
+    "calibrate": "MAP --measurements CSV --out OUT",
     "place": "MAP --predictor paper --out OUT",
     "info": "",
 }
@@ -106,7 +106,15 @@ KINDS = (
     *("predictor.keras", "predictor.json", "coverage.nc", "dataset.parquet", "dataset.json"),
 )
 
-FAMILIES = ("settings", "arguments", "files", "command line", "corpus")
+STOPPED = COMMANDS | {
+    "dataset": "OUT --homes 2",
+    "train": "LINKS --out OUT --networks paper --test-fraction 0",
+}
+"""Subcommands that are told to end in the middle of what they do, and then called again."""
+
+SIGNALS = ("SIGINT", "SIGTERM", "SIGKILL")
+
+FAMILIES = ("settings", "arguments", "files", "command line", "signals", "corpus")
 
 _INPUTS = "from inputs import *\n"
 _SPOIL = """import random
@@ -126,6 +134,7 @@ def cases_of(family: str, seed: int) -> list[Case]:
         "arguments": _arguments,
         "files": _files,
         "command line": _command_line,
+        "signals": _signals,
         "corpus": _corpus,
     }
     return list(makers[family](seed))
@@ -175,14 +184,26 @@ def _command_line(seed: int) -> Iterator[Case]:
 
 
 def _command(words: list[str]) -> Case:
+    return Case("command line", " ".join(words)[:200], f"{_INPUTS}command({_arguments_of(words)})", is_random=True)
+
+
+def _signals(seed: int) -> Iterator[Case]:
+    rng = random.Random(seed)
+    for name, usual in STOPPED.items():
+        words, number, after_s = [name, *usual.split()], rng.choice(SIGNALS), rng.uniform(0.0, 10.0)
+        stop = f"words = [{_arguments_of(words)}]\nmust_end_when_told(words, signal.{number}, {after_s})\n"
+        again = "try:\n    command(*words)\nexcept Exception as error:\n    raise Wrong(str(error)) from error\n"
+        yield Case("signals", f"{name}: {number} after {after_s:.2f} s", _INPUTS + stop + again, is_random=True)
+
+
+def _arguments_of(words: list[str]) -> str:
     made = {
         "MAP": "valid('map.yaml', folder)",
         "OUT": "folder / 'out'",
         "CSV": "valid('measurements.csv', folder)",
         "LINKS": "valid('dataset.json', folder).parent",
     }
-    arguments = ", ".join(made.get(word, repr(word)) for word in words)
-    return Case("command line", " ".join(words)[:200], f"{_INPUTS}command({arguments})", is_random=True)
+    return ", ".join(made.get(word, repr(word)) for word in words)
 
 
 def _corpus(seed: int) -> Iterator[Case]:

@@ -3,14 +3,19 @@
 import functools
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
+from worker import left_behind
 
 import sionna_partial as sp
 
@@ -38,7 +43,7 @@ def must_refuse(call: Callable[[], Any]) -> None:
     raise Wrong(f"accepted, and gave {str(result)[:200]}")
 
 
-def python(code: str, *, seconds: float = 60.0, **variables: str) -> subprocess.CompletedProcess[str]:
+def python(code: str, *, seconds: float = 900.0, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run Python code in a process of its own, with other environment variables."""
     environment = os.environ | {"PYTHONPATH": str(Path(sp.__file__).parents[1])} | variables
     return subprocess.run(
@@ -50,6 +55,57 @@ def must_end_in_one_line(result: subprocess.CompletedProcess[str], *codes: int) 
     """Raise `Wrong` for a traceback, a signal or another exit code than those allowed."""
     if result.returncode not in codes or "Traceback" in result.stderr:
         raise Wrong(f"exit {result.returncode}: {result.stderr[-1500:]}")
+
+
+def must_end_when_told(words: Sequence[object], number: signal.Signals, after_s: float) -> None:
+    """Start a command, send it a signal, and raise `Wrong` if it is late, says more than a line, or leaves something.
+
+    Times are those of the processor, which other programs do not change. A process that was killed may leave hidden
+    folders, which the next start removes.
+    """
+    code = "import sys; sys.argv[0] = 'sionna-partial'; from sionna_partial.cli import main; main()"
+    environment = os.environ | {"PYTHONPATH": str(Path(sp.__file__).parents[1])}
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, words)],
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    _wait(process, after_s)
+    process.send_signal(number)
+    in_time = _wait(process, 3.0)
+    process.kill()
+    errors = process.communicate()[1]
+    what = f"{number.name} after {after_s:.2f} s: exit {process.returncode}: {errors[-800:]}"
+    if not in_time:
+        raise Wrong(f"{what}: later than 3 s")
+    if process.returncode not in (0, 128 + number, -number) or "Traceback" in errors:
+        raise Wrong(what)
+    if process.returncode == 128 + number and errors.count("interrupted") != 1:
+        raise Wrong(what)
+    if number != signal.SIGKILL and left_behind(Path.cwd()):
+        raise Wrong(f"{what} left {left_behind(Path.cwd())}")
+
+
+def _wait(process: "subprocess.Popen[str]", seconds: float) -> bool:
+    """Wait until a process ends (True), or has used so much processor time, or none for 30 s."""
+    first_s = used_s = _processor_s(process.pid)
+    changed = time.monotonic()
+    while process.poll() is None:
+        now_s = _processor_s(process.pid)
+        if now_s > used_s:
+            used_s, changed = now_s, time.monotonic()
+        if used_s - first_s > seconds or time.monotonic() - changed > 30.0:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def _processor_s(pid: int) -> float:
+    with suppress(psutil.Error):
+        return float(sum(psutil.Process(pid).cpu_times()[:2]))
+    return 0.0
 
 
 def room() -> sp.PartialMap:
@@ -123,10 +179,9 @@ def _coverage(folder: Path) -> Path:
 def _read_coverage(path: Path) -> None:
     import xarray as xr
 
-    try:
-        coverage = xr.load_dataset(path)
-    except Exception:  # xarray reads it, not we
+    if python(f"import xarray; xarray.load_dataset({str(path)!r})").returncode:  # HDF5 reads it, and may crash, not we
         return
+    coverage = xr.load_dataset(path)
     sp.save_coverage(coverage, path.with_name("again.csv"))
     sp.plot_coverage(coverage)
 

@@ -1,9 +1,12 @@
 """Run the cases of a folder one after the other, and write down how each ends (see attack.py)."""
 
 import contextlib
+import fcntl
 import io
 import json
 import os
+import shutil
+import signal
 import sys
 import tempfile
 import traceback
@@ -60,8 +63,24 @@ def run(code: str, folder: Path) -> tuple[str, str]:
     return "works", ""
 
 
+def left_behind(folder: Path) -> list[Path]:
+    """Return the hidden and temporary folders that no living process holds."""
+    places = ((folder.rglob, ".tmp-*"), (Path(tempfile.gettempdir()).glob, "sionna_partial_*"))
+    left = []
+    for path in sorted(each for find, pattern in places for each in find(pattern)):
+        with contextlib.suppress(OSError):  # it is locked, or was removed meanwhile
+            descriptor = os.open(path, os.O_RDONLY)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                left.append(path)
+            finally:
+                os.close(descriptor)
+    return left
+
+
 def main() -> None:
     """Run all cases."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in the background
     home = Path(sys.argv[1])
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
     sys.path.insert(0, str(Path(__file__).parent))
@@ -72,12 +91,11 @@ def main() -> None:
             folder.mkdir()
             os.chdir(folder)
             ending, message = run(code, folder)
-            left = sorted(path.name for path in folder.rglob("*") if path.name.startswith((".tmp", "sionna_partial_")))
-            left += sorted(
-                path.name for path in Path(tempfile.gettempdir()).iterdir() if path.name.startswith("sionna_partial_")
-            )
+            left = left_behind(folder)
             if left and ending in ("works", "refused"):
-                ending, message = "left behind", ", ".join(left)
+                ending, message = "left behind", ", ".join(map(str, left))
+            for path in left:
+                shutil.rmtree(path, ignore_errors=True)
             reports.write(json.dumps([ending, message[:2000]]) + "\n")
             reports.flush()
 

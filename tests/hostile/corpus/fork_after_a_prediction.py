@@ -11,5 +11,5 @@ predict(0)
 with multiprocessing.get_context("fork").Pool(1) as pool:
     answer = pool.map_async(predict, [0]).get(60)[0]
 assert isinstance(answer, str) and "spawn" in answer, answer
-""" % HERE, seconds=90.0)
+""" % HERE)
 must_end_in_one_line(result, 0)
