@@ -14,7 +14,7 @@ from PIL import Image
 
 import sionna_partial as sp
 from sionna_partial.display import LONGEST, THUMBNAIL_PX, later
-from sionna_partial.settings import PlacementSettings, PredictorSettings
+from sionna_partial.settings import PlacementSettings
 
 LINKS = sp.LinkFeatures(np.ones(50), np.zeros(50), np.full(50, 3.0), np.full(50, -71.0))
 PARTIAL = map_of(PICTURE)
