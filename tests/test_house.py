@@ -24,7 +24,10 @@ ROOMS = {
         *("constants", "errors", "checks", "settings", "resources"),
         *("process", "files", "planar", "cores", "llvm"),
     ),
-    "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
+    "maps": (
+        *("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.points", "mesh.files", "ros_map"),
+        *("drawings", "bags", "map_files"),
+    ),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
@@ -39,7 +42,7 @@ ROOMS = {
     ),
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "scene"),
-    "measurements": ("measurements",),
+    "measurements": ("measurements", "recordings"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
@@ -63,7 +66,7 @@ IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit"}
 
 HEAVY = IN_FUNCTIONS | {
     *("numpy", "scipy", "numba", "skimage", "shapely", "trimesh", "matplotlib", "xarray", "rasterio", "h5netcdf"),
-    *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed"),
+    *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed", "rosbags", "ezdxf", "laspy", "pypcd4"),
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
 

@@ -17,16 +17,21 @@ from sionna_partial.checks import number_of, require, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import SCENE_FILES, atomic_write, output_path, read_bytes
-from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.bags import BAG_SUFFIXES, is_recording, map_from_bag
+from sionna_partial.maps.drawings import DRAWING_SUFFIXES, map_from_drawing
+from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, MeshReading, mesh_map
 from sionna_partial.maps.mesh.files import MAX_MESH_BYTES, MESH_SUFFIXES, read_mesh, read_mitsuba_scene
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
+from sionna_partial.maps.mesh.points import POINT_SUFFIXES, is_cloud, read_cloud
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map
-from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
+from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
 from sionna_partial.settings import Material
 
 ACCEPTED = (
     "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), an exported scene (folder or scene.xml), "
-    f"a Mitsuba scene (folder or .xml), or a mesh ({', '.join(MESH_SUFFIXES)})"
+    f"a Mitsuba scene (folder or .xml), a mesh ({', '.join(MESH_SUFFIXES)}), a point cloud "
+    f"({', '.join(POINT_SUFFIXES)}, .ply), a drawing ({', '.join(DRAWING_SUFFIXES)}), or a rosbag "
+    f"({', '.join(BAG_SUFFIXES)}, or a folder)"
 )
 """What load_map reads."""
 
@@ -97,12 +102,20 @@ def load_map(
     suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
-    if os.path.isdir(source) or suffix == ".xml":
+    if suffix in POINT_SUFFIXES or (suffix == ".ply" and is_cloud(source)):
+        partial = read_cloud(source, reading)
+    elif is_recording(source):
+        reading.require_unused(source, "a rosbag")
+        partial = map_from_bag(source)
+    elif os.path.isdir(source) or suffix == ".xml":
         partial = _read_scene(source, reading)
     elif suffix in MESH_SUFFIXES:
         partial = mesh_map(read_mesh(source, up), reading)
+    elif suffix in DRAWING_SUFFIXES:
+        replace(reading, resolution_m=None).require_unused(source, "a drawing")
+        partial = map_from_drawing(source, resolution_m=DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
     else:
-        reading.require_unused(source, "no mesh")
+        reading.require_unused(source, "none")
         if suffix in (".yaml", ".yml"):
             partial = read_ros_map(source, strict=strict)
         elif suffix == ".npz":
@@ -214,52 +227,6 @@ def map_from_array(
     False
     """
     return PartialMap(grid_array("array", array, "iub"), resolution_m, origin_m, wall_height_m)
-
-
-def map_from_occupancy(
-    data: ArrayLike,
-    resolution_m: float,
-    *,
-    origin_m: tuple[float, float] = (0.0, 0.0),
-    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
-    occupied_percent: float = 65,
-    free_percent: float = 25,
-) -> PartialMap:
-    """Make a map of a ROS `nav_msgs/OccupancyGrid`.
-
-    Parameters
-    ----------
-    data : (height, width) integers
-        -1 (or 255, its unsigned form) unknown, else the occupancy in percent, 0 to 100: the message's `data`,
-        reshaped to `(info.height, info.width)`. Row 0 holds the smallest y, as ROS has it.
-    resolution_m : float
-        The message's `info.resolution` [m].
-    origin_m : (float, float)
-        x and y of the message's `info.origin` [m]; its orientation has to be the identity.
-    wall_height_m : float
-        Height of walls and ceiling [m].
-    occupied_percent, free_percent : float
-        From this value a cell is wall; up to this value it is free (the defaults of nav2's map_saver).
-
-    Returns
-    -------
-    PartialMap
-
-    Raises
-    ------
-    MapError
-        For other values, or a number out of range.
-    """
-    values = grid_array("data", data, "iu")
-    outside = ((values < -1) | (values > 100)) & (values != 255)
-    if outside.any():
-        raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
-    free, occupied = number_of(free_percent), number_of(occupied_percent)
-    if not 0 <= free < occupied <= 100 or occupied <= 1:
-        given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
-        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
-    state = states_from_percent(values, occupied, free)
-    return PartialMap(state, resolution_m, origin_m, wall_height_m)
 
 
 def map_from_habitat(
