@@ -18,11 +18,11 @@ from meshes import OBSERVED, room, surface_m2
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
+from sionna_partial.maps.bags import map_from_occupancy
 from sionna_partial.maps.map_files import (
     load_map,
     map_from_array,
     map_from_habitat,
-    map_from_occupancy,
     map_from_slam,
     save_map,
 )
@@ -211,10 +211,10 @@ def test_npz_with_a_damaged_mesh(tmp_path: Path, room_file: Path, name: str) -> 
 def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     save_map(SMALL, tmp_path / "home.npz")
     folder = export(tmp_path / "scene")
-    with pytest.raises(MapError, match=r"resolution_m is for meshes alone, but path = '.*home.npz' is no mesh: leave"):
+    with pytest.raises(MapError, match=r"resolution_m is for scans alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
     with pytest.raises(
-        MapError, match=r"up is for meshes alone, but path = '.*' is an exported map \(remove its map.yam"
+        MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its map.yam"
     ):
         load_map(folder, up="z")
 

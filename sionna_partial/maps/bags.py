@@ -14,7 +14,7 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError, SionnaPartialError
 from sionna_partial.files import open_regular
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array
+from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, grid_array
 from sionna_partial.maps.ros_map import states_from_percent, turn_grid
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -112,7 +112,7 @@ def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]
     try:
         with AnyReader([source], default_typestore=get_typestore(store)) as reader:
             yield Recording(source, reader, error)
-    except SionnaPartialError:
+    except (SionnaPartialError, MapWarning):
         raise
     except Exception as cause:  # the reader fails in many ways on damaged files
         reason = " ".join(f"{type(cause).__name__}: {cause}".split())[:200]

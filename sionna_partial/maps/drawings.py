@@ -46,9 +46,11 @@ UNITS_M = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
 PLAUSIBLE_M, POSSIBLE_M = (4.0, 60.0), (1.0, 2000.0)
 """Longer side of a building, where its unit is guessed, and of any one [m]."""
 
-OPENING_M, SOLID_M, FLAT_M = 2.0, 0.5, 0.01
-"""Widest opening of an outer wall that does not make rooms outdoors; width of the widest wall that is drawn by both of
-its faces; distance of a polygon from its curve [m]."""
+OPENING_M, SOLID_M = 2.0, 0.5
+"""Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both of its faces [m]."""
+
+FLAT_FRACTION = 0.001
+"""Distance of a polygon from its curve, in extents of the curve."""
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID"}
 
@@ -117,7 +119,7 @@ def map_from_drawing(
         layers = _wall_layers(source, drawing, names)
         segments = _segments(source, drawing, layers)
         unit = unit or _unit(source, drawing, segments)
-    except MapError:
+    except (MapError, MapWarning):
         raise
     except Exception as error:  # decoders fail in many ways on damaged files
         reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -155,15 +157,25 @@ def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
 def _opened(content: bytes) -> Any:
     """Parse a DXF, which has to end as one."""
     from ezdxf import recover
+    from ezdxf.document import Drawing
+    from ezdxf.lldxf.tagger import binary_tags_loader
 
-    if not content.startswith(b"AutoCAD Binary DXF") and content.split()[-1:] != [b"EOF"]:
+    is_binary = content.startswith(b"AutoCAD Binary DXF")
+    if not content.endswith(b"EOF\0") if is_binary else content.split()[-1:] != [b"EOF"]:
         raise ValueError("it does not end with EOF")
-    drawing, _ = recover.read(io.BytesIO(content))
-    return drawing
+    return Drawing.load(binary_tags_loader(content)) if is_binary else recover.read(io.BytesIO(content))[0]
+
+
+def _layers(drawing: Any) -> dict[str, bool]:
+    """Names of all layers, and whether they are visible; those that are only used have no settings."""
+    used = (entity.dxf.layer for entity in drawing.entitydb.values() if entity.dxf.hasattr("layer"))
+    settings = {layer.dxf.name: layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
+    known = {name.lower() for name in settings}
+    return {name: True for name in used if name.lower() not in known} | settings
 
 
 def _listed(drawing: Any) -> str:
-    names = sorted(layer.dxf.name for layer in drawing.layers)
+    names = sorted(_layers(drawing))
     return f"{len(names)} layers: {', '.join(names[:40])}"
 
 
@@ -171,13 +183,13 @@ def _wall_layers(path: Path, drawing: Any, names: Sequence[str] | None) -> set[s
     """Names, in lower case, of the layers with walls."""
     from fnmatch import fnmatch
 
-    every = {layer.dxf.name.lower(): layer for layer in drawing.layers}
+    every = {name.lower(): is_visible for name, is_visible in _layers(drawing).items()}
     if names is not None:
         found = {layer for layer in every if any(fnmatch(layer, name.lower()) for name in names)}
         if not found:
             raise MapError(f"wall_layers = {shown(names)} are none of path = '{path}': it has {_listed(drawing)}.")
         return found
-    visible = {name for name, layer in every.items() if layer.is_on() and not layer.is_frozen()}
+    visible = {name for name, is_visible in every.items() if is_visible}
     found = {name for name in visible if WALL_NAMES.search(name) and not NO_WALL_NAMES.search(name)}
     if not found:
         message = f"path = '{path}' has no layer whose name looks like walls, so all lines are walls"
@@ -226,9 +238,9 @@ def _curves(entity: Any) -> Iterator[Any]:
     from ezdxf.path import from_hatch, make_path
 
     for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:
-        if len(path):
-            size = max(path.bbox().size.x, path.bbox().size.y) if hasattr(path, "bbox") else 0.0
-            yield path.flattening(max(size, 1e-9) * FLAT_M / 4, segments=4)
+        corners = np.array([(corner.x, corner.y) for corner in path.control_vertices()])
+        if len(corners) > 1:
+            yield path.flattening(max(FLAT_FRACTION * float(np.ptp(corners, axis=0).max()), 1e-9), segments=4)
 
 
 def _unit(path: Path, drawing: Any, segments: Segments) -> float:

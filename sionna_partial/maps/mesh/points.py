@@ -53,17 +53,21 @@ FLOOR_FRACTION = 0.3
 SLAB_M = 0.5
 """Height up to which consecutive full layers are a floor or ceiling, not a cloud of walls alone [m]."""
 
-LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.3, 0.15
+LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
 """Height from which a layer may be the ceiling; heights below the floor and above the ceiling that count [m]."""
 
 WALL_FRACTION = 0.25
 """Of the layers of the height band that its fuller cells (90 %) have, the fraction that makes a wall."""
 
-THIN_FRACTION = 0.4
-"""Cells with less than this fraction of the points of a cell beside them hold the noise of its wall."""
+THIN_FRACTION = 0.5
+"""Cells with certainly less than this fraction of the points of a cell beside them hold the noise of its wall."""
+
+WINDOW_M, STRAY_FRACTION = 0.35, 0.2
+"""Edge of the squares in which floor cells are counted [m]; fraction of the usual number up to which they stray."""
 
 GAP_M, HOLE_M2 = 0.15, 1.0
-"""Half the width of gaps, and size of holes, in a scanned floor that are closed unless walls bound them."""
+"""Half the width of gaps, and size of holes, in a scanned floor that are closed unless walls bound them; size of areas
+of their own that are not free."""
 
 POSE_M = 0.25
 """Sensor positions closer to one another than this are one [m]."""
@@ -150,7 +154,7 @@ def read_cloud(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike |
         with closing(parts):
             try:
                 return _cloud_map(f"path = '{path}'", parts, reading, sensor_positions_m)
-            except MapError:
+            except (MapError, MapWarning):
                 raise
             except Exception as error:  # decoders fail in many ways on damaged files
                 reason = " ".join(str(error).split())[:200] or type(error).__name__
@@ -261,7 +265,7 @@ def _cloud_map(
     voxels, count = _occupied_voxels(what, parts, cell, reading.up)
     size = np.array([cell, cell, LAYER_M])
     bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
-    require_metres(what, bounds, reading.height_band_m)
+    require_metres(what, bounds - [[0.0], [1.0]] * size, reading.height_band_m)
     if reading.up is None and _looks_y_up(voxels, bounds):
         message = f'{what} looks as if y pointed up: give up="y" to turn it, or up="z" to read it as it is.'
         warnings.warn(message, MapWarning, stacklevel=4)
@@ -275,13 +279,14 @@ def _cloud_map(
     seen = np.zeros(empty.shape, dtype=np.bool_)
     storey = (z > floor_m - BELOW_FLOOR_M) & (z < (math.inf if ceiling_m is None else ceiling_m + ABOVE_CEILING_M))
     seen[row[storey], column[storey]] = True
-    free = _closed(seen & ~wall, wall, cell)
+    seen &= ~ndimage.binary_dilation(wall, np.ones((3, 3)))  # noise of walls is on both of their sides
+    free = _closed(_without_strays(seen, cell), wall, cell)
     if sensors is not None:
         edge = (free | wall) & ndimage.binary_dilation(~(free | wall))
         _see_through(wall, np.argwhere(edge), (sensors - empty.origin_m) / cell, free)
     known = free | wall if reading.observed is None else observed_cells(empty, reading.observed)
     state = np.where(known, np.where(wall, CellState.WALL, CellState.FREE), CellState.UNKNOWN).astype(np.uint8)
-    state[narrow_areas(state == CellState.FREE, cell)] = CellState.UNKNOWN
+    state[_enclosed(state == CellState.FREE, cell)] = CellState.UNKNOWN
     height_m = DEFAULT_WALL_HEIGHT_M if ceiling_m is None else ceiling_m - floor_m
     return replace(empty, state=state, wall_height_m=round(height_m, 2))
 
@@ -347,15 +352,15 @@ def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, 
     if not len(cell):
         return layers > 0
     fuller = np.quantile(layers[layers > 0], 0.9)
-    least = THIN_FRACTION * ndimage.maximum_filter(points, 3)
-    return np.asarray((layers >= max(1, math.ceil(WALL_FRACTION * fuller))) & (points >= least))
+    most = points + 2 * np.sqrt(points)  # of a cell with this many points on average
+    is_noise = most < THIN_FRACTION * ndimage.maximum_filter(points, 3)
+    return np.asarray((layers >= max(1, math.ceil(WALL_FRACTION * fuller))) & ~is_noise)
 
 
 def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | None) -> tuple[float, float | None]:
     """Heights of the floor below a band, the lowest by default, and of the ceiling above it, if there is one [m]."""
     first = int(layer.min())
-    cells = np.bincount(layer - first)
-    pairs = cells + np.append(cells[1:], 0)  # what is flat and measured is spread over two layers
+    pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # what is flat and measured is spread over two layers
     full = np.nonzero(pairs >= FLOOR_FRACTION * pairs.max())[0]
     runs = np.split(full, np.nonzero(np.diff(full) > 1)[0] + 1)
     slabs_m = [(run[np.argmax(pairs[run])] + first + 1) * LAYER_M for run in runs if len(run) * LAYER_M <= SLAB_M]
@@ -368,8 +373,17 @@ def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | N
 def _looks_y_up(voxels: NDArray[np.int64], bounds: NDArray[np.float64]) -> bool:
     """Whether the cloud is lowest along y, yet as high as a room, and its fullest layers lie across y, not z."""
     x, y, z = np.ptp(bounds, axis=0)
-    fullest = [np.bincount(voxels[:, axis] - voxels[:, axis].min()).max() for axis in (1, 2)]
+    layers = [np.bincount(voxels[:, axis] - voxels[:, axis].min()) for axis in (1, 2)]
+    fullest = [np.convolve(cells, (1, 1)).max() for cells in layers]
     return bool(LOWEST_CEILING_M <= y < min(x, z) and fullest[0] > fullest[1])
+
+
+def _without_strays(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+    """Leave out cells that have few others around them."""
+    size = 2 * round(WINDOW_M / cell_m / 2) + 1
+    around = ndimage.uniform_filter(free.astype(np.float32), size, mode="constant")
+    usual = np.quantile(around[free], 0.9) if free.any() else 0.0
+    return np.asarray(free & (around >= STRAY_FRACTION * usual))
 
 
 def _closed(free: NDArray[np.bool_], wall: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
@@ -386,6 +400,13 @@ def _closed(free: NDArray[np.bool_], wall: NDArray[np.bool_], cell_m: float) -> 
     beside = [ndimage.sum_labels(side[1:-1, 1:-1], hole, labels) for side in (_beside(wall), _beside(closed))]
     small = (area_m2 <= HOLE_M2) & (beside[0] < beside[1]) & (labels > 0)
     return closed | small[hole]
+
+
+def _enclosed(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+    """Cells of free areas that are narrow or small, as within walls, pillars and shelves."""
+    area, count = ndimage.label(free)
+    small = np.bincount(area.ravel(), minlength=count + 1) * cell_m**2 < HOLE_M2
+    return narrow_areas(free, cell_m) | (free & small[area])
 
 
 def _beside(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
