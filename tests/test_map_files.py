@@ -26,7 +26,7 @@ from sionna_partial.maps.map_files import (
     map_from_slam,
     save_map,
 )
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.settings import Material
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
@@ -294,6 +294,32 @@ def test_array_row_0_is_the_smallest_y() -> None:
     assert partial.state_at(np.array([10.6, 20.1])) == WALL
 
 
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (
+            np.zeros((40, 30)),
+            r"home.npz' has 1,200 free cells and no wall, so that nothing obstructs or reflects: look",
+        ),
+        (
+            np.eye(40) == 0,
+            r"home.npz' has 1,560 wall cells and 40 free ones, as if inverted: look at its states, and at",
+        ),
+    ],
+)
+def test_odd_states(tmp_path: Path, state: np.ndarray, message: str) -> None:
+    save_map(PartialMap(state.astype(int), 0.1), tmp_path / "home.npz")
+    with pytest.warns(MapWarning, match=message):
+        load_map(tmp_path / "home.npz")
+
+
+@pytest.mark.parametrize("name", ["coverage.nc", "coverage.tif"])
+def test_coverage_is_no_map(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(MapError, match=f"{name}' is a coverage, no map: give the map that it was computed from"):
+        load_map(tmp_path / name)
+
+
 def test_occupancy_grid() -> None:
     data = [[-1, 0, 25], [26, 64, 65], [100, 50, 255]]
     partial = map_from_occupancy(data, 0.1, origin_m=(1.0, 2.0))
@@ -373,6 +399,7 @@ FUNCTIONS = {
         ("array", (3,), {}, "array has shape (): give a two-dimensional array"),
         ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
         ("array", ([[-1, 0]],), {}, "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ("array", ([[-1, 0, 100]],), {}, "UNKNOWN 2, or map_from_occupancy for -1 to 100 percent."),
         ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
         ("occupancy", ([[-2]],), {}, "data holds -2: give -1 for unknown"),
         ("occupancy", ([[0.5]],), {}, "data has dtype float64: give integers"),

@@ -129,6 +129,22 @@ def test_scene_choices() -> None:
         SceneSettings(outline="walls")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("frequency_hz", "end"),
+    [
+        (28, " Did you mean 28e9?"),
+        (3.5, " Did you mean 3.5e9?"),
+        (3500, " Did you mean 3500e6?"),
+        (0, "."),
+        (2e12, "]."),
+    ],
+)
+def test_frequency_in_another_unit(frequency_hz: float, end: str) -> None:
+    with pytest.raises(SettingsError, match=re.escape("is not allowed: give a number in [1e+06, 1e+12].")) as error:
+        TraceSettings(frequency_hz=frequency_hz)
+    assert str(error.value).endswith(end)
+
+
 def test_itu_names() -> None:
     assert {Material(itu=name).itu for name in ITU_BANDS_GHZ} == set(ITU_BANDS_GHZ)
     with pytest.raises(SettingsError, match="itu = 'cheese' is not allowed: choose one of vacuum, concrete, brick, "):

@@ -7,7 +7,7 @@ import pytest
 from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET
 
-from sionna_partial.errors import OutputError, PredictorError, SettingsError
+from sionna_partial.errors import OutputError, PredictorError, PredictorWarning, SettingsError
 from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.evaluation.metrics import measure
@@ -96,7 +96,8 @@ class TestTrain:
     def test_networks_that_see_where_links_run(self):
         table, calls = make_table(homes=3, links=60, stages=(0,)), []
         settings = dataclasses.replace(UNTRAINED, networks="map", passes=1)
-        seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
+        with pytest.warns(PredictorWarning, match="'map' are trained on 2 homes, fewer than 20, and may be worse than"):
+            seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
         assert seeing.predictor.settings == settings
         assert {"near_map_network", "far_map_network", "link_network"} <= set(seeing.predictor.model.output)
         assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")

@@ -27,8 +27,8 @@ DRAWING_SUFFIXES = (".dxf",)
 MAX_DRAWING_BYTES = 100_000_000
 """Largest drawing that is read [bytes]."""
 
-MAX_PARTS, MAX_NESTING = 1_000_000, 16
-"""Most entities and pieces of lines, blocks resolved, and most blocks within blocks."""
+MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 200_000, 16
+"""Most pieces of lines, most blocks and entities in them, and most blocks within blocks."""
 
 WALL_NAMES = re.compile(
     r"wall|wand|wänd|mauer|mur(?!al)|pared|parete|vägg|vegg|muur|sciana|ściana|стен|colum|pillar|s-cols|stütze|partition|"
@@ -200,10 +200,12 @@ def _wall_layers(path: Path, drawing: Any, names: Sequence[str] | None) -> set[s
 def _segments(path: Path, drawing: Any, layers: set[str]) -> Segments:
     """Pieces of lines on some layers of the model space, in units of the drawing."""
     pieces: list[tuple[float, float, float, float]] = []
-    too_many = f"path = '{path}' has more than {MAX_PARTS:,} entities and pieces of lines: purge its blocks, or explode"
-    for count, entity in enumerate(_entities(drawing.modelspace(), "", MAX_NESTING)):
-        if count + len(pieces) > MAX_PARTS:
-            raise MapError(f"{too_many} the walls alone into a drawing.")
+    parts = 0
+    for entity in _entities(drawing.modelspace(), "", MAX_NESTING):
+        parts += entity is None or entity.is_virtual
+        if parts > MAX_PARTS or len(pieces) > MAX_PIECES:
+            what = f"{MAX_PARTS:,} entities in blocks, or {MAX_PIECES:,} pieces of lines"
+            raise MapError(f"path = '{path}' has more than {what}: save the walls alone, exploded, as a drawing.")
         if entity is not None and entity.dxf.layer.lower() in layers and entity.dxftype() in _LINES:
             for corners in _curves(entity):
                 points = np.array([(corner.x, corner.y) for corner in corners], dtype=np.float64).reshape(-1, 2)
@@ -246,10 +248,11 @@ def _curves(entity: Any) -> Iterator[Any]:
 def _unit(path: Path, drawing: Any, segments: Segments) -> float:
     """Length of a unit of a drawing [m]."""
     from ezdxf import units
+    from ezdxf.enums import InsertUnits
 
     code = drawing.header.get("$INSUNITS", 0)
     if code in range(1, 25):
-        return float(units.conversion_factor(units.InsertUnits(code), units.InsertUnits.Meters))
+        return float(units.conversion_factor(InsertUnits(code), InsertUnits.Meters))
     size = float(np.ptp(segments.reshape(-1, 2), axis=0).max())
     found = [unit for unit in UNITS_M if PLAUSIBLE_M[0] <= size * unit <= PLAUSIBLE_M[1]]
     what = f"path = '{path}' has no unit ($INSUNITS = {code}), and walls of {size:g} units"

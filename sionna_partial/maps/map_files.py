@@ -23,7 +23,7 @@ from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, MeshReading, me
 from sionna_partial.maps.mesh.files import MAX_MESH_BYTES, MESH_SUFFIXES, read_mesh, read_mitsuba_scene
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
 from sionna_partial.maps.mesh.points import POINT_SUFFIXES, is_cloud, read_cloud
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
 from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
 from sionna_partial.settings import Material
 
@@ -37,6 +37,9 @@ ACCEPTED = (
 
 _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
 """Size of the largest array of a mesh [bytes]."""
+
+COVERAGE_SUFFIXES = (".nc", ".tif", ".tiff")
+"""Formats of coverage files."""
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
 """Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
@@ -55,7 +58,7 @@ def load_map(
     resolution_m: float | None = None,
     up: str | None = None,
 ) -> PartialMap:
-    """Read a map from a file or a scene folder.
+    """Read a map from a file or a folder.
 
     A mesh is laid on cells: observed cells in which it has a surface in the height band are walls, other observed
     cells are free. The map carries the mesh itself, cut at the border of its known cells seen from above.
@@ -65,7 +68,9 @@ def load_map(
     path : path-like
         A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image); an `.npz` of `save_map`; an
         exported scene: its folder or its `scene.xml`; a mesh in metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene
-        of meshes, with the radio materials of Sionna RT: its `.xml`, or a folder with one.
+        of meshes, with the radio materials of Sionna RT: its `.xml`, or a folder with one; a point cloud in metres
+        (PCD, PLY, LAS, LAZ, XYZ, PTS; see `map_from_points`); a floor plan (DXF; see `map_from_drawing`); or a rosbag
+        (.bag, .mcap, .db3, or a folder; see `map_from_bag`).
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
@@ -74,14 +79,16 @@ def load_map(
         Wall height [m] in place of the file's. For a mesh, the height above its lowest point up to which radios may
         be (by default its highest point), as on roofs.
     height_band_m : (float, float) or None
-        World z between which a surface of a mesh is a wall [m]. By default `DEFAULT_BAND_M` above its lowest point.
+        World z between which a surface of a mesh, or a point of a cloud, is a wall [m]. By default `DEFAULT_BAND_M`
+        above the lowest point, of a cloud above its lowest floor.
     observed : (M, 2) array-like, PartialMap or None
         What has been observed of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it
         is. By default all cells above or below which the mesh has a surface.
     resolution_m : float or None
-        Edge of the cells of a mesh's map [m], 0.05 by default. They lie on multiples of it.
+        Edge of the cells of the map of a mesh, cloud or drawing [m], 0.05 by default. They lie on multiples of it.
     up : {"z", "y"} or None
-        Axis of a mesh file that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB files.
+        Axis of a mesh or cloud that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB
+        files.
 
     Returns
     -------
@@ -96,7 +103,8 @@ def load_map(
         given and it is none.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}.")
+        makers = "make a map of an array with map_from_array or map_from_occupancy, of points with map_from_points"
+        raise MapError(f"path = {shown(path)} is not a path: {makers}, or give {ACCEPTED}.")
     require(isinstance(strict, bool), "strict", strict, "give True or False.")
     source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
     suffix = source.suffix.lower()
@@ -120,11 +128,15 @@ def load_map(
             partial = read_ros_map(source, strict=strict)
         elif suffix == ".npz":
             partial = _read_npz(source)
+        elif suffix in COVERAGE_SUFFIXES:
+            remedy = "give the map that it was computed from; xarray.open_dataset reads a coverage (.nc)."
+            raise MapError(f"path = '{source}' is a coverage, no map: {remedy}")
         elif suffix in (".pgm", ".png", ".bmp"):
             remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
             raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
         else:
             raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+    warn_of_odd_states(f"path = '{source}'", partial)
     if wall_height_m is None:
         return partial
     partial = replace(partial, wall_height_m=wall_height_m)

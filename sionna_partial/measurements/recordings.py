@@ -130,7 +130,7 @@ def measurements_from_bag(
         powers = np.array([_power(each, field, topic) for each in messages])
         stamped = bool(messages) and all(each.stamp_s for each in messages)
         track = _robot_track(recording, pose_topic, frame, stamped=stamped)
-        start_s = messages[0].stamp_s - messages[0].time_s if stamped else 0.0
+        start_s = (messages[0].stamp_s or 0.0) - messages[0].time_s if stamped else 0.0
     times_s = np.array([each.stamp_s if stamped else each.time_s for each in messages], dtype=np.float64)
     first_s, last_s = track.time_s[[0, -1]]
     used = np.isfinite(powers) & (times_s >= first_s) & (times_s <= last_s)

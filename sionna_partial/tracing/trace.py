@@ -344,9 +344,7 @@ def checked_positions(
     tx_m = partial.require_positions("tx", tx)
     with suppress(ValueError):  # nested lists of unequal lengths have no size
         rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
-    rx_m = partial.require_positions("rx", rx)
-    if rx_m.ndim != 2:
-        raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
+    rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
     tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
     for source_m in tx_m:
         distance_m = np.linalg.norm(rx_m - source_m, axis=1)

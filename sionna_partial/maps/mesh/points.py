@@ -7,7 +7,6 @@ import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -150,15 +149,13 @@ def read_cloud(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike |
     if f".{kind}" not in (*POINT_SUFFIXES, ".ply"):
         raise MapError(f"path = '{path}' is no point cloud: give one of {', '.join(POINT_SUFFIXES)}, .ply.")
     with open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream:
-        parts = reader(stream)
-        with closing(parts):
-            try:
-                return _cloud_map(f"path = '{path}'", parts, reading, sensor_positions_m)
-            except (MapError, MapWarning):
-                raise
-            except Exception as error:  # decoders fail in many ways on damaged files
-                reason = " ".join(str(error).split())[:200] or type(error).__name__
-                raise MapError(f"path = '{path}' is damaged or no {kind.upper()} ({reason}): {_REMEDY}") from error
+        try:
+            return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m)
+        except (MapError, MapWarning):
+            raise
+        except Exception as error:  # decoders fail in many ways on damaged files
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise MapError(f"path = '{path}' is damaged or no {kind.upper()} ({reason}): {_REMEDY}") from error
 
 
 def is_cloud(path: Path) -> bool:
@@ -169,7 +166,7 @@ def is_cloud(path: Path) -> bool:
 
 
 def _las(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
-    import laspy
+    import laspy  # type: ignore[import-untyped]
 
     with laspy.open(stream, closefd=False) as reader:
         count = 0
@@ -180,7 +177,7 @@ def _las(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
 
 
 def _pcd(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
-    from pypcd4 import MetaData, PointCloud
+    from pypcd4.pypcd4 import MetaData, PointCloud
 
     lines = [line.decode("ascii").strip() for line in itertools.takewhile(_before_data(), stream)]
     header = MetaData.parse_header([line for line in lines if line and not line.startswith("#")])
