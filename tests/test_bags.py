@@ -174,6 +174,7 @@ class TestPowers:
             ({"topic": "/power"}, "has no message topic '/power': name one of its topics: /amcl_pose (PoseStamped)"),
             ({"field": "rssi"}, "field = 'rssi' is no number in the messages of /rssi: give one of data."),
             ({"tx_power_dbm": None}, "tx_power_dbm = None is not allowed: give a number of dBm"),
+            ({"rx_height_m": "x"}, "rx_height_m = 'x' is not allowed: give a number of metres"),
             ({"tx_power_dbm": -80}, "is not allowed: path gains are negative; give minus the path loss"),
             ({"tx": (1, 2)}, "tx has shape (2,) for 20 gains"),
         ],

@@ -93,11 +93,17 @@ class TestTrain:
         assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
         assert "paper" not in run.predictor.metrics["exploration_steps"]["0"]
 
+    def test_few_homes(self, table):
+        with pytest.raises(
+            PredictorWarning, match="'map' are trained on 5 homes, fewer than 20, and may be worse than"
+        ):
+            train(table, test_fraction=0.0, settings=PredictorSettings("map"))
+
+    @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
     def test_networks_that_see_where_links_run(self):
         table, calls = make_table(homes=3, links=60, stages=(0,)), []
         settings = dataclasses.replace(UNTRAINED, networks="map", passes=1)
-        with pytest.warns(PredictorWarning, match="'map' are trained on 2 homes, fewer than 20, and may be worse than"):
-            seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
+        seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
         assert seeing.predictor.settings == settings
         assert {"near_map_network", "far_map_network", "link_network"} <= set(seeing.predictor.model.output)
         assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")

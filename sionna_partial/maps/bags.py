@@ -94,7 +94,7 @@ class Recording:
 
 def is_recording(path: Path) -> bool:
     """Whether a path is a rosbag by its name, or a folder of ROS 2."""
-    return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in BAG_SUFFIXES or os.path.isfile(path / "metadata.yaml")
 
 
 @contextmanager
@@ -106,7 +106,7 @@ def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]
     if not isinstance(path, str | os.PathLike):
         raise error(f"path = {shown(path)} is not a path: give a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder).")
     source = Path(path)
-    for file in source.iterdir() if source.is_dir() else [source]:
+    for file in source.iterdir() if os.path.isdir(source) else [source]:
         open_regular(file, "path", error, MAX_BAG_BYTES).close()
     store = Stores.ROS1_NOETIC if source.suffix.lower() == ".bag" else Stores.LATEST
     try:

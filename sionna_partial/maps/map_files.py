@@ -103,8 +103,8 @@ def load_map(
         given and it is none.
     """
     if not isinstance(path, (str, os.PathLike)):
-        makers = "make a map of an array with map_from_array or map_from_occupancy, of points with map_from_points"
-        raise MapError(f"path = {shown(path)} is not a path: {makers}, or give {ACCEPTED}.")
+        makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
+        raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}. {makers}")
     require(isinstance(strict, bool), "strict", strict, "give True or False.")
     source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
     suffix = source.suffix.lower()
@@ -136,7 +136,8 @@ def load_map(
             raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
         else:
             raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
-    warn_of_odd_states(f"path = '{source}'", partial)
+    if partial.mesh is None:
+        warn_of_odd_states(f"path = '{source}'", partial)
     if wall_height_m is None:
         return partial
     partial = replace(partial, wall_height_m=wall_height_m)

@@ -46,6 +46,9 @@ MAX_IMAGE_BYTES = 16 * MAX_CELLS
 DARK_OCCUPANCY = 0.51
 """Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
 
+FEW_DARK = 100
+"""Number of dark grey pixels up to which nothing is said."""
+
 MAX_YAW_RAD = 6.2832
 """Largest yaw of a map's origin: one turn, as people round it; more is meant in degrees [rad]."""
 
@@ -375,7 +378,8 @@ def _warn_of_dark_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _She
     full = 255 * pixels.per_shade + pixels.opaque
     occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
     dark = (state == CellState.UNKNOWN) & (occupancy > DARK_OCCUPANCY)
-    if sheet.mode == "raw" or dark.sum() <= (state == CellState.WALL).sum():
+    dark &= True if pixels.alpha is None else pixels.alpha > 0
+    if sheet.mode == "raw" or dark.sum() <= max((state == CellState.WALL).sum(), FEW_DARK):
         return
     lowest = float(occupancy[dark].min())
     what = f"{int(dark.sum()):,} dark grey cells (occupancy from {lowest:.2f}) are read as unknown"

@@ -122,9 +122,9 @@ def measurements_from_bag(
     """
     import xarray as xr
 
-    offset_db = number_of(tx_power_dbm)
-    if not math.isfinite(offset_db):
-        raise MeasurementError(f"tx_power_dbm = {shown(tx_power_dbm)} is not allowed: give a number of dBm.")
+    for name, value, unit in (("tx_power_dbm", tx_power_dbm, "dBm"), ("rx_height_m", rx_height_m, "metres")):
+        if not math.isfinite(number_of(value)):
+            raise MeasurementError(f"{name} = {shown(value)} is not allowed: give a number of {unit}.")
     with open_recording(path, MeasurementError) as recording:
         messages = [*recording.messages(recording.topic_of(topic, ()))]
         powers = np.array([_power(each, field, topic) for each in messages])
@@ -145,7 +145,7 @@ def measurements_from_bag(
         warnings.warn(f"{message}; they are left out.", MapWarning, stacklevel=2)
     rx = track.at(times_s[used]).position_m
     rx[:, 2] = rx_height_m
-    measured = Measurements(tx, rx, powers[used] - offset_db)  # type: ignore[arg-type]
+    measured = Measurements(tx, rx, powers[used] - tx_power_dbm)  # type: ignore[arg-type]
     columns = {f"{end}_{axis}": getattr(measured, end)[:, at] for end in ("tx", "rx") for at, axis in enumerate("xyz")}
     columns |= {"gain_db": measured.gain_db, "time_s": times_s[used] - start_s}
     return xr.Dataset({name: ("link", values) for name, values in columns.items()})

@@ -5,6 +5,7 @@ import itertools
 import math
 import os
 import re
+import struct
 import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -168,12 +169,29 @@ def is_cloud(path: Path) -> bool:
 def _las(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
     import laspy  # type: ignore[import-untyped]
 
-    with laspy.open(stream, closefd=False) as reader:
-        count = 0
+    with laspy.open(stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        count, header = 0, reader.header
+        if header.are_points_compressed:
+            _require_chunks(stream, header.offset_to_point_data, header.point_count)
         for part in reader.chunk_iterator(PART):
             count += len(part)
             yield np.column_stack([part.x, part.y, part.z])
-        _require_count(count, reader.header.point_count)
+        _require_count(count, header.point_count)
+
+
+def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
+    """Raise a ValueError for a LAZ whose table of chunks cannot be right: lazrs ends the process where memory fails."""
+    here, size = stream.tell(), os.fstat(stream.fileno()).st_size
+    stream.seek(start)
+    (table,) = struct.unpack("<q", stream.read(8))
+    if table == -1:  # written at the end, by those who cannot seek
+        stream.seek(size - 8)
+        (table,) = struct.unpack("<q", stream.read(8))
+    stream.seek(table)
+    _, chunks = struct.unpack("<II", stream.read(8))
+    if chunks > min(points, size - table):
+        raise ValueError(f"its table has {chunks} chunks for {points} points")
+    stream.seek(here)
 
 
 def _pcd(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
