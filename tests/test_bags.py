@@ -241,7 +241,7 @@ class TestMessages:
 class TestDamage:
     @pytest.mark.parametrize("name", KINDS)
     def test_every_truncation(self, tmp_path: Path, name: str) -> None:
-        bag = write_bag(tmp_path / name, [("/map", 0.0, messages_of(name).grid([[0] * 50] * 50))])
+        bag = write_bag(tmp_path / name, [("/map", 0.0, messages_of(name).grid([[100] * 50, *([[0] * 50] * 49)]))])
         for file in [bag] if bag.is_file() else list(bag.iterdir()):
             content = file.read_bytes()
             for size in range(0, len(content), len(content) // 12 + 1):

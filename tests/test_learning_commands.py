@@ -104,6 +104,7 @@ class TestDataset:
 
 
 class TestTrain:
+    @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
     @pytest.mark.parametrize("networks", ["paper", "map"])
     def test_what_it_writes_and_says(self, networks: str, dataset: Path, tmp_path: Path) -> None:
         out = tmp_path / "run"
