@@ -48,7 +48,9 @@ def require_number(name: str, value: object, low: float, high: float, *, open_lo
     """Raise a SettingsError unless `value` is a finite number in [low, high], or (low, high] with `open_low`."""
     number = number_of(value)
     inside = (low < number if open_low else low <= number) and number <= high
-    require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].")
+    meant = next((f"{number:g}e{power}" for power in (9, 6) if low <= number * 10**power <= high), None)
+    hint = f" Did you mean {meant}?" if name.endswith("_hz") and 1 <= number < low and meant else ""
+    require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].{hint}")
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> None:

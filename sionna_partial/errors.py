@@ -40,5 +40,9 @@ class OutputError(SionnaPartialError, OSError):
     """An output that could not be written; nothing half written is left behind."""
 
 
+class PredictorWarning(UserWarning):
+    """A predictor that is probably worse than a simpler one."""
+
+
 class BackendError(SionnaPartialError, RuntimeError):
     """A native library (LLVM, Sionna RT) that is missing or does not work."""

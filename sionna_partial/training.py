@@ -1,6 +1,7 @@
 """Train a predictor on some homes of a data set and measure it on the others: data set -> TrainingRun."""
 
 import json
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from sionna_partial.checks import Progress, require_number, settings_or_default
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like, settings_for
 from sionna_partial.display import Shown
-from sionna_partial.errors import PredictorError
+from sionna_partial.errors import PredictorError, PredictorWarning
 from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import Evaluation, evaluate
 from sionna_partial.files import atomic_files, atomic_write
@@ -21,6 +22,9 @@ from sionna_partial.settings import PredictorSettings
 PREDICTOR_FILE, SPLIT_FILE = "predictor.keras", "split.json"
 
 TEST_FRACTION = 0.3
+
+FEW_HOMES = 20
+"""Number of training homes below which the networks "map" may be worse than the distance alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +96,8 @@ def train(
     test_fraction : float
         Fraction of the homes that is kept for testing, in [0, 1).
     settings : PredictorSettings, optional
-        Networks "map" by default. Frequency and diffraction must be those of the data set, and are by default; the seed
-        splits the homes, too.
+        Networks "map" by default, with a `PredictorWarning` on fewer than 20 homes. Frequency and diffraction must be
+        those of the data set, and are by default; the seed splits the homes, too.
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
         terminals and notebooks after 2 s.
@@ -126,6 +130,10 @@ def train(
     train_homes, test_homes = split_homes(list(dict.fromkeys(map(str, table.home))), test_fraction, settings.seed)
     links = table.take(np.isin(table.home, train_homes))
     indoors, unsure = links.take(~links.anywhere), links.take(links.anywhere & ~links.context.rx_seen)
+    if settings.networks == "map" and len(train_homes) < FEW_HOMES:
+        what = f"the networks 'map' are trained on {len(train_homes)} homes, fewer than {FEW_HOMES}"
+        remedy = "choose the networks 'paper' (PredictorSettings('paper'), --networks paper), or make more homes."
+        warnings.warn(f"{what}, and may be worse than the distance alone: {remedy}", PredictorWarning, stacklevel=2)
     with reporting(progress) as report:
         report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
         predictor = Predictor.fit(

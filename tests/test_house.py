@@ -24,7 +24,10 @@ ROOMS = {
         *("constants", "errors", "checks", "display", "progress", "settings", "resources"),
         *("process", "files", "planar", "cores", "llvm"),
     ),
-    "maps": (*("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.files", "ros_map", "map_files"),),
+    "maps": (
+        *("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.points", "mesh.files", "ros_map"),
+        *("drawings", "bags", "map_files"),
+    ),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
@@ -37,7 +40,7 @@ ROOMS = {
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
-    "measurements": ("measurements", "assimilation"),
+    "measurements": ("measurements", "recordings", "assimilation"),
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
@@ -67,7 +70,7 @@ IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit", "bokeh"}
 
 HEAVY = IN_FUNCTIONS | {
     *("numpy", "scipy", "numba", "skimage", "shapely", "trimesh", "matplotlib", "xarray", "rasterio", "h5netcdf"),
-    *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed"),
+    *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed", "rosbags", "ezdxf", "laspy", "pypcd4"),
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
 

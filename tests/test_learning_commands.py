@@ -104,6 +104,7 @@ class TestDataset:
 
 
 class TestTrain:
+    @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
     @pytest.mark.parametrize("networks", ["paper", "map"])
     def test_what_it_writes_and_says(self, networks: str, dataset: Path, tmp_path: Path) -> None:
         out = tmp_path / "run"
@@ -174,7 +175,9 @@ class TestEvaluate:
     def test_unknown_predictor(self, dataset: Path, tmp_path: Path) -> None:
         result = run("evaluate", dataset, "--predictor", "nobody", "--out", tmp_path / "report")
         assert result.exit_code == 2
-        assert result.stderr.strip().endswith("error: path = 'nobody' is no predictor: give the path of a .keras file.")
+        assert result.stderr.strip().endswith(
+            "error: path = 'nobody' is no predictor: give 'map' or 'paper', or the path of a .keras file."
+        )
 
     def test_trained_on_all_homes(self, dataset: Path, tmp_path: Path) -> None:
         trained = run("train", dataset, "--out", tmp_path / "run", "--test-fraction", 0, "--networks", "paper")

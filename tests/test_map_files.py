@@ -18,15 +18,15 @@ from meshes import OBSERVED, room, surface_m2
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
+from sionna_partial.maps.bags import map_from_occupancy
 from sionna_partial.maps.map_files import (
     load_map,
     map_from_array,
     map_from_habitat,
-    map_from_occupancy,
     map_from_slam,
     save_map,
 )
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.settings import Material
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
@@ -214,10 +214,10 @@ def test_npz_with_a_damaged_mesh(tmp_path: Path, room_file: Path, name: str) -> 
 def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     save_map(SMALL, tmp_path / "home.npz")
     folder = export(tmp_path / "scene")
-    with pytest.raises(MapError, match=r"resolution_m is for meshes alone, but path = '.*home.npz' is no mesh: leave"):
+    with pytest.raises(MapError, match=r"resolution_m is for scans alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
     with pytest.raises(
-        MapError, match=r"up is for meshes alone, but path = '.*' is an exported map \(remove its map.yam"
+        MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its map.yam"
     ):
         load_map(folder, up="z")
 
@@ -295,6 +295,32 @@ def test_array_row_0_is_the_smallest_y() -> None:
     partial = map_from_array([[0, 1], [2, 2]], 0.5, origin_m=(10.0, 20.0), wall_height_m=2.5)
     assert partial == PartialMap(np.array([[0, 1], [2, 2]]), 0.5, (10.0, 20.0), 2.5)
     assert partial.state_at(np.array([10.6, 20.1])) == WALL
+
+
+@pytest.mark.parametrize(
+    ("state", "message"),
+    [
+        (
+            np.zeros((40, 30)),
+            r"home.npz' has 1,200 free cells and no wall, so that nothing obstructs or reflects: look",
+        ),
+        (
+            np.eye(40) == 0,
+            r"home.npz' has 1,560 wall cells and 40 free ones, as if inverted: look at its states, and at",
+        ),
+    ],
+)
+def test_odd_states(tmp_path: Path, state: np.ndarray, message: str) -> None:
+    save_map(PartialMap(state.astype(int), 0.1), tmp_path / "home.npz")
+    with pytest.warns(MapWarning, match=message):
+        load_map(tmp_path / "home.npz")
+
+
+@pytest.mark.parametrize("name", ["coverage.nc", "coverage.tif"])
+def test_coverage_is_no_map(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(MapError, match=f"{name}' is a coverage, no map: give the map that it was computed from"):
+        load_map(tmp_path / name)
 
 
 def test_occupancy_grid() -> None:
@@ -376,6 +402,7 @@ FUNCTIONS = {
         ("array", (3,), {}, "array has shape (): give a two-dimensional array"),
         ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
         ("array", ([[-1, 0]],), {}, "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
+        ("array", ([[-1, 0, 100]],), {}, "UNKNOWN 2, or map_from_occupancy for -1 to 100 percent."),
         ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
         ("occupancy", ([[-2]],), {}, "data holds -2: give -1 for unknown"),
         ("occupancy", ([[0.5]],), {}, "data has dtype float64: give integers"),

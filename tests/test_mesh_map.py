@@ -209,7 +209,7 @@ def test_other_units_than_metres(factor: float, end: str) -> None:
 
 def test_too_many_cells() -> None:
     large = SceneMesh(ROOM.vertices_m * 1e5, ROOM.triangles, ROOM.material)
-    message = r"resolution_m = 0.05 makes \d+ x \d+ cells of the mesh, more than 100,000,000: give (\d+) or more, check"
+    message = r"resolution_m = 0.05 makes \d+ x \d+ cells, more than 100,000,000: give (\d+) or more, check"
     with pytest.raises(MapError, match=message):
         mesh_map(large, MeshReading())
 
@@ -219,7 +219,7 @@ def test_too_many_cells() -> None:
 )
 def test_for_meshes_alone(given: dict) -> None:  # type: ignore[type-arg]
     (name,) = given
-    with pytest.raises(MapError, match=rf"{name} is for meshes alone, but path = 'a.npz' is none: leave it out\."):
+    with pytest.raises(MapError, match=rf"{name} is for scans alone, but path = 'a.npz' is none: leave it out\."):
         MeshReading(**given).require_unused(Path("a.npz"), "none")
     MeshReading().require_unused(Path("a.npz"), "none")
 

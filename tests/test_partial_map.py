@@ -1,6 +1,7 @@
 """PartialMap: what a robot knows of a floor plan."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -250,6 +251,22 @@ def test_positions_may_be_free_or_unknown() -> None:
 def test_wrong_positions(points: object, message: str) -> None:
     with pytest.raises(PositionError, match=re.escape(message)):
         PLAN.require_positions("tx", points)
+
+
+@pytest.mark.parametrize(
+    ("turn", "hint"),
+    [(np.flipud, "on the map upside down (numpy.flipud)."), (np.transpose, "on the map with rows and columns swapped")],
+)
+def test_turned_arrays(turn: Callable[[np.ndarray], np.ndarray], hint: str) -> None:
+    state = np.full((4, 9), WALL)
+    state[1, 1:8] = state[2, 1] = FREE
+    rx = [(x + 0.5, y, 1.5) for x, y in ((1, 1.5), (4, 1.5), (7, 1.5), (1, 2.5))]
+    assert len(PartialMap(state, 1.0).require_positions("rx", rx)) == 4
+    with pytest.raises(PositionError, match=re.escape(f"All 4 are free {hint}")):
+        PartialMap(turn(state), 1.0).require_positions("rx", rx)
+    with pytest.raises(PositionError, match=r"is (inside a wall|outside the map).*\.$") as error:
+        PartialMap(turn(state), 1.0).require_positions("rx", [*rx, (0.5, 0.5, 1.5)])
+    assert "All" not in str(error.value)
 
 
 @given(states, arrays(np.float64, (5, 3), elements=st.floats(-1.0, 2.0)))

@@ -4,11 +4,14 @@ import re
 import shutil
 from pathlib import Path
 
+import ezdxf
+import laspy
 import matplotlib as mpl
 import numpy as np
 import pytest
 import trimesh
 import typer
+from rosbag_files import START_S, Messages, write_bag
 
 import sionna_partial as sp
 from sionna_partial.cli.app import app
@@ -37,6 +40,29 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
+def write_scans(folder: Path) -> None:
+    """Write the rosbag, the point cloud and the drawing that the blocks read."""
+    make = Messages(1)
+    rows: list[tuple[str, float, object]] = [("/map", 1.0, make.grid([[100, 0, 0, 100]] * 3))]
+    for time_s in range(10):
+        rows.append(("/amcl_pose", time_s, make.pose_stamped(START_S + time_s, 5.0 + 0.2 * time_s, 8.0, 0.0)))
+        rows.append(("/rssi", time_s, make.power(-50.0)))
+    write_bag(folder / "drive.bag", rows)
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform((0, 0, 0), (5, 3, 2.5), (60_000, 3))
+    cloud[:30_000, 2] = np.where(rng.random(30_000) < 0.5, 0.0, 2.5)
+    side = rng.integers(0, 4, 30_000)
+    for number, (axis, value) in enumerate(((0, 0.0), (0, 5.0), (1, 0.0), (1, 3.0))):
+        cloud[30_000:][side == number, axis] = value
+    scan = laspy.create()
+    scan.x, scan.y, scan.z = cloud.T
+    scan.write(folder / "scan.laz")
+    plan = ezdxf.new(units=4)
+    corners = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
+    plan.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "A-WALL-FULL"})
+    plan.saveas(folder / "plan.dxf")
+
+
 @pytest.fixture
 def inputs(tmp_path: Path) -> Path:
     """Folder with the map, the measurements and the scan that the blocks read."""
@@ -46,6 +72,7 @@ def inputs(tmp_path: Path) -> Path:
     trimesh.creation.box((7.0, 5.0, 3.0), transform=trimesh.transformations.translation_matrix((3, 2, 1.5))).export(
         tmp_path / "scan.ply"
     )
+    write_scans(tmp_path)
     partial = sp.load_map(tmp_path / "map.yaml")
     cells = np.argwhere(partial.state == sp.CellState.FREE)
     rx = cells[np.random.default_rng(0).choice(len(cells), 18, replace=False)][:, ::-1] + 0.5

@@ -182,6 +182,18 @@ def test_one_stray_unknown_pixel_does_not_open_the_trap(tmp_path: Path) -> None:
         assert load_state(tmp_path, [[0, 128, 205, 205]], free_thresh=0.25) == [[WALL, 2, 2, 2]]
 
 
+@pytest.mark.parametrize("negate", [False, True])
+def test_dark_grey_walls(tmp_path: Path, negate: bool) -> None:
+    """Dark pixels between the thresholds are unknown; more of them than of walls get a warning."""
+    shades = np.repeat(np.array([[90, 90, 254], [0, 205, 254]], dtype=np.uint8), 60, axis=0)
+    path = write_map(tmp_path, 255 - shades if negate else shades, negate=int(negate))
+    message = r"120 dark grey cells \(occupancy from 0\.65\) are read as unknown: if they are walls, set occupied_thr"
+    with pytest.warns(MapWarning, match=message):
+        assert load_map(path).state[[0, -1]].tolist() == [[WALL, UNKNOWN, FREE], [UNKNOWN, UNKNOWN, FREE]]
+    assert (load_map(path, strict=True).state == UNKNOWN).sum() == 180
+    assert load_state(tmp_path, [[90, 127, 127, 0]] * 150)[0] == [UNKNOWN, UNKNOWN, UNKNOWN, WALL]
+
+
 def test_warning_points_to_the_caller(tmp_path: Path) -> None:
     path = write_map(tmp_path, [[0, 205, 254]], free_thresh=0.25)
     with pytest.warns(MapWarning) as caught:

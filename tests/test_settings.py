@@ -62,7 +62,7 @@ RANGES = {
     (SensorSettings, "missed_wall_fraction"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "field_of_view_deg"): ("(0, 360]", (1e-9, 90, 360.0), (0, -0.1, 360.1)),
     (SensorSettings, "range_m"): ("(0, 100]", (1e-9, 3.2, 100), (0, -0.1, 100.1)),
-    (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28, 1e12), (0, -28e9, 28, 1.1e12)),
+    (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28e9, 1e12), (0, -28e9, 1.1e12)),
     (TraceSettings, "max_depth"): ("[0, 10]", (0, 10), (-1, 11)),
     (TraceSettings, "diffraction_walls"): ("[0, 2]", (0, 2), (-1, 3)),
     (TraceSettings, "samples_per_tx"): ("[1, 100000000]", (1, 10**8), (0, 10**8 + 1)),
@@ -76,8 +76,7 @@ def test_ranges(kind: type, name: str) -> None:
     """Both ends are allowed; each message has the name, the value and what is allowed."""
     span, allowed, refused = RANGES[kind, name]
     for value in allowed:
-        if (name, value) != ("frequency_hz", 28):
-            assert getattr(kind(**{name: value}), name) == value
+        assert getattr(kind(**{name: value}), name) == value
     for value in refused:
         number = "whole number" if name in WHOLE else "number"
         expected = f"{name} = {value!r} is not allowed: give a {number} in {span}."
@@ -127,6 +126,22 @@ def test_scene_choices() -> None:
     expected = "outline = 'walls' is not allowed: choose one of lines, cells."
     with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
         SceneSettings(outline="walls")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "end"),
+    [
+        (28, " Did you mean 28e9?"),
+        (3.5, " Did you mean 3.5e9?"),
+        (3500, " Did you mean 3500e6?"),
+        (0, "."),
+        (2e12, "]."),
+    ],
+)
+def test_frequency_in_another_unit(frequency_hz: float, end: str) -> None:
+    with pytest.raises(SettingsError, match=re.escape("is not allowed: give a number in [1e+06, 1e+12].")) as error:
+        TraceSettings(frequency_hz=frequency_hz)
+    assert str(error.value).endswith(end)
 
 
 def test_itu_names() -> None:

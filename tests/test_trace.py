@@ -286,7 +286,7 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
             r"tx has shape \(1, 1, 3\): give x, y, z in metres, \(3,\) or \(N, 3\)",
         ),
         ((1.0, 1.0, 1.5), [[1.0, 1.0, 1.0], [1.0]], r"rx = .* is not numeric: give x, y, z in metres\."),
-        ((1.0, 1.0, 1.5), (1.0, 1.0, 1.0), r"rx has shape \(3,\): give receivers as \(N, 3\)"),
+        ((1.0, 1.0, 1.5), [[1.0, 1.0]], r"rx has shape \(1, 2\): give x, y, z in metres, \(3,\) or \(N, 3\)"),
         (
             (1.0, 1.0, 1.5),
             [[2.0, 1.0, 1.0], [1.0, 1.005, 1.5]],
@@ -297,6 +297,12 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
 def test_positions_are_checked(tx: object, rx: object, message: str) -> None:
     with pytest.raises(PositionError, match=message):
         trace_links(_room(), tx, rx)  # type: ignore[arg-type]
+
+
+def test_one_receiver() -> None:
+    one, many = (trace_links(_room(), (1.0, 1.0, 1.5), rx) for rx in ((2.0, 1.0, 1.5), [(2.0, 1.0, 1.5)]))
+    np.testing.assert_array_equal(one.gain_db, many.gain_db)
+    assert one.rx.shape == (1, 3)
 
 
 @pytest.mark.parametrize("name", ["trace_settings", "scene_settings"])

@@ -7,7 +7,7 @@ import pytest
 from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET
 
-from sionna_partial.errors import OutputError, PredictorError, SettingsError
+from sionna_partial.errors import OutputError, PredictorError, PredictorWarning, SettingsError
 from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.evaluation.metrics import measure
@@ -93,6 +93,13 @@ class TestTrain:
         assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
         assert "paper" not in run.predictor.metrics["exploration_steps"]["0"]
 
+    def test_few_homes(self, table):
+        with pytest.raises(
+            PredictorWarning, match="'map' are trained on 5 homes, fewer than 20, and may be worse than"
+        ):
+            train(table, test_fraction=0.0, settings=PredictorSettings("map"))
+
+    @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
     def test_networks_that_see_where_links_run(self):
         table, calls = make_table(homes=3, links=60, stages=(0,)), []
         settings = dataclasses.replace(UNTRAINED, networks="map", passes=1)

@@ -10,8 +10,8 @@ from typer.core import TyperCommand
 
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 
-_MAP_HELP = "ROS map_server YAML, exported scene folder, .npz, or mesh."
-_BAND_HELP = "Of a mesh: z between which its surfaces are walls [m]."
+_MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
+_BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
 _MATERIAL_HELP = "ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
 
 Map = Annotated[Path, typer.Argument(metavar="MAP", help=_MAP_HELP, show_default=False)]
@@ -19,7 +19,7 @@ Strict = Annotated[bool, typer.Option("--strict", help="Read the map file to the
 HeightBand = Annotated[
     tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help=_BAND_HELP, show_default=False)
 ]
-Up = Annotated[str | None, typer.Option(metavar="y|z", help="Of a mesh: the axis that points up.", show_default=False)]
+Up = Annotated[str | None, typer.Option(metavar="y|z", help="Of a mesh or cloud: the axis up.", show_default=False)]
 WallHeight = Annotated[
     float | None, typer.Option(help="Height of walls and ceiling [m]. Default: the map's.", show_default=False)
 ]

@@ -17,22 +17,30 @@ from sionna_partial.checks import number_of, require, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import CALIBRATED_FILE, SCENE_FILES, atomic_write, output_path, read_bytes
-from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.bags import BAG_SUFFIXES, is_recording, map_from_bag
+from sionna_partial.maps.drawings import DRAWING_SUFFIXES, map_from_drawing
+from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, MeshReading, mesh_map
 from sionna_partial.maps.mesh.files import MAX_MESH_BYTES, MESH_SUFFIXES, read_mesh, read_mitsuba_scene
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map
-from sionna_partial.maps.ros_map import read_ros_map, states_from_percent, write_ros_map
+from sionna_partial.maps.mesh.points import POINT_SUFFIXES, is_cloud, read_cloud
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
+from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
 from sionna_partial.settings import Material
 
 ACCEPTED = (
     "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), an exported scene (folder or scene.xml), "
     "the folder of a calibration, "
-    f"a Mitsuba scene (folder or .xml), or a mesh ({', '.join(MESH_SUFFIXES)})"
+    f"a Mitsuba scene (folder or .xml), a mesh ({', '.join(MESH_SUFFIXES)}), a point cloud "
+    f"({', '.join(POINT_SUFFIXES)}, .ply), a drawing ({', '.join(DRAWING_SUFFIXES)}), or a rosbag "
+    f"({', '.join(BAG_SUFFIXES)}, or a folder)"
 )
 """What load_map reads."""
 
 _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
 """Size of the largest array of a mesh [bytes]."""
+
+COVERAGE_SUFFIXES = (".nc", ".tif", ".tiff")
+"""Formats of coverage files."""
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
 """Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
@@ -51,7 +59,7 @@ def load_map(
     resolution_m: float | None = None,
     up: str | None = None,
 ) -> PartialMap:
-    """Read a map from a file or a scene folder.
+    """Read a map from a file or a folder.
 
     A mesh is laid on cells: observed cells in which it has a surface in the height band are walls, other observed
     cells are free. The map carries the mesh itself, cut at the border of its known cells seen from above.
@@ -62,7 +70,8 @@ def load_map(
         A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image); an `.npz` of `save_map`; an
         exported scene: its folder or its `scene.xml`; the folder that `sionna-partial calibrate` wrote; a mesh in
         metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene of meshes, with the radio materials of Sionna RT: its
-        `.xml`, or a folder with one.
+        `.xml`, or a folder with one; a point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS; see `map_from_points`); a
+        floor plan (DXF; see `map_from_drawing`); or a rosbag (.bag, .mcap, .db3, or a folder; see `map_from_bag`).
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
@@ -71,14 +80,16 @@ def load_map(
         Wall height [m] in place of the file's. For a mesh, the height above its lowest point up to which radios may
         be (by default its highest point), as on roofs.
     height_band_m : (float, float) or None
-        World z between which a surface of a mesh is a wall [m]. By default `DEFAULT_BAND_M` above its lowest point.
+        World z between which a surface of a mesh, or a point of a cloud, is a wall [m]. By default `DEFAULT_BAND_M`
+        above the lowest point, of a cloud above its lowest floor.
     observed : (M, 2) array-like, PartialMap or None
         What has been observed of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it
         is. By default all cells above or below which the mesh has a surface.
     resolution_m : float or None
-        Edge of the cells of a mesh's map [m], 0.05 by default. They lie on multiples of it.
+        Edge of the cells of the map of a mesh, cloud or drawing [m], 0.05 by default. They lie on multiples of it.
     up : {"z", "y"} or None
-        Axis of a mesh file that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB files.
+        Axis of a mesh or cloud that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB
+        files.
 
     Returns
     -------
@@ -93,27 +104,41 @@ def load_map(
         given and it is none.
     """
     if not isinstance(path, (str, os.PathLike)):
-        raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}.")
+        makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
+        raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}. {makers}")
     require(isinstance(strict, bool), "strict", strict, "give True or False.")
     source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
     suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
-    if os.path.isdir(source) or suffix == ".xml":
+    if suffix in POINT_SUFFIXES or (suffix == ".ply" and is_cloud(source)):
+        partial = read_cloud(source, reading)
+    elif is_recording(source):
+        reading.require_unused(source, "a rosbag")
+        partial = map_from_bag(source)
+    elif os.path.isdir(source) or suffix == ".xml":
         partial = _read_scene(source, reading)
     elif suffix in MESH_SUFFIXES:
         partial = mesh_map(read_mesh(source, up), reading)
+    elif suffix in DRAWING_SUFFIXES:
+        replace(reading, resolution_m=None).require_unused(source, "a drawing")
+        partial = map_from_drawing(source, resolution_m=DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
     else:
-        reading.require_unused(source, "no mesh")
+        reading.require_unused(source, "none")
         if suffix in (".yaml", ".yml"):
             partial = read_ros_map(source, strict=strict)
         elif suffix == ".npz":
             partial = _read_npz(source)
+        elif suffix in COVERAGE_SUFFIXES:
+            remedy = "give the map that it was computed from; xarray.open_dataset reads a coverage (.nc)."
+            raise MapError(f"path = '{source}' is a coverage, no map: {remedy}")
         elif suffix in (".pgm", ".png", ".bmp"):
             remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
             raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
         else:
             raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+    if partial.mesh is None:
+        warn_of_odd_states(f"path = '{source}'", partial)
     if wall_height_m is None:
         return partial
     partial = replace(partial, wall_height_m=wall_height_m)
@@ -219,52 +244,6 @@ def map_from_array(
     False
     """
     return PartialMap(grid_array("array", array, "iub"), resolution_m, origin_m, wall_height_m)
-
-
-def map_from_occupancy(
-    data: ArrayLike,
-    resolution_m: float,
-    *,
-    origin_m: tuple[float, float] = (0.0, 0.0),
-    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
-    occupied_percent: float = 65,
-    free_percent: float = 25,
-) -> PartialMap:
-    """Make a map of a ROS `nav_msgs/OccupancyGrid`.
-
-    Parameters
-    ----------
-    data : (height, width) integers
-        -1 (or 255, its unsigned form) unknown, else the occupancy in percent, 0 to 100: the message's `data`,
-        reshaped to `(info.height, info.width)`. Row 0 holds the smallest y, as ROS has it.
-    resolution_m : float
-        The message's `info.resolution` [m].
-    origin_m : (float, float)
-        x and y of the message's `info.origin` [m]; its orientation has to be the identity.
-    wall_height_m : float
-        Height of walls and ceiling [m].
-    occupied_percent, free_percent : float
-        From this value a cell is wall; up to this value it is free (the defaults of nav2's map_saver).
-
-    Returns
-    -------
-    PartialMap
-
-    Raises
-    ------
-    MapError
-        For other values, or a number out of range.
-    """
-    values = grid_array("data", data, "iu")
-    outside = ((values < -1) | (values > 100)) & (values != 255)
-    if outside.any():
-        raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
-    free, occupied = number_of(free_percent), number_of(occupied_percent)
-    if not 0 <= free < occupied <= 100 or occupied <= 1:
-        given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
-        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
-    state = states_from_percent(values, occupied, free)
-    return PartialMap(state, resolution_m, origin_m, wall_height_m)
 
 
 def map_from_habitat(

@@ -1,7 +1,8 @@
 """PartialMap: what has been observed of a floor plan, cell by cell."""
 
 import itertools
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +22,9 @@ MAX_CELLS = 100_000_000
 
 MAX_INTERIOR_CELLS = 2**53
 """Largest number of free cells of a complete home: more is damage, and no file could hold it."""
+
+ODD_CELLS = 1000
+"""Number of cells from which a map has free and wall cells."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
@@ -188,8 +192,18 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
                 index = int(np.argmax(fault))
                 which = name if points.ndim == 1 else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
+                remedy += self._turned_hint(flat)
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
+
+    def _turned_hint(self, points_m: NDArray[np.float64]) -> str:
+        """Say how positions (N, 3), three at least, would all be free if the array of states were turned."""
+        turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
+        can_tell = len(points_m) >= 3 and self.mesh is None and bool((np.abs(points_m) < 1e8).all())
+        for name, state in turns.items() if can_tell else ():
+            if (replace(self, state=state).state_at(points_m) == CellState.FREE).all():
+                return f" All {len(points_m)} are free on the map {name}."
+        return ""
 
     def radios_can_stand(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Whether `require_positions` takes each of the points (N, 3) [m]."""
@@ -245,6 +259,22 @@ def alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:
     return alike
 
 
+def warn_of_odd_states(what: str, partial: PartialMap) -> None:
+    """Warn of a map, called `what`, that is probably not what was meant: without walls or free cells, or inverted."""
+    count = np.bincount(partial.state.ravel(), minlength=len(CellState))
+    free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
+    if partial.state.size < ODD_CELLS or not free + wall:
+        return
+    if not wall:
+        seen = f"has {free:,} free cells and no wall, so that nothing obstructs or reflects"
+    elif wall > 2 * free:
+        seen = f"has {wall:,} wall cells and {free:,} free ones, as if inverted"
+    else:
+        return
+    remedy = "look at its states, and at negate and the thresholds of a ROS map."
+    warnings.warn(f"{what} {seen}: {remedy}", MapWarning, stacklevel=3)
+
+
 def require_map(name: str, value: object) -> None:
     """Raise a MapError that names `name` unless `value` is a PartialMap."""
     if not isinstance(value, PartialMap):
@@ -267,7 +297,9 @@ def _checked_state(values: ArrayLike) -> NDArray[np.uint8]:
         cells = f"{state.shape[0]} x {state.shape[1]} cells, more than {MAX_CELLS:,}"
         raise MapError(f"state has {cells}: cut the map to the building or coarsen it.")
     if state.min() < 0 or state.max() > max(CellState):
-        raise MapError(f"state has values {state.min()} to {state.max()}: use {wanted}.")
+        values = f"state has values {state.min()} to {state.max()}: use {wanted}"
+        is_percent = state.min() >= -1 and state.max() in (100, 255)
+        raise MapError(f"{values}{', or map_from_occupancy for -1 to 100 percent' if is_percent else ''}.")
     state = np.array(state, dtype=np.uint8)
     state.setflags(write=False)
     return state

@@ -43,6 +43,12 @@ MAX_YAML_BYTES = 1_000_000
 MAX_IMAGE_BYTES = 16 * MAX_CELLS
 """Largest map image that is read [bytes]."""
 
+DARK_OCCUPANCY = 0.51
+"""Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
+
+FEW_DARK = 100
+"""Number of dark grey pixels up to which nothing is said."""
+
 MAX_YAW_RAD = 6.2832
 """Largest yaw of a map's origin: one turn, as people round it; more is meant in degrees [rad]."""
 
@@ -111,6 +117,8 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     state = _classify(pixels, sheet)
     if sheet.mode == "trinary" and not strict:
         _keep_unknown(state, pixels, sheet)
+    if not strict:
+        _warn_of_dark_unknown(state, pixels, sheet)
     state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
@@ -363,6 +371,20 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> NDArray[np.uint8]:
     if sheet.mode == "scale" and pixels.alpha is not None:
         state[pixels.alpha < 255] = CellState.UNKNOWN
     return state
+
+
+def _warn_of_dark_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> None:
+    """Warn of dark grey pixels that lie between the thresholds, if they are more than the walls."""
+    full = 255 * pixels.per_shade + pixels.opaque
+    occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
+    dark = (state == CellState.UNKNOWN) & (occupancy > DARK_OCCUPANCY)
+    dark &= True if pixels.alpha is None else pixels.alpha > 0
+    if sheet.mode == "raw" or dark.sum() <= max((state == CellState.WALL).sum(), FEW_DARK):
+        return
+    lowest = float(occupancy[dark].min())
+    what = f"{int(dark.sum()):,} dark grey cells (occupancy from {lowest:.2f}) are read as unknown"
+    remedy = f"if they are walls, set occupied_thresh, now {sheet.occupied_thresh:g}, below {lowest:.2f}."
+    warnings.warn(f"{sheet.source}: {what}: {remedy}", MapWarning, stacklevel=4)
 
 
 def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> None:

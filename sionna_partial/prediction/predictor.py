@@ -405,12 +405,14 @@ class Predictor(Shown):
             If a file is missing, damaged, changed, or of another kind.
         """
         name = SHIPPED[0] if name_or_path is None else name_or_path
+        known = " or ".join(map(repr, SHIPPED))
         if not isinstance(name, (str, PathLike)):
-            known = " or ".join(map(repr, SHIPPED))
             raise PredictorError(
                 f"name_or_path = {name!r} is not a path: give {known}, or the path of a {SUFFIX} file."
             )
         path = PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
+        if path.suffix != SUFFIX:
+            raise PredictorError(f"path = '{path}' is no predictor: give {known}, or the path of a {SUFFIX} file.")
         model, archive, card = read_files(path)
         try:
             settings = PredictorSettings(**card["settings"])

@@ -544,10 +544,7 @@ def valid_links(
 def _receivers(rx: ArrayLike) -> NDArray[np.float64]:
     with suppress(ValueError):  # nested lists of unequal lengths have no size
         rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
-    rx_m = position_array("rx", rx)
-    if rx_m.ndim != 2:
-        raise PositionError(f"rx has shape {rx_m.shape}: give receivers as (N, 3).")
-    return rx_m
+    return position_array("rx", rx).reshape(-1, 3)
 
 
 def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:

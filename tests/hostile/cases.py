@@ -40,6 +40,14 @@ CALLS = {
         "fog_of_war": "np.ones((5, 6), bool)",
         "resolution_m": "0.1",
     },
+    "map_from_points": {"points": "CLOUD"},
+    "map_from_drawing": {"path": "valid('plan.dxf', folder)"},
+    "map_from_bag": {"path": "valid('drive.bag', folder)"},
+    "poses_from_bag": {"path": "valid('drive.bag', folder)"},
+    "measurements_from_bag": {
+        **{"path": "valid('drive.bag', folder)", "topic": "'/rssi'", "tx": "TX"},
+        "tx_power_dbm": "20.0",
+    },
     "load_map": {"path": "valid('map.yaml', folder)"},
     "save_map": {"partial": "room()", "path": "folder / 'map.yaml'"},
     "export_scene": {"partial": "room()", "folder": "folder / 'scene'"},
@@ -102,6 +110,7 @@ SPOILS = (
 """Expressions of the bytes `data` of a valid file and a random generator `rng`."""
 
 KINDS = (
+    *("cloud.las", "cloud.laz", "cloud.pcd", "cloud.xyz", "plan.dxf", "drive.bag", "drive.mcap", "drive.db3"),
     *("map.yaml", "map.pgm", "map.npz", "mesh.ply", "mesh.obj", "scene.xml", "scene folder", "measurements.csv"),
     *("predictor.keras", "predictor.json", "coverage.nc", "dataset.parquet", "dataset.json"),
 )

@@ -24,6 +24,9 @@ HERE = str(Path(__file__).parent)
 TX = (1.1, 1.1, 1.5)
 
 CUBE = np.array([(x, y, z) for x in (0.0, 4.0) for y in (0.0, 3.0) for z in (0.0, 2.5)])
+CLOUD = np.random.default_rng(0).uniform((0, 0, 0), (4, 3, 2.5), (3000, 3))
+CLOUD[:2000, 2] = 0.0  # a floor, and a wall at x = 0
+CLOUD[2000:, 0] = 0.0
 FACES = (
     *((0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)),
     *((2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)),
@@ -199,7 +202,64 @@ def _dataset(folder: Path) -> Path:
     return next((folder / "links").rglob("*.parquet"))
 
 
+def _cloud(name: str, folder: Path) -> Path:
+    import laspy
+    from pypcd4 import PointCloud
+
+    path = folder / name
+    if path.suffix == ".pcd":
+        PointCloud.from_xyz_points(CLOUD.astype(np.float32)).save(path)
+    elif path.suffix == ".xyz":
+        np.savetxt(path, CLOUD, fmt="%.3f")
+    else:
+        cloud = laspy.create()
+        cloud.x, cloud.y, cloud.z = CLOUD.T
+        cloud.write(path)
+    return path
+
+
+def _drawing(folder: Path) -> Path:
+    import ezdxf
+
+    plan = ezdxf.new(units=6)
+    plan.modelspace().add_lwpolyline(CUBE[[0, 2, 6, 4], :2], close=True, dxfattribs={"layer": "WALLS"})
+    plan.blocks.new("COLUMN").add_circle((0, 0), 0.2)
+    plan.modelspace().add_blockref("COLUMN", (2, 1), dxfattribs={"layer": "WALLS"})
+    plan.saveas(folder / "plan.dxf")
+    return folder / "plan.dxf"
+
+
+def _bag(name: str, folder: Path) -> Path:
+    sys.path.insert(0, str(Path(HERE).parent))
+    from rosbag_files import START_S, messages_of, write_bag
+
+    name = {".bag": "drive.bag", ".mcap": "drive_mcap", ".db3": "drive_sqlite3"}[Path(name).suffix]
+    make = messages_of(name)
+    rows: list[tuple[str, float, Any]] = [("/map", 0.0, make.grid([[0, 100, -1]] * 4))]
+    for time_s in (0.0, 1.0, 2.0):
+        rows.append(("/pose", time_s, make.pose_stamped(START_S + time_s, time_s, 1.0, 0.0)))
+        rows.append(("/rssi", time_s, make.power(-60.0)))
+    bag = write_bag(folder / name, rows)
+    return bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
+
+
+def _read_bag(path: Path) -> None:
+    for read in (
+        sp.load_map,
+        sp.poses_from_bag,
+        lambda path: sp.measurements_from_bag(path, "/rssi", TX, tx_power_dbm=20.0),
+    ):
+        with suppress(sp.SionnaPartialError):
+            read(path)
+
+
 KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
+    **{
+        name: (functools.partial(_cloud, name), sp.load_map)
+        for name in ("cloud.las", "cloud.laz", "cloud.pcd", "cloud.xyz")
+    },
+    "plan.dxf": (_drawing, sp.load_map),
+    **{name: (functools.partial(_bag, name), _read_bag) for name in ("drive.bag", "drive.mcap", "drive.db3")},
     "map.yaml": (_yaml, sp.load_map),
     "map.pgm": (lambda folder: _yaml(folder).with_suffix(".pgm"), lambda path: sp.load_map(path.with_suffix(".yaml"))),
     "map.npz": (_npz, sp.load_map),

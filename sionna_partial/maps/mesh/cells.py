@@ -46,10 +46,10 @@ class MeshReading:
             raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
 
     def require_unused(self, path: Path, what: str) -> None:
-        """Raise a MapError if anything has been given, for a file that is no mesh but `what`."""
+        """Raise a MapError if anything has been given, for a file that is no scan but `what`."""
         for name, value in vars(self).items():
             if value is not None:
-                raise MapError(f"{name} is for meshes alone, but path = '{path}' is {what}: leave it out.")
+                raise MapError(f"{name} is for scans alone, but path = '{path}' is {what}: leave it out.")
 
 
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
@@ -58,13 +58,13 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     Known cells with a surface in the height band are walls. Walls that run along lattice lines are in the cells above
     or to the right of them, or on the other side if those are unknown.
     """
-    empty = _fitted_grid(mesh, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
-    _require_metres(mesh, reading.height_band_m)
+    empty = fitted_grid(mesh.bounds_m, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
+    require_metres("the mesh", mesh.bounds_m, reading.height_band_m)
     band_m = _band(mesh, reading.height_band_m)
     if reading.observed is None:
         known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
     else:
-        known = _observed_cells(empty, reading.observed)
+        known = observed_cells(empty, reading.observed)
     upper = _cells_with_surfaces(mesh, empty, band_m, upper=True)
     lower = _cells_with_surfaces(mesh, empty, band_m, upper=False)
     lost = np.pad(upper & ~known, ((0, 1), (0, 1)))
@@ -75,12 +75,12 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     return partial if reading.observed is None else cut_to_known(partial)
 
 
-def _require_metres(mesh: SceneMesh, height_band_m: object) -> None:
-    """Raise a MapError for a mesh that seems to be in another unit."""
-    x, y, z = (float(extent) for extent in np.ptp(mesh.bounds_m, axis=0))
+def require_metres(what: str, bounds_m: NDArray[np.float64], height_band_m: object) -> None:
+    """Raise a MapError for lowest and highest x, y, z (2, 3) that seem to be in another unit."""
+    x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
         raise MapError(
-            f"the mesh spans {x:g} x {y:g} x {z:g} m: scale it to metres (0.01 for centimetres, 1000 for kilometres)"
+            f"{what} spans {x:g} x {y:g} x {z:g} m: scale it to metres (0.01 for centimetres, 1000 for kilometres)"
             + (", or give the height_band_m of the walls if it is so high." if z > HIGHEST_M else ".")
         )
 
@@ -100,28 +100,35 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
     return replace(partial, mesh=partial.mesh.within(area))
 
 
+def narrow_areas(free: NDArray[np.bool_], resolution_m: float) -> NDArray[np.bool_]:
+    """Find the cells (ny, nx) of free areas that are nowhere `RIM_M` wide."""
+    area, count = ndimage.label(np.pad(free, 1))
+    to_border_m = (ndimage.distance_transform_edt(area > 0) - 0.5) * resolution_m
+    widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
+    narrow: NDArray[np.bool_] = (widest_m < RIM_M)[area][1:-1, 1:-1] & free
+    return narrow
+
+
 def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
     """Find the cells (ny, nx) of narrow free areas beside unknown cells."""
-    free = np.pad(state == CellState.FREE, 1)
+    free = state == CellState.FREE
+    unknown = np.pad(state == CellState.UNKNOWN, 1)
     area, count = ndimage.label(free)
-    to_border_m = (ndimage.distance_transform_edt(free) - 0.5) * resolution_m
-    widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
     beside = np.zeros(count + 1, dtype=bool)
-    beside[area[ndimage.binary_dilation(np.pad(state == CellState.UNKNOWN, 1))]] = True
-    rims: NDArray[np.bool_] = (free & ((widest_m < RIM_M) & beside)[area])[1:-1, 1:-1]
-    return rims
+    beside[area[ndimage.binary_dilation(unknown)[1:-1, 1:-1]]] = True
+    return narrow_areas(free, resolution_m) & beside[area]
 
 
-def _fitted_grid(mesh: SceneMesh, resolution_m: float) -> PartialMap:
-    """Map of unknown cells around a mesh, on multiples of the resolution, with a margin of a cell or more."""
+def fitted_grid(bounds_m: NDArray[np.float64], resolution_m: float) -> PartialMap:
+    """Map of unknown cells around the lowest and highest x and y, on multiples of the resolution, with a margin."""
     one = PartialMap(np.full((1, 1), CellState.UNKNOWN), resolution_m)
     cell = one.resolution_m
-    first = np.floor(mesh.bounds_m[0, :2] / cell).astype(int) - 1
-    nx, ny = (int(count) for count in np.floor(mesh.bounds_m[1, :2] / cell + BORDER_M / cell).astype(int) + 2 - first)
+    first = np.floor(bounds_m[0, :2] / cell).astype(int) - 1
+    nx, ny = (int(count) for count in np.floor(bounds_m[1, :2] / cell + BORDER_M / cell).astype(int) + 2 - first)
     if nx * ny > MAX_CELLS:
         raise MapError(
-            f"resolution_m = {cell:g} makes {ny} x {nx} cells of the mesh, more than {MAX_CELLS:,}: give "
-            f"{cell * math.sqrt(1.1 * nx * ny / MAX_CELLS):.2g} or more, check that the mesh is in metres, or cut it."
+            f"resolution_m = {cell:g} makes {ny} x {nx} cells, more than {MAX_CELLS:,}: give "
+            f"{cell * math.sqrt(1.1 * nx * ny / MAX_CELLS):.2g} or more, check that the file is in metres, or cut it."
         )
     x, y = (float(value) for value in first * cell)
     return PartialMap(np.full((ny, nx), CellState.UNKNOWN), cell, (x, y))
@@ -138,7 +145,7 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
     return low, high
 
 
-def _observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> NDArray[np.bool_]:
+def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> NDArray[np.bool_]:
     """Cells (ny, nx) whose centre is in the polygon, or in a known cell of the other map."""
     (ny, nx), cell = empty.shape, empty.resolution_m
     x = empty.origin_m[0] + cell * (np.arange(nx) + 0.5)
@@ -183,12 +190,12 @@ def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upp
     polygons, sizes = clip_slab(corners, np.ascontiguousarray(corners[..., 2]), *limits)
     flat = (polygons[..., :2] - empty.origin_m) / empty.resolution_m
     cells = np.zeros(empty.shape, dtype=np.bool_)
-    _mark_cells(flat, sizes, cells, BORDER_M / empty.resolution_m, upper)
+    mark_cells(flat, sizes, cells, BORDER_M / empty.resolution_m, upper)
     return cells
 
 
 @njit(cache=True)
-def _mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
+def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
     """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
 
     What runs along a lattice line within the margin is in the cells above (or to the right of) it, or below it.

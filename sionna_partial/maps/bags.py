@@ -1,0 +1,263 @@
+"""ROS messages and recordings: OccupancyGrids as maps, and rosbags of ROS 1 and 2 (.bag, .mcap, .db3, folders)."""
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sionna_partial.checks import number_of, shown
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
+from sionna_partial.errors import MapError, SionnaPartialError
+from sionna_partial.files import open_regular
+from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, grid_array
+from sionna_partial.maps.ros_map import states_from_percent, turn_grid
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+"""File formats of recordings; a ROS 2 recording may also be a folder with a metadata.yaml."""
+
+MAX_BAG_BYTES = 10**12
+"""Largest file of a recording [bytes]; only the messages that are asked for are read."""
+
+MAX_MESSAGE_BYTES = MAX_CELLS + 100_000
+"""Largest message that is decoded [bytes]."""
+
+MAX_TILT_RAD = 0.01
+"""Largest roll and pitch of a map's origin that pass for level [rad]."""
+
+GRID = "OccupancyGrid"
+"""Type of messages with a map."""
+
+
+class Message(NamedTuple):
+    """A message of a recording: seconds since its start, the header's stamp (None without one), and the content."""
+
+    time_s: float
+    stamp_s: float | None
+    content: Any
+
+
+class Recording:
+    """An open rosbag; errors of its reader become `error`s that name the path."""
+
+    def __init__(self, path: Path, reader: Any, error: type[SionnaPartialError]) -> None:
+        self.path, self.error, self._reader = path, error, reader
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """Message type of every topic, without its package."""
+        return {link.topic: link.msgtype.rpartition("/")[2] for link in self._reader.connections}
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last message [s]."""
+        return self._reader.duration / 1e9 if self._reader.message_count else 0.0
+
+    def topic_of(self, given: str | None, kinds: tuple[str, ...], usual: str = "") -> str:
+        """Return a topic of one of several message types: the given one, the usual one, or the only one."""
+        topics = [topic for topic, kind in self.kinds.items() if not kinds or kind in kinds]
+        if given is None and (usual in topics or len(topics) == 1):
+            return usual if usual in topics else topics[0]
+        if given in topics:
+            return str(given)
+        wanted = " or ".join(kinds) or "message"
+        what = f"has {len(topics)} {wanted} topics" if given is None else f"has no {wanted} topic {shown(given)}"
+        found = ", ".join(f"{name} ({kind})" for name, kind in sorted(self.kinds.items())[:30]) or "none"
+        raise self.error(f"path = '{self.path}' {what}: name one of its topics: {found}.")
+
+    def messages(self, *topics: str, until_s: float = math.inf) -> Iterator[Message]:
+        """Decode the messages of some topics, in the order in which they were recorded."""
+        for time_s, raw, kind in self.raw(*topics, until_s=until_s):
+            yield self.decoded(time_s, raw, kind)
+
+    def raw(self, *topics: str, until_s: float = math.inf) -> Iterator[tuple[float, bytes, str]]:
+        """Yield time, bytes and type of messages."""
+        links = [link for link in self._reader.connections if link.topic in topics]
+        start = self._reader.start_time
+        stop = None if until_s > self.duration_s else start + round(until_s * 1e9) + 1
+        for link, time_ns, raw in self._reader.messages(links, stop=stop) if links else ():
+            yield (time_ns - start) / 1e9, raw, link.msgtype
+
+    def decoded(self, time_s: float, raw: bytes, kind: str) -> Message:
+        """Decode a message."""
+        if len(raw) > MAX_MESSAGE_BYTES:
+            size = f"a {kind} of {len(raw):,} bytes, more than {MAX_MESSAGE_BYTES:,}"
+            raise self.error(f"path = '{self.path}' holds {size}: record a coarser map.")
+        content = self._reader.deserialize(raw, kind)
+        stamp = getattr(getattr(content, "header", None), "stamp", None)
+        return Message(time_s, None if stamp is None else stamp.sec + stamp.nanosec / 1e9, content)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a path is a rosbag by its name, or a folder of ROS 2."""
+    return path.suffix.lower() in BAG_SUFFIXES or os.path.isfile(path / "metadata.yaml")
+
+
+@contextmanager
+def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]) -> Iterator[Recording]:
+    """Open a rosbag; whatever its reader raises while it is open becomes an `error`."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    if not isinstance(path, str | os.PathLike):
+        raise error(f"path = {shown(path)} is not a path: give a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder).")
+    source = Path(path)
+    for file in source.iterdir() if os.path.isdir(source) else [source]:
+        open_regular(file, "path", error, MAX_BAG_BYTES).close()
+    store = Stores.ROS1_NOETIC if source.suffix.lower() == ".bag" else Stores.LATEST
+    try:
+        with AnyReader([source], default_typestore=get_typestore(store)) as reader:
+            yield Recording(source, reader, error)
+    except (SionnaPartialError, MapWarning):
+        raise
+    except Exception as cause:  # the reader fails in many ways on damaged files
+        reason = " ".join(f"{type(cause).__name__}: {cause}".split())[:200]
+        remedy = "record it again, or repair it with rosbag reindex (ROS 1) or ros2 bag reindex."
+        raise error(f"path = '{source}' is damaged or no rosbag ({reason}): {remedy}") from cause
+
+
+def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time_s: float | None = None) -> PartialMap:
+    """Read a map from a rosbag of ROS 1 (.bag) or ROS 2 (.mcap, .db3, or a folder), without ROS.
+
+    Parameters
+    ----------
+    path : path-like
+        The recording.
+    topic : str or None
+        A topic of `nav_msgs/OccupancyGrid`; by default `/map`, or the only one.
+    time_s : float or None
+        Seconds since the start of the recording: the last map up to then. None is the last map of all.
+
+    Returns
+    -------
+    PartialMap
+        As `map_from_occupancy` makes it of the message.
+
+    Raises
+    ------
+    MapError
+        If it is no rosbag or damaged, or has no such topic, or no map up to then.
+
+    Examples
+    --------
+    >>> import numpy as np, sionna_partial as sp
+    >>> from rosbags.rosbag2 import StoragePlugin, Writer
+    >>> from rosbags.typesys import Stores, get_typestore
+    >>> types = get_typestore(Stores.ROS2_HUMBLE)
+    >>> new = lambda name, *values: types.types[name](*values)
+    >>> stamp = new("builtin_interfaces/msg/Time", 0, 0)
+    >>> pose = new("geometry_msgs/msg/Pose", new("geometry_msgs/msg/Point", 1.0, 2.0, 0.0),
+    ...            new("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0))
+    >>> grid = new("nav_msgs/msg/OccupancyGrid", new("std_msgs/msg/Header", stamp, "map"),
+    ...            new("nav_msgs/msg/MapMetaData", stamp, 0.5, 2, 1, pose), np.array([0, 100], np.int8))
+    >>> with Writer("drive", version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+    ...     link = writer.add_connection("/map", grid.__msgtype__, typestore=types)
+    ...     writer.write(link, 0, types.serialize_cdr(grid, grid.__msgtype__))
+    >>> sp.map_from_bag("drive").bounds_m
+    (1.0, 2.0, 2.0, 2.5)
+    """
+    limit = math.inf if time_s is None else number_of(time_s)
+    if not limit >= 0:
+        raise MapError(f"time_s = {shown(time_s)} is not allowed: give seconds since the start of the recording.")
+    with open_recording(path, MapError) as recording:
+        name, last = recording.topic_of(topic, (GRID,), "/map"), None
+        for message in recording.raw(name, until_s=limit):
+            last = message
+        if last is None:
+            first_s = next((time for time, _, _ in recording.raw(name)), math.inf)
+            what = "is empty" if first_s == math.inf else f"has its first map {first_s:g} s after the start"
+            given = "" if time_s is None else f" up to time_s = {limit:g}"
+            remedy = "name another topic." if first_s == math.inf else "give a later time_s."
+            raise MapError(f"path = '{recording.path}' has no map{given}: topic {name} {what}: {remedy}")
+        grid = recording.decoded(*last).content
+        try:
+            return map_from_occupancy(grid)
+        except MapError as error:
+            raise MapError(f"path = '{recording.path}', topic {name}: {error}") from error
+
+
+def map_from_occupancy(
+    data: Any,
+    resolution_m: float | None = None,
+    *,
+    origin_m: tuple[float, float] | None = None,
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
+    occupied_percent: float = 65,
+    free_percent: float = 25,
+) -> PartialMap:
+    """Make a map of a ROS `nav_msgs/OccupancyGrid`: of the message itself, or of its array.
+
+    Parameters
+    ----------
+    data : OccupancyGrid or (height, width) integers
+        A message (rclpy, rospy, rosbags; anything with its `info` and `data`), or an array: -1 (or 255, its unsigned
+        form) unknown, else the occupancy in percent, 0 to 100. Row 0 holds the smallest y, as ROS has it.
+    resolution_m : float or None
+        Edge of a cell [m]; None for a message, which has its own.
+    origin_m : (float, float) or None
+        World x and y of the lower-left corner [m], (0, 0) by default; None for a message. The yaw of a message's
+        origin is honoured: quarter turns are exact, and for any other yaw cells have half the size.
+    wall_height_m : float
+        Height of walls and ceiling [m].
+    occupied_percent, free_percent : float
+        From this value a cell is wall; up to this value it is free (the defaults of nav2's map_saver).
+
+    Returns
+    -------
+    PartialMap
+
+    Raises
+    ------
+    MapError
+        For other values, a number out of range, or an origin that is not level.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.map_from_occupancy([[100, 100], [0, -1]], 0.05).state.tolist()
+    [[1, 1], [0, 2]]
+    """
+    yaw = 0.0
+    if hasattr(data, "info") and hasattr(data, "data"):
+        if resolution_m is not None or origin_m is not None:
+            raise MapError("resolution_m and origin_m are those of the message: leave them out.")
+        data, resolution_m, (x, y, yaw) = _message_parts(data)
+        origin_m = (x, y)
+    elif resolution_m is None:
+        raise MapError("resolution_m is missing: give the edge of a cell in metres, or an OccupancyGrid message.")
+    values = grid_array("data", data, "iu")
+    outside = ((values < -1) | (values > 100)) & (values != 255)
+    if outside.any():
+        raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
+    free, occupied = number_of(free_percent), number_of(occupied_percent)
+    if not 0 <= free < occupied <= 100 or occupied <= 1:
+        given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
+        raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
+    state = states_from_percent(values, occupied, free)
+    partial = PartialMap(state, resolution_m, (0.0, 0.0) if origin_m is None else origin_m, wall_height_m)
+    if not yaw:
+        return partial
+    return PartialMap(*turn_grid(partial.state, partial.resolution_m, (*partial.origin_m, yaw)), wall_height_m)
+
+
+def _message_parts(message: Any) -> tuple[ArrayLike, float, tuple[float, float, float]]:
+    """Cells (height, width), their edge, and x, y and yaw of the origin of an OccupancyGrid."""
+    try:
+        info, origin = message.info, message.info.origin
+        size, resolution_m = (int(info.height), int(info.width)), number_of(info.resolution)
+        x, y = number_of(origin.position.x), number_of(origin.position.y)
+        quaternion = np.array([number_of(getattr(origin.orientation, name)) for name in "xyzw"])
+        cells = np.asarray(message.data)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise MapError(f"data is no OccupancyGrid ({error}): give one with info and data, or an array.") from error
+    if cells.ndim != 1 or len(cells) != size[0] * size[1]:
+        raise MapError(f"data has {cells.size} values for {size[0]} x {size[1]} cells: give the whole message.")
+    length = float(np.linalg.norm(quaternion))
+    qx, qy, qz, qw = quaternion / length if length else (0.0, 0.0, 0.0, 1.0)  # many leave it at zero
+    if not 2 * math.hypot(qx, qy) <= MAX_TILT_RAD:
+        raise MapError(f"info.origin.orientation = {shown(quaternion.tolist())} is not level: give a yaw alone.")
+    return cells.reshape(size), resolution_m, (x, y, 2 * math.atan2(qz, qw))

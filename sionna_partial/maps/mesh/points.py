@@ -1,0 +1,452 @@
+"""Point clouds (PCD, PLY, LAS, LAZ, XYZ, arrays) -> PartialMap, read in parts and kept as occupied voxels."""
+
+import io
+import itertools
+import math
+import os
+import re
+import struct
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from sionna_partial.checks import real_array
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.errors import MapError
+from sionna_partial.files import open_regular
+from sionna_partial.maps.mesh.cells import (
+    DEFAULT_BAND_M,
+    DEFAULT_RESOLUTION_M,
+    MeshReading,
+    fitted_grid,
+    narrow_areas,
+    observed_cells,
+    require_metres,
+)
+from sionna_partial.maps.mesh.mesh import MAX_COORDINATE_M, height_pair
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.process import njit
+
+POINT_SUFFIXES = (".pcd", ".las", ".laz", ".xyz", ".pts")
+"""File formats of point clouds, besides PLY files without faces."""
+
+MAX_CLOUD_BYTES = 20_000_000_000
+"""Largest point cloud that is read [bytes]; of PCD and PLY, which are read whole, `MAX_WHOLE_BYTES`."""
+
+MAX_WHOLE_BYTES = 2_000_000_000
+
+PART, PART_BYTES = 1_000_000, 32_000_000
+"""Points, and bytes of text, that are read at a time."""
+
+LAYER_M = 0.05
+"""Height of a voxel [m]."""
+
+FLOOR_FRACTION = 0.3
+"""Layers with this fraction of the most occupied one's cells, or more, are floors and ceilings."""
+
+SLAB_M = 0.5
+"""Height up to which consecutive full layers are a floor or ceiling, not a cloud of walls alone [m]."""
+
+LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
+"""Height from which a layer may be the ceiling; heights below the floor and above the ceiling that count [m]."""
+
+WALL_FRACTION = 0.25
+"""Of the layers of the height band that its fuller cells (90 %) have, the fraction that makes a wall."""
+
+THIN_FRACTION = 0.5
+"""Cells with certainly less than this fraction of the points of a cell beside them hold the noise of its wall."""
+
+WINDOW_M, STRAY_FRACTION = 0.35, 0.2
+"""Edge of the squares in which floor cells are counted [m]; fraction of the usual number up to which they stray."""
+
+GAP_M, HOLE_M2 = 0.15, 1.0
+"""Half the width of gaps, and size of holes, in a scanned floor that are closed unless walls bound them; size of areas
+of their own that are not free."""
+
+POSE_M = 0.25
+"""Sensor positions closer to one another than this are one [m]."""
+
+_HALF, _BITS = 1 << 20, 21
+_REMEDY = "export it again."
+
+
+def map_from_points(
+    points: ArrayLike | str | os.PathLike[str],
+    *,
+    sensor_positions_m: ArrayLike | None = None,
+    height_band_m: tuple[float, float] | None = None,
+    observed: ArrayLike | PartialMap | None = None,
+    resolution_m: float | None = None,
+    up: str | None = None,
+    wall_height_m: float | None = None,
+) -> PartialMap:
+    """Make a map of a point cloud in metres.
+
+    Floor and ceiling are the layers in which most cells have points. Cells with points in the height band are walls,
+    other cells with points between floor and ceiling are free, and so are small gaps between them. Heights of the map
+    count from the floor that was found, wherever that is in the cloud. Files are read in parts: memory grows with the
+    building, not with the number of points (of PCD and PLY files, with the file).
+
+    Parameters
+    ----------
+    points : (N, 3) array-like or path-like
+        x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are left out.
+    sensor_positions_m : (M, 2) or (M, 3) array-like, or None
+        Where the sensor was, in the axes of the cloud [m]: what lies between it and a point is free as well.
+    height_band_m : (float, float) or None
+        z of the cloud between which points are walls [m], which also selects a storey. By default `DEFAULT_BAND_M`
+        above the lowest floor.
+    observed : (M, 2) array-like, PartialMap or None
+        What has been observed, as for the meshes of `load_map`. By default the cells that are free or wall as above.
+    resolution_m : float or None
+        Edge of the cells [m], 0.05 by default.
+    up : {"z", "y"} or None
+        Axis of the cloud that points up, z by default.
+    wall_height_m : float or None
+        Height of walls and ceiling [m]; by default that of the ceiling that was found, or 3.
+
+    Returns
+    -------
+    PartialMap
+
+    Raises
+    ------
+    MapError
+        For a file that is damaged, of another kind or too large, a cloud in another unit than metres, or other values.
+
+    Examples
+    --------
+    >>> import numpy as np, sionna_partial as sp
+    >>> x, y = np.meshgrid(np.arange(0.02, 4, 0.04), np.arange(0.02, 3, 0.04))
+    >>> floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    >>> wall = np.column_stack([x.ravel(), np.full(x.size, 2.98), y.ravel()])
+    >>> room = sp.map_from_points(np.concatenate([floor, wall]))
+    >>> room.state_at([[2.0, 1.0], [2.0, 2.97], [2.0, 4.0]]).tolist()
+    [0, 1, 2]
+    """
+    reading = MeshReading(height_band_m, observed, resolution_m, up)
+    if isinstance(points, str | os.PathLike):
+        partial = read_cloud(Path(points), reading, sensor_positions_m)
+    else:
+        cloud = real_array("points", points, MapError, "give x, y, z in metres, (N, 3), or the path of a file.")
+        if cloud.ndim != 2 or cloud.shape[1] != 3:
+            raise MapError(f"points has shape {cloud.shape}: give x, y, z in metres, (N, 3), or the path of a file.")
+        parts = (cloud[start : start + PART] for start in range(0, len(cloud), PART))
+        partial = _cloud_map("points", parts, reading, sensor_positions_m)
+    return partial if wall_height_m is None else replace(partial, wall_height_m=wall_height_m)
+
+
+def read_cloud(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None = None) -> PartialMap:
+    """Read the map of a point cloud from a file."""
+    kind = path.suffix.lower().removeprefix(".")
+    reader = {"las": _las, "laz": _las, "pcd": _pcd, "ply": _ply}.get(kind, _text)
+    most = MAX_WHOLE_BYTES if kind in ("pcd", "ply") else MAX_CLOUD_BYTES
+    if f".{kind}" not in (*POINT_SUFFIXES, ".ply"):
+        raise MapError(f"path = '{path}' is no point cloud: give one of {', '.join(POINT_SUFFIXES)}, .ply.")
+    with open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream:
+        try:
+            return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m)
+        except (MapError, MapWarning):
+            raise
+        except Exception as error:  # decoders fail in many ways on damaged files
+            reason = " ".join(str(error).split())[:200] or type(error).__name__
+            raise MapError(f"path = '{path}' is damaged or no {kind.upper()} ({reason}): {_REMEDY}") from error
+
+
+def is_cloud(path: Path) -> bool:
+    """Whether a PLY file has no faces."""
+    with open_regular(path, "path", MapError, MAX_CLOUD_BYTES) as stream:
+        header, end, _ = stream.read(100_000).partition(b"end_header")
+    return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
+
+
+def _las(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+    import laspy  # type: ignore[import-untyped]
+
+    with laspy.open(stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
+        count, header = 0, reader.header
+        if header.are_points_compressed:
+            _require_chunks(stream, header.offset_to_point_data, header.point_count)
+        for part in reader.chunk_iterator(PART):
+            count += len(part)
+            yield np.column_stack([part.x, part.y, part.z])
+        _require_count(count, header.point_count)
+
+
+def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
+    """Raise a ValueError for a LAZ whose table of chunks cannot be right: lazrs ends the process where memory fails."""
+    here, size = stream.tell(), os.fstat(stream.fileno()).st_size
+    stream.seek(start)
+    (table,) = struct.unpack("<q", stream.read(8))
+    if table == -1:  # written at the end, by those who cannot seek
+        stream.seek(size - 8)
+        (table,) = struct.unpack("<q", stream.read(8))
+    stream.seek(table)
+    _, chunks = struct.unpack("<II", stream.read(8))
+    if chunks > min(points, size - table):
+        raise ValueError(f"its table has {chunks} chunks for {points} points")
+    stream.seek(here)
+
+
+def _pcd(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+    from pypcd4.pypcd4 import MetaData, PointCloud
+
+    lines = [line.decode("ascii").strip() for line in itertools.takewhile(_before_data(), stream)]
+    header = MetaData.parse_header([line for line in lines if line and not line.startswith("#")])
+    size = header.points * header.build_dtype().itemsize
+    inside = os.fstat(stream.fileno()).st_size
+    if header.data.value.startswith("binary_") or header.data.value == "binaryscompressed":
+        size, inside = int(np.frombuffer(stream.read(8), "<u4")[1]), size
+    if size > (inside if header.data.value != "ascii" else MAX_WHOLE_BYTES) or size > MAX_WHOLE_BYTES:
+        raise ValueError(f"it announces {header.points} points, more than it holds")
+    stream.seek(0)
+    cloud = PointCloud.from_fileobj(stream)  # type: ignore[arg-type]
+    data = np.atleast_1d(cloud.pc_data)
+    _require_count(len(data), header.points)
+    for start in range(0, len(data), PART):
+        yield np.column_stack([data[axis][start : start + PART] for axis in "xyz"]).astype(np.float64)
+
+
+def _before_data() -> Any:
+    """Predicate that is true for the lines of a PCD header, its DATA line included."""
+    state = {"lines": 0, "ended": False}
+
+    def is_header(line: bytes) -> bool:
+        before, state["ended"] = not state["ended"], line.startswith(b"DATA")
+        state["lines"] += 1
+        return before and state["lines"] < 100
+
+    return is_header
+
+
+def _ply(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+    import trimesh
+
+    header, _, _ = stream.read(100_000).partition(b"end_header")
+    found = re.search(rb"^element\s+vertex\s+(\d+)", header, re.MULTILINE)
+    count = int(found[1]) if found else 0
+    if count > os.fstat(stream.fileno()).st_size:
+        raise ValueError(f"it announces {count} points, more than it holds")
+    stream.seek(0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # damage ends in an error
+        vertices = np.asarray(trimesh.load(stream, file_type="ply", process=False).vertices)
+    _require_count(len(vertices), count)
+    for start in range(0, len(vertices), PART):
+        yield vertices[start : start + PART]
+
+
+def _text(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+    """Read the first three columns of a text, after a header or a number of points, if there are any."""
+    separator, first = None, True
+    while block := stream.read(PART_BYTES):
+        block += stream.readline(10_000)
+        if first:
+            lines = block.splitlines(keepends=True)
+            start = next((n for n, line in enumerate(lines[:50]) if _columns(line) >= 3), None)
+            if start is None:
+                raise ValueError("no line has three numbers")
+            separator = next((mark for mark in ",;" if mark.encode() in lines[start]), None)
+            block, first = b"".join(lines[start:]), False
+        if block.strip():
+            yield np.loadtxt(io.BytesIO(block), delimiter=separator, usecols=(0, 1, 2), ndmin=2)
+
+
+def _columns(line: bytes) -> int:
+    """Count the numbers at the beginning of a line."""
+    words = re.split(rb"[\s,;]+", line.strip())
+    return sum(1 for _ in itertools.takewhile(lambda word: re.fullmatch(rb"[-+]?[\d.]+([eE][-+]?\d+)?", word), words))
+
+
+def _require_count(count: int, announced: int) -> None:
+    """Raise a ValueError if a file holds other points than it announces."""
+    if count != announced:
+        raise ValueError(f"it announces {announced} points, and has {count}")
+
+
+def _cloud_map(
+    what: str, parts: Iterable[NDArray[Any]], reading: MeshReading, sensor_positions_m: ArrayLike | None
+) -> PartialMap:
+    """Turn points, in parts, into a map."""
+    cell = DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m
+    cell = PartialMap(np.full((1, 1), CellState.UNKNOWN), cell).resolution_m
+    sensors = _sensors(sensor_positions_m, reading.up)
+    voxels, count = _occupied_voxels(what, parts, cell, reading.up)
+    size = np.array([cell, cell, LAYER_M])
+    bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
+    require_metres(what, bounds - [[0.0], [1.0]] * size, reading.height_band_m)
+    if reading.up is None and _looks_y_up(voxels, bounds):
+        message = f'{what} looks as if y pointed up: give up="y" to turn it, or up="z" to read it as it is.'
+        warnings.warn(message, MapWarning, stacklevel=4)
+    empty = fitted_grid(bounds, cell)
+    column, row = (voxels[:, :2] - np.rint(np.array(empty.origin_m) / cell).astype(np.int64)).T
+    z = (voxels[:, 2] + 0.5) * LAYER_M
+    floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], reading.height_band_m)
+    low, high = reading.height_band_m or (floor_m + DEFAULT_BAND_M[0], floor_m + DEFAULT_BAND_M[1])
+    band = (z > low) & (z < high)
+    wall = _walls(np.ravel_multi_index((row[band], column[band]), empty.shape), count[band], empty.shape)
+    seen = np.zeros(empty.shape, dtype=np.bool_)
+    storey = (z > floor_m - BELOW_FLOOR_M) & (z < (math.inf if ceiling_m is None else ceiling_m + ABOVE_CEILING_M))
+    seen[row[storey], column[storey]] = True
+    seen &= ~ndimage.binary_dilation(wall, np.ones((3, 3)))  # noise of walls is on both of their sides
+    free = _closed(_without_strays(seen, cell), wall, cell)
+    if sensors is not None:
+        edge = (free | wall) & ndimage.binary_dilation(~(free | wall))
+        _see_through(wall, np.argwhere(edge), (sensors - empty.origin_m) / cell, free)
+    known = free | wall if reading.observed is None else observed_cells(empty, reading.observed)
+    state = np.where(known, np.where(wall, CellState.WALL, CellState.FREE), CellState.UNKNOWN).astype(np.uint8)
+    state[_enclosed(state == CellState.FREE, cell)] = CellState.UNKNOWN
+    height_m = DEFAULT_WALL_HEIGHT_M if ceiling_m is None else ceiling_m - floor_m
+    return replace(empty, state=state, wall_height_m=round(height_m, 2))
+
+
+def _sensors(given: ArrayLike | None, up: str | None) -> NDArray[np.float64] | None:
+    """Return positions (M, 2) of a sensor in the plan."""
+    if given is None:
+        return None
+    remedy = "give x, y (and z) in metres, (M, 2) or (M, 3)."
+    positions = real_array("sensor_positions_m", given, MapError, remedy).astype(np.float64)
+    if positions.ndim != 2 or positions.shape[1] not in (2, 3) or not np.isfinite(positions).all():
+        raise MapError(f"sensor_positions_m has shape {positions.shape} or values that are not finite: {remedy}")
+    if up == "y":
+        if positions.shape[1] == 2:
+            raise MapError('sensor_positions_m has shape (M, 2) with up = "y": give x, y, z of the cloud, (M, 3).')
+        positions = positions[:, [0, 2]] * (1.0, -1.0)
+    flat = positions[:, :2]
+    return flat[np.unique(np.floor(flat / POSE_M), axis=0, return_index=True)[1]]
+
+
+def _occupied_voxels(
+    what: str, parts: Iterable[NDArray[Any]], cell_m: float, up: str | None
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return indices x, y, z (V, 3) of the voxels with points, on multiples of their size, and how many these are."""
+    base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
+    for part in parts:
+        points = part[np.isfinite(part).all(axis=1)].astype(np.float64)
+        if not len(points):
+            continue
+        if np.abs(points).max() > MAX_COORDINATE_M:
+            raise MapError(f"{what} holds coordinates above {MAX_COORDINATE_M:g} m: give a cloud in metres.")
+        if up == "y":
+            points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+        index = np.floor(points / (cell_m, cell_m, LAYER_M) + 1e-9).astype(np.int64)
+        base = index[0].copy() if base is None else base
+        index += _HALF - base
+        if index.min() < 0 or index.max() >= 2 * _HALF:
+            raise MapError(f"{what} spans more than {_HALF * cell_m:,.0f} m: remove stray points, or cut it.")
+        key = (index[:, 0] << 2 * _BITS) | (index[:, 1] << _BITS) | index[:, 2]
+        pending.append(np.unique(key, return_counts=True))
+        if sum(len(keys) for keys, _ in pending[1:]) > max(4 * PART, len(pending[0][0])):
+            pending = [_merged(pending)]
+    if base is None:
+        raise MapError(f"{what} holds no finite point: give a cloud with x, y, z in metres.")
+    keys, counts = _merged(pending)
+    mask = (1 << _BITS) - 1
+    return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts
+
+
+def _merged(
+    pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Merge sorted keys with the counts of each."""
+    keys, inverse = np.unique(np.concatenate([keys for keys, _ in pending]), return_inverse=True)
+    return keys, np.bincount(inverse, np.concatenate([counts for _, counts in pending])).astype(np.int64)
+
+
+def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Cells (ny, nx) with points in enough layers of the height band, and not much fewer than those beside them."""
+    size = shape[0] * shape[1]
+    layers = np.bincount(cell, minlength=size).reshape(shape)
+    points = np.bincount(cell, count, minlength=size).reshape(shape)
+    if not len(cell):
+        return layers > 0
+    fuller = np.quantile(layers[layers > 0], 0.9)
+    most = points + 2 * np.sqrt(points)  # of a cell with this many points on average
+    is_noise = most < THIN_FRACTION * ndimage.maximum_filter(points, 3)
+    return np.asarray((layers >= max(1, math.ceil(WALL_FRACTION * fuller))) & ~is_noise)
+
+
+def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | None) -> tuple[float, float | None]:
+    """Heights of the floor below a band, the lowest by default, and of the ceiling above it, if there is one [m]."""
+    first = int(layer.min())
+    pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # what is flat and measured is spread over two layers
+    full = np.nonzero(pairs >= FLOOR_FRACTION * pairs.max())[0]
+    runs = np.split(full, np.nonzero(np.diff(full) > 1)[0] + 1)
+    slabs_m = [(run[np.argmax(pairs[run])] + first + 1) * LAYER_M for run in runs if len(run) * LAYER_M <= SLAB_M]
+    low = math.inf if band_m is None else height_pair("height_band_m", band_m)[0]
+    below = [slab for slab in slabs_m if slab < low] or [first * LAYER_M]
+    floor_m = below[0] if band_m is None else below[-1]
+    return floor_m, next((slab for slab in slabs_m if slab >= floor_m + LOWEST_CEILING_M), None)
+
+
+def _looks_y_up(voxels: NDArray[np.int64], bounds: NDArray[np.float64]) -> bool:
+    """Whether the cloud is lowest along y, yet as high as a room, and its fullest layers lie across y, not z."""
+    x, y, z = np.ptp(bounds, axis=0)
+    layers = [np.bincount(voxels[:, axis] - voxels[:, axis].min()) for axis in (1, 2)]
+    fullest = [np.convolve(cells, (1, 1)).max() for cells in layers]
+    return bool(LOWEST_CEILING_M <= y < min(x, z) and fullest[0] > fullest[1])
+
+
+def _without_strays(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+    """Leave out cells that have few others around them."""
+    size = 2 * round(WINDOW_M / cell_m / 2) + 1
+    around = ndimage.uniform_filter(free.astype(np.float32), size, mode="constant")
+    usual = np.quantile(around[free], 0.9) if free.any() else 0.0
+    return np.asarray(free & (around >= STRAY_FRACTION * usual))
+
+
+def _closed(free: NDArray[np.bool_], wall: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+    """Close narrow gaps and small holes of a scanned floor, not through walls, nor what walls enclose."""
+    steps = max(1, round(GAP_M / cell_m))
+    grown = ndimage.binary_dilation(free, iterations=steps, mask=~wall)
+    open_cells = ndimage.binary_dilation(
+        np.pad(~(grown | wall), 1, constant_values=True), iterations=steps, mask=np.pad(~wall, 1, constant_values=True)
+    )[1:-1, 1:-1]
+    closed = free | (grown & ~open_cells)
+    hole, count = ndimage.label(~(closed | wall))
+    labels = np.arange(count + 1)
+    area_m2 = ndimage.sum_labels(np.ones_like(hole), hole, labels) * cell_m**2
+    beside = [ndimage.sum_labels(side[1:-1, 1:-1], hole, labels) for side in (_beside(wall), _beside(closed))]
+    small = (area_m2 <= HOLE_M2) & (beside[0] < beside[1]) & (labels > 0)
+    return closed | small[hole]
+
+
+def _enclosed(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+    """Cells of free areas that are narrow or small, as within walls, pillars and shelves."""
+    area, count = ndimage.label(free)
+    small = np.bincount(area.ravel(), minlength=count + 1) * cell_m**2 < HOLE_M2
+    return narrow_areas(free, cell_m) | (free & small[area])
+
+
+def _beside(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    return np.pad(ndimage.binary_dilation(cells), 1)
+
+
+@njit(cache=True)
+def _see_through(wall, targets, sensors, free):  # type: ignore[no-untyped-def]
+    """Mark what lies between a sensor and the cells that it sees (row, column) as free."""
+    ny, nx = wall.shape
+    for sensor in range(len(sensors)):
+        x0, y0 = sensors[sensor]
+        for target in range(len(targets)):
+            row, column = targets[target]
+            dx, dy = column + 0.5 - x0, row + 0.5 - y0
+            steps = int(2 * max(abs(dx), abs(dy))) + 1
+            for marking in range(2):
+                for step in range(steps):
+                    y, x = int(np.floor(y0 + dy * step / steps)), int(np.floor(x0 + dx * step / steps))
+                    if not (0 <= y < ny and 0 <= x < nx) or (y == row and x == column):
+                        continue
+                    if marking:
+                        free[y, x] = True
+                    elif wall[y, x]:
+                        break
+                else:
+                    continue
+                break

@@ -1,0 +1,270 @@
+"""Rosbags: where the robot was, and received powers as measurements."""
+
+import math
+import os
+import warnings
+from collections.abc import Iterable, Mapping
+from functools import reduce
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.checks import number_of, shown
+from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.errors import MeasurementError
+from sionna_partial.maps.bags import GRID, Message, Recording, open_recording
+from sionna_partial.maps.partial_map import MapWarning
+from sionna_partial.measurements.measurements import Measurements
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+TF = "TFMessage"
+"""Type of messages with the transforms between the frames of a robot."""
+
+POSES = ("PoseWithCovarianceStamped", "PoseStamped", "Odometry")
+"""Types of messages with a pose, in the order in which they are preferred."""
+
+ROBOT_FRAMES = ("base_link", "base_footprint")
+"""Usual names of the frame of a robot (REP 105)."""
+
+
+class _Track(NamedTuple):
+    """Poses of one frame in another one: N times [s], x, y, z [m] (N, 3), unit quaternions x, y, z, w (N, 4)."""
+
+    parent: str
+    time_s: NDArray[np.float64]
+    position_m: NDArray[np.float64]
+    quaternion: NDArray[np.float64]
+
+    def at(self, time_s: NDArray[np.float64]) -> "_Track":
+        """Interpolate linearly; beyond the ends the first and the last pose stay."""
+        rows = np.hstack([self.position_m, self.quaternion])
+        rows = np.column_stack([np.interp(time_s, self.time_s, row) for row in rows.T])
+        return _Track(self.parent, time_s, rows[:, :3], rows[:, 3:])
+
+
+def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, frame: str | None = None) -> "xr.Dataset":
+    """Read where the robot was from a rosbag.
+
+    Parameters
+    ----------
+    path : path-like
+        The recording: .bag, .mcap, .db3, or a folder.
+    topic : str or None
+        A topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`. By default the transforms if they
+        lead from the map to the robot, else the first of these types that there is.
+    frame : str or None
+        Of transforms, the frame whose pose is meant, such as that of an antenna; by default `base_link`, or
+        `base_footprint`.
+
+    Returns
+    -------
+    xarray.Dataset
+        On `time`: `time_s` since the start of the recording, `position_m` (time, 3) in the frame of the map [m], and
+        `yaw_rad`. Odometry that no transform leads to the map gets a `MapWarning`: it drifts away from the map.
+
+    Raises
+    ------
+    MeasurementError
+        If it is no rosbag or damaged, or there are no such poses.
+    """
+    with open_recording(path, MeasurementError) as recording:
+        track = _robot_track(recording, topic, frame, stamped=False)
+    return _pose_table(track)
+
+
+def measurements_from_bag(
+    path: str | os.PathLike[str],
+    topic: str,
+    tx: ArrayLike,
+    *,
+    tx_power_dbm: float,
+    field: str = "data",
+    pose_topic: str | None = None,
+    frame: str | None = None,
+    rx_height_m: float = DEFAULT_HEIGHT_M,
+) -> "xr.Dataset":
+    """Read received powers from a rosbag as the table of measurements that `calibrate_materials` takes.
+
+    Receivers are where the robot was at the stamps of the powers, interpolated between its poses. Where powers have
+    no stamps, the times at which the messages were recorded count, for powers and poses. Powers before the first pose
+    or after the last one are left out, as are those that are not finite.
+
+    Parameters
+    ----------
+    path : path-like
+        The recording: .bag, .mcap, .db3, or a folder.
+    topic : str
+        Topic of the received powers [dBm].
+    tx : (3,) array-like
+        Transmitter position [m].
+    tx_power_dbm : float
+        What the receiver would report without path loss: transmit power and antenna gains less cable losses [dBm].
+    field : str
+        Field of the messages that holds the power; the default is that of `std_msgs/Float32` and `Float64`.
+    pose_topic, frame : str or None
+        As `topic` and `frame` of `poses_from_bag`.
+    rx_height_m : float
+        Height of the receiving antenna above the floor [m].
+
+    Returns
+    -------
+    xarray.Dataset
+        On `link`: `tx_x`, `tx_y`, `tx_z`, `rx_x`, `rx_y`, `rx_z` [m], `gain_db`, and `time_s` since the start of the
+        recording. `.to_dataframe().to_csv("measured.csv")` writes the CSV.
+
+    Raises
+    ------
+    MeasurementError
+        If it is no rosbag or damaged, there are no such powers or poses, or the gains are none.
+    """
+    import xarray as xr
+
+    for name, value, unit in (("tx_power_dbm", tx_power_dbm, "dBm"), ("rx_height_m", rx_height_m, "metres")):
+        if not math.isfinite(number_of(value)):
+            raise MeasurementError(f"{name} = {shown(value)} is not allowed: give a number of {unit}.")
+    with open_recording(path, MeasurementError) as recording:
+        messages = [*recording.messages(recording.topic_of(topic, ()))]
+        powers = np.array([_power(each, field, topic) for each in messages])
+        stamped = bool(messages) and all(each.stamp_s for each in messages)
+        track = _robot_track(recording, pose_topic, frame, stamped=stamped)
+        start_s = (messages[0].stamp_s or 0.0) - messages[0].time_s if stamped else 0.0
+    times_s = np.array([each.stamp_s if stamped else each.time_s for each in messages], dtype=np.float64)
+    first_s, last_s = track.time_s[[0, -1]]
+    used = np.isfinite(powers) & (times_s >= first_s) & (times_s <= last_s)
+    if not used.any():
+        span = f"{times_s.min():.1f} to {times_s.max():.1f} s" if len(times_s) else "none"
+        what = f"{len(powers)} powers ({span}), none of them finite and within the poses"
+        raise MeasurementError(
+            f"path = '{path}', topic {topic} has {what} ({first_s:.1f} to {last_s:.1f} s): name another topic."
+        )
+    if not used.all():
+        message = f"path = '{path}': {int((~used).sum())} of {len(used)} powers are not finite or without a pose"
+        warnings.warn(f"{message}; they are left out.", MapWarning, stacklevel=2)
+    rx = track.at(times_s[used]).position_m
+    rx[:, 2] = rx_height_m
+    measured = Measurements(tx, rx, powers[used] - tx_power_dbm)  # type: ignore[arg-type]
+    columns = {f"{end}_{axis}": getattr(measured, end)[:, at] for end in ("tx", "rx") for at, axis in enumerate("xyz")}
+    columns |= {"gain_db": measured.gain_db, "time_s": times_s[used] - start_s}
+    return xr.Dataset({name: ("link", values) for name, values in columns.items()})
+
+
+def _pose_table(track: _Track) -> "xr.Dataset":
+    import xarray as xr
+
+    x, y, z, w = track.quaternion.T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    variables = {"position_m": (("time", "axis"), track.position_m), "yaw_rad": ("time", yaw)}
+    return xr.Dataset(variables, {"time_s": ("time", track.time_s), "axis": [*"xyz"]}, {"frame_id": track.parent})
+
+
+def _power(message: Message, field: str, topic: str) -> float:
+    """Return the number in a field of a message; NaN and infinity count."""
+    names = [name for name in dir(message.content) if not name.startswith("_")]
+    try:
+        return float(reduce(getattr, field.split("."), message.content))  # type: ignore[arg-type]
+    except (AttributeError, TypeError, ValueError) as error:
+        raise MeasurementError(
+            f"field = {shown(field)} is no number in the messages of {topic}: give one of {', '.join(names)}."
+        ) from error
+
+
+def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, stamped: bool) -> _Track:
+    """Poses of the robot in the frame of the map."""
+    kinds, target = recording.kinds, _map_frame(recording)
+    links = _transforms(recording, stamped=stamped) if TF in kinds.values() else {}
+    frames = [frame] if frame else [name for name in ROBOT_FRAMES if name in links]
+    if kinds.get(topic or "", TF) == TF:
+        for name in frames:
+            chain = _chain(links, name, target)
+            if chain:
+                return _composed(chain)
+        if topic is not None or frame is not None:
+            known = ", ".join(sorted({*links, *(link.parent for link in links.values())})[:30]) or "none"
+            what = f"no transform leads from {target!r} to {' or '.join(map(repr, frames or ROBOT_FRAMES))}"
+            raise MeasurementError(f"path = '{recording.path}': {what}; its frames are {known}: name one as frame.")
+    if topic is None:
+        found = (name for kind in POSES for name in sorted(kinds) if kinds[name] == kind and "goal" not in name)
+        topic = next(found, None)
+    track = _pose_track(recording, recording.topic_of(topic, POSES), stamped=stamped)
+    chain = _chain(links, track.parent, target)
+    if track.parent != target and not chain:
+        message = f"path = '{recording.path}': poses of {topic} are in the frame {track.parent!r}, and no transform"
+        warnings.warn(f"{message} leads to {target!r}; they are taken as they are.", MapWarning, stacklevel=4)
+    return _composed([track, *chain])
+
+
+def _map_frame(recording: Recording) -> str:
+    """Frame of the map of a recording; "map" (REP 105) if there is none."""
+    grids = [topic for topic, kind in recording.kinds.items() if kind == GRID]
+    first = next(recording.messages(*sorted(grids, key="/map".__ne__)[:1]), None)
+    return _frame(first.content.header.frame_id if first else "") or "map"
+
+
+def _frame(name: str) -> str:
+    return name.lstrip("/")
+
+
+def _pose_track(recording: Recording, topic: str, *, stamped: bool) -> _Track:
+    rows, parent = [], "map"
+    for message in recording.messages(topic):
+        pose = message.content.pose
+        pose = getattr(pose, "pose", pose)
+        parent = _frame(message.content.header.frame_id)
+        rows.append((message.stamp_s if stamped else message.time_s, pose.position, pose.orientation))
+    if not rows:
+        raise MeasurementError(f"path = '{recording.path}' has no message on {topic}: name another topic.")
+    return _track(parent, rows)
+
+
+def _transforms(recording: Recording, *, stamped: bool) -> dict[str, _Track]:
+    """Poses of each frame in its parent."""
+    rows: dict[tuple[str, str], list[Any]] = {}
+    topics = [topic for topic, kind in recording.kinds.items() if kind == TF]
+    for message in recording.messages(*topics):
+        for each in message.content.transforms:
+            stamp = each.header.stamp
+            time_s = stamp.sec + stamp.nanosec / 1e9 if stamped else message.time_s
+            key = _frame(each.child_frame_id), _frame(each.header.frame_id)
+            rows.setdefault(key, []).append((time_s, each.transform.translation, each.transform.rotation))
+    return {child: _track(parent, each) for (child, parent), each in rows.items()}
+
+
+def _track(parent: str, rows: Iterable[Any]) -> _Track:
+    """Sort poses by time, and turn quaternions so that neighbours can be interpolated."""
+    table = np.array([(time, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for time, p, q in rows], dtype=np.float64)
+    table = table[np.isfinite(table).all(axis=1)]
+    table = table[np.unique(table[:, 0], return_index=True)[1]]
+    if not len(table):
+        raise MeasurementError("the recording has no finite pose: name another topic.")
+    quaternion = table[:, 4:]
+    quaternion[~quaternion.any(axis=1), 3] = 1.0
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    turned = np.where((quaternion[1:] * quaternion[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+    quaternion *= np.cumprod([1.0, *turned])[:, None]
+    return _Track(parent, table[:, 0], table[:, 1:4], quaternion)
+
+
+def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]:
+    """Return the transforms from a frame up to another one; none if they do not lead there."""
+    chain: list[_Track] = []
+    while frame != target:
+        if frame not in links or len(chain) > len(links):
+            return []
+        chain.append(links[frame])
+        frame = links[frame].parent
+    return chain
+
+
+def _composed(chain: list[_Track]) -> _Track:
+    """Poses of the first frame of a chain in the last one, at the times of the transform that changes most often."""
+    from scipy.spatial.transform import Rotation
+
+    time_s = max(chain, key=lambda each: len(each.time_s)).time_s
+    position_m, turn = np.zeros((len(time_s), 3)), Rotation.identity(len(time_s))
+    for each in (link.at(time_s) for link in chain):
+        outer = Rotation.from_quat(each.quaternion)
+        position_m, turn = outer.apply(position_m) + each.position_m, outer * turn
+    return _Track(chain[-1].parent, time_s, position_m, turn.as_quat())

@@ -1,0 +1,6 @@
+bag = valid("drive.db3", folder)
+sheet = bag.with_name("metadata.yaml")
+sheet.write_text(sheet.read_text().replace(bag.name, "../../../../etc/passwd"))
+must_refuse(lambda: sp.load_map(bag.parent))
+sheet.write_text(sheet.read_text().replace("sqlite3", "[" * 20000))
+must_refuse(lambda: sp.load_map(bag.parent))

@@ -1,0 +1,258 @@
+"""Rosbags of ROS 1 and 2: maps, poses, and received powers, in files that the library rosbags wrote."""
+
+import math
+import re
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbag_files import KINDS, START_S, Messages, messages_of, write_bag
+
+from sionna_partial.errors import MapError, MeasurementError
+from sionna_partial.maps.bags import map_from_bag, map_from_occupancy
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import MapWarning
+from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.measurements.recordings import measurements_from_bag, poses_from_bag
+
+EARLY, LATE, SIDE = [[-1, -1, -1], [-1, 0, 100]], [[100, 0, 0], [0, 0, 100]], [[0, 100]]
+TIMES = np.arange(0.0, 10.01, 0.5)
+
+
+def way(time_s: Any) -> tuple[Any, Any, Any]:
+    """x, y and yaw of the robot in the map."""
+    return 1.0 + 0.5 * time_s, 2.0 + 0.1 * time_s, 0.02 * time_s
+
+
+@pytest.fixture(params=KINDS)
+def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """Two maps, a costmap, transforms, poses, a goal, odometry, and powers with and without stamps."""
+    name: str = request.param
+    make = messages_of(name)
+    rows: list[tuple[str, float, Any]] = [
+        ("/map", 1.0, make.grid(EARLY)),
+        ("/map", 6.0, make.grid(LATE)),
+        ("/costmap", 2.0, make.grid(SIDE)),
+        ("/goal_pose", 0.5, make.pose_stamped(START_S, 99.0, 99.0, 0.0)),
+        ("/tf_static", 0.0, make.transform(START_S, "base_link", "antenna", 0.3, 0.0, 0.0)),
+        ("/tf", 0.0, make.transform(START_S, "map", "odom", 1.0, 2.0, math.pi / 2)),
+    ]
+    for time_s in TIMES:
+        x, y, yaw = way(time_s)
+        rows.append(("/amcl_pose", time_s, make.pose_stamped(START_S + time_s, x, y, yaw)))
+        turned = (y - 2.0, 1.0 - x, yaw - math.pi / 2)  # in odom, which is turned by a quarter
+        rows.append(("/odom", time_s, make.odometry(START_S + time_s, *turned)))
+        rows.append(("/tf", time_s, make.transform(START_S + time_s, "odom", "base_link", *turned)))
+        rows.append(("/rssi", time_s + 0.2, make.power(-50.0 - time_s)))
+        rows.append(("/stamped", time_s + 0.4, make.stamped_power(START_S + time_s + 0.1, -60.0 - time_s)))
+    return write_bag(tmp_path / name, rows)
+
+
+class TestMaps:
+    def test_last_map(self, drive: Path) -> None:
+        partial = load_map(drive)
+        assert partial.state.tolist() == [[1, 0, 0], [0, 0, 1]]
+        assert (partial.origin_m, partial.resolution_m) == ((1.0, 2.0), 0.5)
+        assert map_from_bag(str(drive)) == partial
+        assert load_map(drive, wall_height_m=2.5).wall_height_m == 2.5
+
+    def test_any_topic_and_time(self, drive: Path) -> None:
+        assert map_from_bag(drive, time_s=5.9).state.tolist() == [[2, 2, 2], [2, 0, 1]]
+        assert map_from_bag(drive, time_s=6.0) == map_from_bag(drive, time_s=1e6) == load_map(drive)
+        assert map_from_bag(drive, topic="/costmap").state.tolist() == [[0, 1]]
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            (
+                {"time_s": 0.5},
+                r"has no map up to time_s = 0\.5: topic /map has its first map 1 s after the start: g",
+            ),
+            ({"time_s": -1}, r"time_s = -1 is not allowed: give seconds since the start of the recording"),
+            ({"time_s": "1"}, r"time_s = '1' is not allowed"),
+            (
+                {"topic": "/odom"},
+                r"has no OccupancyGrid topic '/odom': name one of its topics: /amcl_pose \(PoseStamped\)",
+            ),
+            ({"topic": 3}, r"has no OccupancyGrid topic 3: name one of its topics"),
+        ],
+    )
+    def test_refused(self, drive: Path, given: Any, message: str) -> None:
+        with pytest.raises(MapError, match=message):
+            map_from_bag(drive, **given)
+
+    def test_arguments_for_scans_alone(self, drive: Path) -> None:
+        with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is a rosbag: leave it out"):
+            load_map(drive, up="y")
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_only_grid_is_the_map(tmp_path: Path, name: str) -> None:
+    grid = messages_of(name).grid(SIDE)
+    one = write_bag(tmp_path / name, [("/projected_map", 0.0, grid)])
+    assert load_map(one).state.tolist() == [[0, 1]]
+    two = write_bag(tmp_path / f"two_{name}", [("/a", 0.0, grid), ("/b", 0.0, grid)])
+    with pytest.raises(MapError, match=r"has 2 OccupancyGrid topics: name one of its topics: /a \(OccupancyGrid\), /b"):
+        load_map(two)
+    broken = messages_of(name).grid([[101]])
+    with pytest.raises(MapError, match=r"topic /map: data holds 101: give -1 for unknown"):
+        load_map(write_bag(tmp_path / f"bad_{name}", [("/map", 0.0, broken)]))
+
+
+def test_single_files_of_ros_2(tmp_path: Path) -> None:
+    rows = [("/map", 0.0, Messages(2).grid(LATE))]
+    (mcap,) = write_bag(tmp_path / "drive_mcap", rows).glob("*.mcap")
+    (db3,) = write_bag(tmp_path / "drive_sqlite3", rows).glob("*.db3")
+    assert load_map(mcap).state.tolist() == load_map(db3).state.tolist() == [[1, 0, 0], [0, 0, 1]]
+
+
+class TestPoses:
+    @pytest.mark.parametrize("topic", [None, "/tf", "/amcl_pose", "/odom"])
+    def test_poses_are_in_the_map(self, drive: Path, topic: str | None) -> None:
+        poses = poses_from_bag(drive, topic=topic)
+        x, y, yaw = way(TIMES)
+        np.testing.assert_allclose(poses.time_s, TIMES, atol=1e-6)
+        np.testing.assert_allclose(poses.position_m, np.column_stack([x, y, 0 * x]), atol=1e-6)
+        np.testing.assert_allclose(poses.yaw_rad, yaw, atol=1e-6)
+        assert poses.attrs["frame_id"] == "map"
+
+    def test_pose_of_the_antenna(self, drive: Path) -> None:
+        x, y, yaw = way(TIMES)
+        poses = poses_from_bag(drive, frame="antenna")
+        np.testing.assert_allclose(poses.position_m[:, 0], x + 0.3 * np.cos(yaw), atol=1e-6)
+        np.testing.assert_allclose(poses.position_m[:, 1], y + 0.3 * np.sin(yaw), atol=1e-6)
+
+    @pytest.mark.parametrize("name", KINDS)
+    def test_odometry_without_a_map(self, tmp_path: Path, name: str) -> None:
+        make = messages_of(name)
+        rows = [("/odom", time, make.odometry(START_S + time, time, 0.0, 0.0)) for time in (0.0, 1.0)]
+        bag = write_bag(tmp_path / name, [*rows, ("/empty", 0.0, make.power(0.0))])
+        with pytest.warns(
+            MapWarning, match=r"poses of /odom are in the frame 'odom', and no transform leads to 'map'; they"
+        ):
+            poses = poses_from_bag(bag)
+        assert poses.position_m[:, 0].values.tolist() == [0.0, 1.0]
+        with pytest.raises(MeasurementError, match=r"has no .* topic '/empty': name one of its topics"):
+            poses_from_bag(bag, topic="/empty")
+        with pytest.raises(MapError, match=r"has 0 OccupancyGrid topics: name one of its topics: /empty \(Float32\)"):
+            load_map(bag)
+
+    def test_no_such_frame(self, drive: Path) -> None:
+        message = r"no transform leads from 'map' to 'camera'; its frames are antenna, base_link, map, odom: name one"
+        with pytest.raises(MeasurementError, match=message):
+            poses_from_bag(drive, frame="camera")
+
+
+class TestPowers:
+    TX = (2.0, 2.5, 1.4)
+
+    def test_by_the_times_of_recording(self, drive: Path) -> None:
+        with pytest.warns(MapWarning, match="1 of 21 powers are not finite or without a pose; they are left out"):
+            table = measurements_from_bag(drive, "/rssi", self.TX, tx_power_dbm=20.0)
+        x, y, _ = way(TIMES[:-1] + 0.2)
+        np.testing.assert_allclose(table.gain_db, -70.0 - TIMES[:-1], atol=1e-4)
+        np.testing.assert_allclose(table.time_s, TIMES[:-1] + 0.2, atol=1e-6)
+        measured = measurements_of(table)
+        np.testing.assert_allclose(measured.rx, np.column_stack([x, y, 0 * x + 1.5]), atol=1e-5)
+        np.testing.assert_allclose(measured.tx, np.tile(self.TX, (20, 1)))
+
+    def test_by_stamps(self, drive: Path, tmp_path: Path) -> None:
+        with pytest.warns(MapWarning, match="1 of 21 powers"):
+            table = measurements_from_bag(
+                drive, "/stamped", self.TX, tx_power_dbm=0, field="temperature", pose_topic="/odom", rx_height_m=0.4
+            )
+        np.testing.assert_allclose(table.rx_x, way(TIMES[:-1] + 0.1)[0], atol=1e-5)
+        assert (table.rx_z == 0.4).all()
+        table.to_dataframe().to_csv(tmp_path / "measured.csv")
+        np.testing.assert_allclose(measurements_of(tmp_path / "measured.csv").rx, measurements_of(table).rx)
+
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            ({"topic": "/power"}, "has no message topic '/power': name one of its topics: /amcl_pose (PoseStamped)"),
+            ({"field": "rssi"}, "field = 'rssi' is no number in the messages of /rssi: give one of data."),
+            ({"tx_power_dbm": None}, "tx_power_dbm = None is not allowed: give a number of dBm"),
+            ({"rx_height_m": "x"}, "rx_height_m = 'x' is not allowed: give a number of metres"),
+            ({"tx_power_dbm": -80}, "is not allowed: path gains are negative; give minus the path loss"),
+            ({"tx": (1, 2)}, "tx has shape (2,) for 20 gains"),
+        ],
+    )
+    @pytest.mark.filterwarnings("ignore::sionna_partial.maps.partial_map.MapWarning")
+    def test_refused(self, drive: Path, given: Any, message: str) -> None:
+        every = {"topic": "/rssi", "tx": self.TX, "tx_power_dbm": 20.0, **given}
+        with pytest.raises(MeasurementError, match=re.escape(message)):
+            measurements_from_bag(drive, **every)
+
+    @pytest.mark.parametrize("name", KINDS)
+    def test_powers_without_poses(self, tmp_path: Path, name: str) -> None:
+        make = messages_of(name)
+        rows = [("/pose", 9.0, make.pose_stamped(START_S, 0.0, 0.0, 0.0)), ("/rssi", 0.0, make.power(-60.0))]
+        with pytest.raises(
+            MeasurementError, match=r"topic /rssi has 1 powers \(0.0 to 0.0 s\), none of them finite and"
+        ):
+            measurements_from_bag(write_bag(tmp_path / name, rows), "/rssi", self.TX, tx_power_dbm=0.0)
+
+
+class TestMessages:
+    @pytest.mark.parametrize("yaw", [0.0, math.pi / 2, -0.3])
+    def test_message_with_yaw(self, yaw: float) -> None:
+        """Cells turn about the origin of the message, which is in the axes of the world."""
+        grid = Messages(2).grid([[0] * 8, [0] * 8, [100] * 8], (3.0, -1.0, yaw))
+        partial = map_from_occupancy(grid, wall_height_m=2.0)
+        turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
+        points = np.array([(0.75, 0.25), (3.75, 0.75), (0.75, 1.25), (3.25, 1.25), (0.75, 2.0)]) @ turn + (3.0, -1.0)
+        assert partial.state_at(points).tolist() == [0, 0, 1, 1, 2]
+        assert partial.wall_height_m == 2.0
+
+    def test_messages_of_other_libraries(self) -> None:
+        """Lists in place of arrays (rospy), and an orientation that was never set."""
+        zero = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0)
+        info = SimpleNamespace(
+            resolution=0.1, width=2, height=1, origin=SimpleNamespace(position=zero, orientation=zero)
+        )
+        assert map_from_occupancy(SimpleNamespace(info=info, data=(0, -1))).state.tolist() == [[0, 2]]
+
+    @pytest.mark.parametrize(
+        ("change", "given", "message"),
+        [
+            ({}, {"resolution_m": 0.1}, "resolution_m and origin_m are those of the message: leave them out"),
+            ({}, {"origin_m": (0, 0)}, "resolution_m and origin_m are those of the message"),
+            ({"data": [0]}, {}, "data has 1 values for 1 x 2 cells: give the whole message"),
+            ({"info": None}, {}, "data is no OccupancyGrid ("),
+            ({"tilt": 1.0}, {}, "info.origin.orientation = [1.0, 0.0, 0.0, 1.0] is not level: give a yaw alone"),
+            ({"tilt": math.nan}, {}, "is not level"),
+        ],
+    )
+    def test_refused(self, change: dict[str, Any], given: dict[str, Any], message: str) -> None:
+        grid = Messages(2).grid(SIDE)
+        grid.info.origin.orientation.x = change.pop("tilt", 0.0)
+        for name, value in change.items():
+            object.__setattr__(grid, name, value)
+        with pytest.raises(MapError, match=re.escape(message)):
+            map_from_occupancy(grid, **given)
+
+    def test_array_without_resolution(self) -> None:
+        with pytest.raises(MapError, match="resolution_m is missing: give the edge of a cell in metres, or an Occ"):
+            map_from_occupancy([[0]])
+
+
+class TestDamage:
+    @pytest.mark.parametrize("name", KINDS)
+    def test_every_truncation(self, tmp_path: Path, name: str) -> None:
+        bag = write_bag(tmp_path / name, [("/map", 0.0, messages_of(name).grid([[100] * 50, *([[0] * 50] * 49)]))])
+        for file in [bag] if bag.is_file() else list(bag.iterdir()):
+            content = file.read_bytes()
+            for size in range(0, len(content), len(content) // 12 + 1):
+                file.write_bytes(content[:size])
+                with pytest.raises(MapError, match=r"is damaged or no rosbag|has 0 Occ|has no map|is no scene"):
+                    load_map(bag)
+            file.write_bytes(content)
+        assert load_map(bag).shape == (50, 50)
+
+    def test_other_files(self, tmp_path: Path) -> None:
+        with pytest.raises(MapError, match=r"path = 3 is not a path: give a rosbag \(.bag, .mcap, .db3, or a folder\)"):
+            map_from_bag(3)  # type: ignore[arg-type]
+        with pytest.raises(MeasurementError, match=r"drive.bag' cannot be read \(No such file or directory\)"):
+            poses_from_bag(tmp_path / "drive.bag")

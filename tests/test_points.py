@@ -1,0 +1,254 @@
+"""Point clouds as maps: every format, written by other tools, and what is free, wall and unknown."""
+
+import re
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from pypcd4 import Encoding, PointCloud
+
+import sionna_partial as sp
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.mesh import points as points_module
+from sionna_partial.maps.mesh.points import POINT_SUFFIXES, map_from_points
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.resources import scenes_folder
+
+FREE, WALL, UNKNOWN = (int(state) for state in CellState)
+INSIDE, IN_WALL, OUTSIDE = (2.0, 1.5), (2.0, 3.01), (2.0, 4.5)
+
+
+def shell(low: tuple[float, float, float], high: tuple[float, float, float], rng: np.random.Generator) -> NDArray:
+    """Points on the six faces of a box, about 1,000 per square metre."""
+    low_m, size = np.array(low), np.subtract(high, low)
+    faces = []
+    for axis in range(3):
+        area = np.delete(size, axis).prod()
+        for end in (0, 1):
+            points = rng.random((round(1000 * area), 3))
+            points[:, axis] = end
+            faces.append(low_m + points * size)
+    return np.concatenate(faces)
+
+
+def room(floor_m: float = 0.0, noise_m: float = 0.005) -> NDArray:
+    """Floor, ceiling and walls of a room of 5 x 3 x 2.6 m, a table, a thick pillar, and stray points."""
+    rng = np.random.default_rng(0)
+    parts = [shell((0.02, 0.02, 0), (5.02, 3.02, 2.6), rng), shell((3.02, 1.02, 0), (3.52, 1.52, 2.6), rng)]
+    parts += [shell((1.0, 1.0, 0.7), (1.8, 1.6, 0.75), rng), rng.uniform((-2, -2, 0), (8, 6, 2), (40, 3))]
+    points = np.concatenate(parts)
+    points += rng.normal((0.0, 0.0, floor_m), noise_m, points.shape)
+    return points
+
+
+ROOM = room()
+
+
+def write(path: Path, points: NDArray) -> Path:
+    """Write a cloud with the library of its format."""
+    kind = path.suffix
+    if kind in (".las", ".laz"):
+        header = laspy.LasHeader(point_format=3, version="1.2")
+        header.scales, header.offsets = (0.001,) * 3, points.min(axis=0)
+        las = laspy.LasData(header)
+        las.x, las.y, las.z = points.T
+        las.write(path)
+    elif kind == ".pcd":
+        name = path.stem.rpartition("_")[2]
+        encoding = Encoding(name) if name in ("ascii", "binary") else Encoding.BINARY_COMPRESSED
+        PointCloud.from_xyz_points(points.astype(np.float32)).save(path, encoding=encoding)
+    elif kind == ".ply":
+        trimesh.PointCloud(points).export(path)
+    else:
+        head = f"{len(points)}\n" if kind == ".pts" else "//X,Y,Z,R\n"
+        columns = np.column_stack([points, np.zeros(len(points))])
+        with path.open("w") as stream:
+            stream.write(head)
+            np.savetxt(stream, columns, fmt="%.4f", delimiter=" " if kind == ".pts" else ",")
+    return path
+
+
+def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
+    return partial.state_at(np.array(points)).tolist()
+
+
+def require_room(partial: PartialMap) -> None:
+    assert partial.state_at(np.array([INSIDE, IN_WALL, OUTSIDE, (3.27, 1.27)])).tolist() == [
+        FREE,
+        WALL,
+        UNKNOWN,
+        UNKNOWN,
+    ]
+    assert partial.state_at(np.array([(1.4, 1.3), (3.03, 1.3)])).tolist() == [FREE, WALL]  # under the table; the pillar
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
+    assert partial.is_complete
+    assert (partial.state == FREE).sum() * 0.05**2 == pytest.approx(5 * 3 - 0.25, rel=0.05)
+
+
+FORMATS = ("room.las", "room.laz", "room_ascii.pcd", "room_binary.pcd", "room.pcd", "room.ply", "room.xyz", "room.pts")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_gives_the_room(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path / name, ROOM)
+    partial = load_map(path)
+    require_room(partial)
+    assert load_map(path, wall_height_m=2.2).wall_height_m == 2.2
+    assert map_from_points(path) == partial
+
+
+def test_every_suffix_is_tried() -> None:
+    assert {Path(name).suffix for name in FORMATS} == {*POINT_SUFFIXES, ".ply"}
+
+
+@pytest.mark.parametrize("floor_m", [-1.23, 512.34])
+def test_heights_count_from_the_floor(floor_m: float) -> None:
+    require_room(map_from_points(room(floor_m)))
+
+
+def test_map_coordinates(tmp_path: Path) -> None:
+    shift = np.array([500_000.0, 4_500_000.0, 0.0])
+    far = load_map(write(tmp_path / "room.laz", ROOM + shift))
+    require_room(PartialMap(far.state, 0.05, tuple(np.subtract(far.origin_m, shift[:2])), far.wall_height_m))
+
+
+def test_y_up() -> None:
+    turned = ROOM[:, [0, 2, 1]] * (1.0, 1.0, -1.0)
+    require_room(map_from_points(turned, up="y"))
+    with pytest.warns(MapWarning, match='points looks as if y pointed up: give up="y" to turn it'):
+        map_from_points(turned)
+
+
+def test_two_storeys() -> None:
+    """The band selects the storey; by default it is the lowest."""
+    upper = np.add(ROOM, (10.0, 0.0, 2.9))
+    both = np.concatenate([ROOM, upper])
+    require_room(map_from_points(both, observed=[(0, 0), (5.1, 0), (5.1, 3.1), (0, 3.1)]))
+    partial = map_from_points(both, height_band_m=(3.9, 4.7))
+    assert states(partial, INSIDE, (12.0, 1.5)) == [UNKNOWN, FREE]
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
+
+
+def test_walls_alone() -> None:
+    """Without floor and ceiling, only what sensors see across is free."""
+    walls = ROOM[(ROOM[:, 2] > 0.3) & (ROOM[:, 2] < 2.3)]
+    walls = walls[(np.abs(walls[:, :2] - (1.4, 1.3)) > 0.6).any(axis=1)]
+    assert states(map_from_points(walls), INSIDE) == [UNKNOWN]
+    partial = map_from_points(walls, sensor_positions_m=[(1.0, 1.25, 0.9), (1.01, 1.25, 0.9)])
+    assert states(partial, INSIDE, IN_WALL, OUTSIDE, (4.5, 1.25)) == [
+        FREE,
+        WALL,
+        UNKNOWN,
+        UNKNOWN,
+    ]
+    around = map_from_points(walls, sensor_positions_m=[(1.0, 1.25), (4.5, 2.0)])
+    assert states(around, (4.5, 1.25)) == [FREE]
+
+
+def test_parts_and_order_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = map_from_points(ROOM)
+    monkeypatch.setattr(points_module, "PART", 700)
+    assert map_from_points(np.random.default_rng(1).permutation(ROOM)) == whole
+
+
+def test_text_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "room.xyz", ROOM)
+    whole = load_map(path)
+    monkeypatch.setattr(points_module, "PART_BYTES", 5000)
+    assert load_map(path) == whole
+
+
+def test_shipped_scene_comes_back() -> None:
+    """A scan of the shipped apartment has its rooms: what is free there is free, and walls are beside its walls."""
+    home = sp.load_map(scenes_folder() / "apartment" / "complete")
+    rng, cell = np.random.default_rng(0), home.resolution_m
+    free = np.argwhere(home.state == FREE)
+    flat = np.repeat(free[:, ::-1] + rng.random(free.shape), 8, axis=0) + rng.uniform(0, 1, (8 * len(free), 2)) - 0.5
+    z = np.where(rng.random(len(flat)) < 0.5, 0.0, home.wall_height_m)
+    sides = [(0, 1), (0, -1), (1, 0), (-1, 0)]
+    faces = [np.argwhere((home.state == FREE) & (np.roll(home.state, (-y, -x), (0, 1)) == WALL)) for y, x in sides]
+    upright = np.concatenate(
+        [
+            np.repeat(each[:, ::-1] + 0.5 + 0.6 * np.array([x, y]), 80, axis=0)
+            for each, (y, x) in zip(faces, sides, strict=True)
+        ]
+    )
+    points = np.concatenate(
+        [np.column_stack([flat * cell, z]), np.column_stack([upright * cell, rng.uniform(0, 3, len(upright))])]
+    )
+    scan = map_from_points(points + rng.normal(0, 0.003, points.shape))
+    y, x = np.nonzero(home.state == FREE)
+    assert (scan.state_at((np.column_stack([x, y]) + 0.5) * cell + home.origin_m) == FREE).mean() > 0.97
+    y, x = np.nonzero(scan.state == WALL)
+    at = (np.column_stack([x, y]) + 0.5) * cell + scan.origin_m
+    assert (home.state_at(at) == WALL).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"points": np.zeros((3, 2))}, "points has shape (3, 2): give x, y, z in metres, (N, 3), or the path of a"),
+        ({"points": np.zeros((0, 3))}, "points holds no finite point: give a cloud with x, y, z in metres"),
+        ({"points": np.full((5, 3), np.nan)}, "points holds no finite point"),
+        ({"points": [["a"] * 3]}, "points = [['a', 'a', 'a']] is not numeric: give x, y, z in metres, (N, 3)"),
+        ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: scale it to metres"),
+        ({"points": ROOM * 1000}, "scale it to metres (0.01 for centimetres"),
+        ({"points": [(0, 0, 0), (1e5, 0, 0)]}, "points spans more than 52,429 m: remove stray points, or cut it"),
+        ({"points": [(0, 0, 0), (1e9, 0, 0)]}, "points holds coordinates above 1e+08 m: give a cloud in metres"),
+        ({"points": [(0, 0, 0), (9e3, 9e3, 0)]}, "more than 100,000,000: give"),
+        ({"sensor_positions_m": (1.0, 2.0)}, "sensor_positions_m has shape (2,) or values that are not finite: give x"),
+        ({"sensor_positions_m": [(1.0, np.inf)]}, "sensor_positions_m has shape (1, 2) or values that are not finite"),
+        ({"sensor_positions_m": [(1.0, 2.0)], "up": "y"}, 'with up = "y": give x, y, z of the cloud, (M, 3)'),
+        ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high)"),
+        ({"up": "x"}, "up = 'x' is not allowed"),
+        ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed"),
+    ],
+)
+def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(MapError, match=re.escape(message)):
+        map_from_points(**{"points": ROOM, **given})
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_truncation(tmp_path: Path, name: str) -> None:
+    """A file that was cut is refused, wherever; of texts only what is no row."""
+    path = write(tmp_path / name, ROOM[::50])
+    content = path.read_bytes()
+    for size in range(0, len(content) - 1, len(content) // 25):
+        path.write_bytes(content[:size])
+        if path.suffix in (".xyz", ".pts") and size:
+            continue
+        with pytest.raises(MapError, match=r"is damaged or no|holds no finite point|holds 0 triangles"):
+            map_from_points(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("room_binary.pcd", rb"POINTS \d+", b"POINTS 999999999999"),
+        ("room_ascii.pcd", rb"POINTS \d+", b"POINTS 999999999999"),
+        ("room_ascii.pcd", rb"POINTS \d+", b"POINTS 5"),
+        ("room_binary.pcd", rb"FIELDS x y z", b"FIELDS a b c"),
+        ("room.ply", rb"element vertex \d+", b"element vertex 99999999999"),
+        ("room.ply", rb"element vertex \d+", b"element vertex 5000"),
+        ("room.xyz", rb"//X,Y,Z,R", b"\n" * 60),
+        ("room.xyz", rb"\n", b"\nx,y,z\n"),
+    ],
+)
+def test_lying_header(tmp_path: Path, name: str, old: bytes, new: bytes) -> None:
+    path = write(tmp_path / name, ROOM[::50])
+    path.write_bytes(re.sub(old, new, path.read_bytes(), count=1 if b"\\n" not in old else 3))
+    with pytest.raises(MapError, match=r"is damaged or no [A-Z]+ \(.+\): export it again\."):
+        map_from_points(path)
+
+
+def test_other_files(tmp_path: Path) -> None:
+    with pytest.raises(MapError, match=r"room.e57' is no point cloud: give one of .pcd, .las, .laz,"):
+        map_from_points(tmp_path / "room.e57")
+    with pytest.raises(MapError, match=r"room.las' cannot be read \(No such file or directory\)"):
+        map_from_points(tmp_path / "room.las")
