@@ -90,9 +90,7 @@ def add_contents(app: Sphinx, name: str, source: list[str]) -> None:
         return
     found = app.env.found_docs
     listed = {page for pages in SECTIONS.values() for page in pages}
-    sections = SECTIONS | {
-        "More": sorted(page for page in found if Path(page).parent.name == "docs" and page not in listed)
-    }
+    others = sorted(page for page in found - listed if Path(page).parent.name == "docs")
     for caption, pages in {**SECTIONS, "More": others}.items():
         there = [f"/{page}" for page in pages if page in found]
         if there:
