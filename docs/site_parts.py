@@ -118,7 +118,7 @@ def finish(app: Sphinx, failure: Exception | None) -> None:
     site = Path(app.outdir)
     shutil.copyfile(site / "README.html", site / "index.html")
     pages = {}
-    for page in set(site.rglob("*.html")) - set((site / "_static").rglob("*.html")):
+    for page in (site / f"{name}.html" for name in app.env.found_docs):
         pages[page] = _Links()
         pages[page].feed(page.read_text(encoding="utf-8"))
     broken = []
