@@ -2,16 +2,17 @@
 A robot explores a home
 =======================
 
-`make_home` makes a floor plan, and `explore_trajectory` sends a robot through it: one action per step, a camera of 90
-degrees and 3.2 m.
+`explore_trajectory` sends a robot through a home: one action per step, a camera of 90 degrees and 3.2 m. The home is
+one that ships; `make_home` makes others.
 """
 
 import numpy as np
 from matplotlib.figure import Figure
 
 import sionna_partial as sp
+from sionna_partial.resources import scenes_folder
 
-home = sp.make_home(3)
+home = sp.load_map(scenes_folder() / "apartment" / "complete")
 trajectory = sp.explore_trajectory(home, steps=(0, 25, 50, 100, 150, 200), seed=3)
 maps = sp.plot_exploration(trajectory.at((50, 100, 200)))
 
@@ -19,7 +20,7 @@ maps = sp.plot_exploration(trajectory.at((50, 100, 200)))
 # What does the robot gain from each step? At each stage the link from a transmitter to a room at the other end of the
 # home is predicted again, from what the robot has seen by then.
 
-tx, rx = (7.0, 9.8, 1.5), [(4.0, 3.0, 1.5)]
+tx, rx = (7.0, 9.8, 1.5), [(10.0, 3.5, 1.5)]
 predictor = sp.Predictor.load()
 rows = []
 for step, partial in zip(trajectory.steps, trajectory.maps, strict=True):

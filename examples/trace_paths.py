@@ -13,7 +13,7 @@ import sionna_partial as sp
 from sionna_partial.resources import scenes_folder
 
 home = sp.load_map(scenes_folder() / "apartment" / "complete" / "map.yaml")
-tx, rx = (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (6.0, 5.0, 1.5)]
+tx, rx = (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)]
 links = sp.trace_links(home, tx, rx, settings=sp.TraceSettings(power_tolerance_db=0.0))
 for i, (state, gain_db) in enumerate(zip(links.link_state, links.gain_db, strict=True)):
     print(f"link {i}: {sp.LinkState(state).name}, {gain_db:.1f} dB, {np.sum(links.path_rx == i)} paths")
