@@ -61,10 +61,10 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 
-wheel: $(READY) ## Build the wheel (dist/)
-	@$(BIN)/python -m build --wheel --no-isolation
+wheel: $(READY) ## Build the source archive, and the wheel from it (dist/)
+	@$(BIN)/python -m build --no-isolation
 
-wheel-check: $(READY) ## Install the wheel in a new environment, and run the demo there
+wheel-check: $(READY) ## Install source archive and wheel in a new environment, and run the demo there
 	@$(BIN)/python -m pytest -m slow tests/test_wheel.py
 
 clean: ## Remove what was made, the environment too
