@@ -30,16 +30,15 @@ print(f"the stronger one: {gain_db.max('transmitter').median().item():.1f} dB")
 # %%
 # Where each of them is the stronger one, and the gain of that one. Walls are black.
 
-figure = Figure(figsize=(9, 3.6), layout="constrained")
+figure = Figure(figsize=(10, 3.6), layout="constrained")
 axes = figure.subplots(1, 2, sharey=True)
 known = gain_db.notnull().all("transmitter")
 best = gain_db.fillna(-np.inf).argmax("transmitter").where(known)
-wall = (coverage["cell_state"].isel(transmitter=0) == sp.CellState.WALL).astype(float)
-layers = {
-    "stronger transmitter": best.plot.pcolormesh(ax=axes[0], levels=[-0.5, 0.5, 1.5], cbar_kwargs={"ticks": [0, 1]}),
-    "mean gain of the stronger one [dB]": gain_db.max("transmitter").plot.pcolormesh(ax=axes[1], cmap="viridis"),
-}
-for axis, title in zip(axes, layers, strict=True):
-    axis.contourf(wall.x, wall.y, wall, levels=[0.5, 1.5], colors="black")
+best.plot.imshow(ax=axes[0], levels=[-0.5, 0.5, 1.5], cbar_kwargs={"ticks": [0, 1], "label": "stronger transmitter"})
+gain_db.max("transmitter").plot.imshow(ax=axes[1], cmap="viridis", cbar_kwargs={"label": "mean gain [dB]"})
+left, bottom, right, top = partial.bounds_m
+wall = np.ma.masked_equal(partial.state == sp.CellState.WALL, False)
+for axis in axes:
+    axis.imshow(wall, cmap="gray", vmin=1, vmax=2, origin="lower", extent=(left, right, bottom, top))
     axis.plot(*np.array(positions)[:, :2].T, "*", color="white", markeredgecolor="black", markersize=12)
-    axis.set(title=title, aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")

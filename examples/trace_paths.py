@@ -2,8 +2,8 @@
 Paths of a link
 ===============
 
-`trace_links` returns every path from a transmitter to the receivers: complex gain, delay, angles, and the points where
-it was reflected or diffracted.
+`trace_links` returns the paths from a transmitter to the receivers: complex gain, delay, angles, and the points where
+each was reflected or diffracted. Paths that change the power of a link by less than 0.1 dB are left out.
 """
 
 import numpy as np
@@ -14,7 +14,7 @@ from sionna_partial.resources import scenes_folder
 
 home = sp.load_map(scenes_folder() / "apartment" / "complete" / "map.yaml")
 tx, rx = (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)]
-links = sp.trace_links(home, tx, rx, settings=sp.TraceSettings(power_tolerance_db=0.0))
+links = sp.trace_links(home, tx, rx)
 for i, (state, gain_db) in enumerate(zip(links.link_state, links.gain_db, strict=True)):
     print(f"link {i}: {sp.LinkState(state).name}, {gain_db:.1f} dB, {np.sum(links.path_rx == i)} paths")
 
