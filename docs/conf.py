@@ -32,10 +32,12 @@ extensions = [
     *("site_parts", "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"),
     "sphinx_gallery.gen_gallery",
 ]
-templates_path = ["_templates"]
+templates_path = [str(ROOT / "docs" / "_templates")]  # autosummary looks in the source folder
 
 html_theme = "pydata_sphinx_theme"
 html_title = project
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 html_math_renderer = "mathml"
 html_copy_source = html_show_sourcelink = False
 html_sidebars = {"**": ["contents.html"]}
@@ -57,6 +59,7 @@ sphinx_gallery_conf = {
     "filename_pattern": r"\.py$",
     "image_scrapers": ("site_parts.figures",),
     "abort_on_example_error": True,
+    "capture_repr": (),
     "download_all_examples": False,
     "show_signature": False,
     "write_computation_times": False,
