@@ -11,6 +11,7 @@ from docutils.utils.math.latex2mathml import tex2mathml
 from matplotlib.figure import Figure
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
+from sphinx.ext import autosummary
 from sphinx_gallery.scrapers import figure_rst
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -149,6 +150,7 @@ def block_math(writer: nodes.NodeVisitor, node: nodes.math_block) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Connect all of this with Sphinx."""
     write_api()
+    autosummary.WELL_KNOWN_ABBREVIATIONS += ("eq.", "Eq.", "Fig.")  # they end no sentence
     app.connect("source-read", add_contents)
     app.connect("build-finished", finish)
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))

@@ -28,17 +28,15 @@ for tx, of_one in zip(positions, gain_db, strict=True):
 print(f"the stronger one: {gain_db.max('transmitter').median().item():.1f} dB")
 
 # %%
-# Where each of them is the stronger one, and the gain of that one. Walls are black.
+# Where each of them is the stronger one, and the gain of that one. Black: no receiver can be there.
 
 figure = Figure(figsize=(10, 3.6), layout="constrained")
 axes = figure.subplots(1, 2, sharey=True)
 known = gain_db.notnull().all("transmitter")
 best = gain_db.fillna(-np.inf).argmax("transmitter").where(known)
-best.plot.imshow(ax=axes[0], levels=[-0.5, 0.5, 1.5], cbar_kwargs={"ticks": [0, 1], "label": "stronger transmitter"})
+bar = {"ticks": [0, 1], "label": "stronger transmitter"}
+best.plot.imshow(ax=axes[0], levels=[-0.5, 0.5, 1.5], cmap="coolwarm", cbar_kwargs=bar)
 gain_db.max("transmitter").plot.imshow(ax=axes[1], cmap="viridis", cbar_kwargs={"label": "mean gain [dB]"})
-left, bottom, right, top = partial.bounds_m
-wall = np.ma.masked_equal(partial.state == sp.CellState.WALL, False)
 for axis in axes:
-    axis.imshow(wall, cmap="gray", vmin=1, vmax=2, origin="lower", extent=(left, right, bottom, top))
     axis.plot(*np.array(positions)[:, :2].T, "*", color="white", markeredgecolor="black", markersize=12)
-    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axis.set(aspect="equal", facecolor="black", xlabel="x [m]", ylabel="y [m]")
