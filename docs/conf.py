@@ -17,6 +17,7 @@ author = project_copyright = "The sionna_partial developers"
 release = version = __version__
 
 root_doc = "README"
+highlight_language = "none"  # of blocks that name no language: commands of a shell
 include_patterns = ["*.md", "docs/**", "build/api/**", "build/gallery/**"]
 exclude_patterns = [
     *(".*", "sionna_partial", "tests", "scenes", "dist", "build/docs", "build/doctrees", "build/notebooks"),
