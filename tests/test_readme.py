@@ -1,5 +1,6 @@
 """The documentation: its Python blocks run as they stand, its commands parse, and its pages lead to each other."""
 
+import json
 import re
 from pathlib import Path
 
@@ -76,6 +77,12 @@ def test_every_page_and_picture_is_linked() -> None:
     assert set((ROOT / "docs").glob("*.png")) <= linked
     for page in PAGES[1:]:
         assert README in {target for target, _ in links(page)}, f"{page.name} does not lead back"
+
+
+def test_notebooks_are_stored_without_outputs() -> None:
+    for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
+        cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        assert not [cell for cell in cells if cell.get("outputs")], f"{notebook.name}: clear its outputs"
 
 
 def test_files_named_in_code_exist() -> None:
