@@ -152,6 +152,6 @@ def setup(app: Sphinx) -> dict[str, bool]:
     write_api()
     autosummary.WELL_KNOWN_ABBREVIATIONS += ("eq.", "Eq.", "Fig.")  # they end no sentence
     app.connect("source-read", add_contents)
-    app.connect("build-finished", finish)
+    app.connect("build-finished", finish, priority=900)  # after MyST-NB, which copies its style sheet then
     app.add_html_math_renderer("mathml", (inline_math, None), (block_math, None))
     return {"parallel_read_safe": True}
