@@ -1,6 +1,7 @@
 """The wheel, built from the source archive, holds all that a user needs, and nothing else."""
 
 import os
+import re
 import subprocess
 import sys
 import tarfile
@@ -65,7 +66,9 @@ def test_nothing_else_is_in_it(names: list[str]) -> None:
 def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
     with tarfile.open(archive) as files:
         names = {name.partition("/")[2] for name in files.getnames()}
-    assert {"pyproject.toml", "LICENSE", "README.md", "CHANGELOG.md", "CITATION.cff", "scenes/scan.ply"} <= names
+    assert {"pyproject.toml", "LICENSE", "CITATION.cff", "scenes/scan.ply"} <= names
+    linked = re.findall(r"\]\(([\w/]+\.\w+)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {"docs/coverage.png", "CONTRIBUTING.md"} <= set(linked) <= names
     assert not [name for name in names if name.startswith(("build/", ".venv/")) or "__pycache__" in name]
 
 
