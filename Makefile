@@ -9,7 +9,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_
 LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
 FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
-.PHONY: help demo test hostile lint format lock scenes predictor wheel wheel-check clean
+.PHONY: help demo test docs hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -19,6 +19,10 @@ demo: $(READY) ## Predict a half-explored demo home, and compare with the truth 
 
 test: lint ## Check style and types, and run the tests
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2
+
+docs: $(READY) ## Build the site, with its notebooks and examples run (build/docs/index.html)
+	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
+	@echo "the site is build/docs/index.html"
 
 hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time and memory
 	@$(ONE_THREAD) $(BIN)/python tests/hostile/attack.py --minutes 60 --table docs/hostile.md
@@ -57,10 +61,10 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 
-wheel: $(READY) ## Build the wheel (dist/)
-	@$(BIN)/python -m build --wheel --no-isolation
+wheel: $(READY) ## Build the source archive, and the wheel from it (dist/)
+	@$(BIN)/python -m build --no-isolation
 
-wheel-check: $(READY) ## Install the wheel in a new environment, and run the demo there
+wheel-check: $(READY) ## Install source archive and wheel in a new environment, and run the demo there
 	@$(BIN)/python -m pytest -m slow tests/test_wheel.py
 
 clean: ## Remove what was made, the environment too

@@ -2,8 +2,9 @@
 
 usage: python scenes/make_scenes.py [FOLDER]
 
-Writes FOLDER/<home>/complete and FOLDER/<home>/step<steps> as scene folders, FOLDER/homes.json, and FOLDER/README.md.
-Running it again gives the same bytes.
+Writes FOLDER/<home>/complete and FOLDER/<home>/step<steps> as scene folders, FOLDER/homes.json, and FOLDER/README.md;
+FOLDER/measured.csv and FOLDER/scan.ply, which the pages of the documentation read. Running it again gives the same
+bytes.
 """
 
 import json
@@ -11,11 +12,17 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import trimesh
+
+from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import export_scene
+from sionna_partial.settings import Material, SceneSettings
 from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home
+from sionna_partial.tracing.trace import trace_links
 
 STEPS = (50, 100, 150, 200)
 
@@ -33,6 +40,10 @@ home, `step050` to `step200` what a simulated robot has observed after that many
 `scene.xml` loads in stock `sionna.rt.load_scene`, and `map.yaml` is a ROS map. `homes.json` holds the same as this
 table, for programs.
 
+`measured.csv` holds path gains of 60 links in the apartment, all from its transmitter to positions that the robot had
+seen after 100 steps: those of walls of concrete, with 2 dB of noise. `scan.ply` is the mesh of two rooms with a door
+between them and a table.
+
 | home | kind | seed | robot's seed | grid [m] | free area [m2] | observed after {steps} steps | transmitter [m] |
 |---|---|---|---|---|---|---|---|
 {rows}
@@ -49,6 +60,9 @@ def main(folder: Path) -> None:
         for steps, partial in zip(STEPS, stages, strict=True):
             export_scene(partial, folder / name / f"step{steps:03d}")
         rows.append(_row(name, recipe, home, stages))
+        if name == "apartment":
+            _write_measurements(home, stages[STEPS.index(100)], recipe["transmitter"], folder / "measured.csv")
+    _scan().export(folder / "scan.ply")
     with atomic_write(folder / "homes.json") as stream:
         stream.write((json.dumps(HOMES, indent=2) + "\n").encode())
     with atomic_write(folder / "README.md") as stream:
@@ -62,6 +76,34 @@ def _row(name: str, recipe: dict[str, Any], home: PartialMap, stages: list[Parti
     transmitter = ", ".join(f"{value:g}" for value in recipe["transmitter"])
     cells = (name, recipe["kind"], recipe["seed"], recipe["exploration_seed"], f"{x1 - x0:.1f} x {y1 - y0:.1f}")
     return "| " + " | ".join(map(str, (*cells, f"{area_m2:.0f}", seen, transmitter))) + " |"
+
+
+def _write_measurements(home: PartialMap, seen: PartialMap, tx: list[float], path: Path) -> None:
+    """Write noisy path gains of a home with walls of concrete, at positions that a robot has seen."""
+    rng = np.random.default_rng(0)
+    cells = rng.choice(np.argwhere(seen.state == CellState.FREE), 60, replace=False)[:, ::-1] + 0.5
+    rx = np.round(np.column_stack([cells * home.resolution_m + home.origin_m, np.full(len(cells), 1.5)]), 3)
+    concrete = SceneSettings(material=Material(relative_permittivity=5.24, conductivity_s_m=0.626))
+    gain_db = trace_links(home, tx, rx, scene_settings=concrete).gain_db + 2.0 * rng.standard_normal(len(rx))
+    table = np.column_stack([np.tile(tx, (len(rx), 1)), rx, gain_db])
+    header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
+    np.savetxt(path, table, delimiter=",", header=header, comments="", fmt=[*(["%.3f"] * 6), "%.1f"])
+
+
+def _scan() -> trimesh.Trimesh:
+    """Two rooms of 3 x 4 m and 2.6 m, a door of 0.9 m between them, and a table."""
+    boxes = {
+        "floor": ((0, 0, -0.1), (6, 4, 0)),
+        "ceiling": ((0, 0, 2.6), (6, 4, 2.7)),
+        "west": ((-0.1, 0, 0), (0, 4, 2.6)),
+        "east": ((6, 0, 0), (6.1, 4, 2.6)),
+        "south": ((-0.1, -0.1, 0), (6.1, 0, 2.6)),
+        "north": ((-0.1, 4, 0), (6.1, 4.1, 2.6)),
+        "between": ((2.95, 0, 0), (3.05, 2.6, 2.6)),
+        "beyond the door": ((2.95, 3.5, 0), (3.05, 4, 2.6)),
+        "table": ((4.2, 0.8, 0), (5.4, 1.6, 0.9)),
+    }
+    return trimesh.util.concatenate([trimesh.creation.box(bounds=bounds) for bounds in boxes.values()])
 
 
 if __name__ == "__main__":

@@ -201,6 +201,15 @@ def predict_map(
         If the predictor cannot be read.
     BackendError
         If LLVM or Sionna RT cannot be used.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> coverage = sp.predict_map(partial, tx=(1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> coverage["p_los"].sel(x=3.25, y=2.25).item()
+    1.0
     """
     require_choice("receivers", receivers, RECEIVERS)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)

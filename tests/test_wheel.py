@@ -1,8 +1,10 @@
-"""The wheel holds all that a user needs, and nothing else."""
+"""The wheel, built from the source archive, holds all that a user needs, and nothing else."""
 
 import os
+import re
 import subprocess
 import sys
+import tarfile
 import venv
 import zipfile
 from pathlib import Path
@@ -13,12 +15,24 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), str(ROOT)]
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the source archive, and the wheel that was built from it."""
+    folder = tmp_path_factory.mktemp("dist")
+    command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stdout + result.stderr
-    (path,) = folder.glob("*.whl")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def wheel(dist: Path) -> Path:
+    (path,) = dist.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def archive(dist: Path) -> Path:
+    (path,) = dist.glob("*.tar.gz")
     return path
 
 
@@ -49,27 +63,35 @@ def test_nothing_else_is_in_it(names: list[str]) -> None:
     assert not [name for name in names if "test" in name or "__pycache__" in name]
 
 
+def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
+    with tarfile.open(archive) as files:
+        names = {name.partition("/")[2] for name in files.getnames()}
+    assert {"pyproject.toml", "LICENSE", "CITATION.cff", "scenes/scan.ply"} <= names
+    linked = re.findall(r"\]\(([\w/]+\.\w+)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert {"docs/coverage.png", "CONTRIBUTING.md"} <= set(linked) <= names
+    assert not [name for name in names if name.startswith(("build/", ".venv/")) or "__pycache__" in name]
+
+
 @pytest.mark.slow
-def test_demo_runs_from_the_wheel_alone(wheel: Path, tmp_path: Path) -> None:
-    """Install the lock and the wheel in a new environment, and run the demo in an empty folder."""
+def test_demo_runs_from_what_is_published_alone(wheel: Path, archive: Path, tmp_path: Path) -> None:
+    """Install the lock, then wheel and source archive, in a new environment; run the demo in an empty folder."""
     venv.create(tmp_path / "venv", with_pip=True)
     python = tmp_path / "venv" / "bin" / "python"
     install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
     lock = ["--only-binary", ":all:", "--require-hashes", "-r", ROOT / "requirements.lock"]
     subprocess.run([*install, *lock], check=True, timeout=1800)
-    subprocess.run([*install, wheel], check=True, timeout=300)
     (tmp_path / "empty").mkdir()
-    result = subprocess.run(
-        [python.parent / "sionna-partial", "demo", "--out", "results"],
-        cwd=tmp_path / "empty",
-        env={name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "DRJIT", "VIRTUAL"))},
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert result.returncode == 0, result.stderr
-    written = [
-        tmp_path / "empty" / line.removeprefix("wrote ") for line in result.stdout.splitlines() if "wrote" in line
-    ]
-    assert written
-    assert all(file.stat().st_size for file in written)
+    environment = {
+        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "DRJIT", "VIRTUAL"))
+    }
+    for published in (archive, wheel):
+        again = [*install, "--no-build-isolation", "--force-reinstall", published]
+        subprocess.run(again, check=True, timeout=300)
+        command = [python.parent / "sionna-partial", "demo", "--out", f"demo{published.suffix}"]
+        result = subprocess.run(
+            command, cwd=tmp_path / "empty", env=environment, capture_output=True, text=True, timeout=600
+        )
+        assert result.returncode == 0, result.stderr
+        lines = [line.removeprefix("wrote ") for line in result.stdout.splitlines() if "wrote" in line]
+        assert lines
+        assert all((tmp_path / "empty" / line).stat().st_size for line in lines)
