@@ -51,7 +51,7 @@ def choose_llvm() -> None:
     try:
         _loaded_library()
     except BackendError:
-        if "drjit" in sys.modules:
+        if sys.modules.get("drjit"):
             raise
 
 
@@ -83,7 +83,7 @@ def _first_process() -> int:
 @functools.cache
 def _loaded_library() -> LlvmLibrary:
     named = os.environ.get(PATH_VARIABLE)
-    started = _started_library() if "drjit" in sys.modules else None
+    started = _started_library() if sys.modules.get("drjit") else None
     try:
         path = started or (_named_library(named) if named else _pip_library())
         version = _version(_open_library(path))

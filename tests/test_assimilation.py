@@ -171,6 +171,7 @@ class TestPredictMap:
         with pytest.raises(MeasurementError, match="30,000 links of this transmitter, more than 20,000"):
             sp.predict_map(HOUSE, TX, measurements=self.table(rx=rx), **OPTIONS)
 
+    @pytest.mark.usefixtures("command_line")
     def test_the_command_reads_a_csv(self, tmp_path):
         sp.save_map(HOUSE, tmp_path / "house.yaml")
         rows = [",".join(f"{value:g}" for value in (*TX, *rx, -75.0, 2.0)) for rx in LEFT]

@@ -83,6 +83,7 @@ class TestPredict:
             "scene_settings": SceneSettings(),
             "trace_settings": TraceSettings(),
             "receivers": "indoor",
+            "measurements": None,
             "memory_gb": 2.0,
         }
         names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
@@ -104,6 +105,7 @@ class TestPredict:
             "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2)),
             "trace_settings": TraceSettings(frequency_hz=60e9, max_depth=2, diffraction=False),
             "receivers": "anywhere",
+            "measurements": None,
             "memory_gb": 1.5,
         }
         assert [path.name for _, path in calls[1:]] == ["coverage.nc", "coverage.csv"]

@@ -49,7 +49,7 @@ def test_options(map_path: Path, tmp_path: Path) -> None:
     options = ["--threshold", -90, "--height", 2, "--rx-height", 1, "--seed", 3, "--frequency", 27e9, "--max-depth", 0]
     assert run(map_path, "--out", tmp_path / "place", *options, "--material", "concrete").exit_code == 0
     settings = json.loads((tmp_path / "place" / "placement.json").read_text())["settings"]
-    expected = {"threshold_db": -90.0, "height_m": 2.0, "rx_height_m": 1.0, "seed": 3, "objective": "coverage"}
+    expected = {"threshold_db": -90.0, "tx_height_m": 2.0, "rx_height_m": 1.0, "seed": 3, "objective": "coverage"}
     assert {name: settings[name] for name in expected} == expected
     assert (settings["trace_settings"]["frequency_hz"], settings["trace_settings"]["max_depth"]) == (27e9, 0)
     assert settings["scene_settings"]["material"]["itu"] == "concrete"
@@ -59,7 +59,7 @@ def test_options(map_path: Path, tmp_path: Path) -> None:
     ("options", "message"),
     [
         (["--threshold", 3], "error: threshold_db = 3.0 is not allowed: give a number in (-150, 0]."),
-        (["--height", 9], "error: height_m = 9.0 is not allowed: give a number in (0, 3]."),
+        (["--height", 9], "error: tx_height_m = 9.0 is not allowed: give a number in (0, 3]."),
     ],
 )
 def test_errors_are_one_line(options: list[object], message: str, map_path: Path, tmp_path: Path) -> None:
