@@ -506,7 +506,8 @@ def _assimilated(links: _Links, measured: Measurements, at_once: int) -> Assimil
     """Hold what was measured against what is predicted there."""
     blocks = [slice(start, start + at_once) for start in range(0, len(measured), at_once)]
     predictions = [links.predict(measured.rx[block], no_progress)[1] for block in blocks]
-    told = Assimilation(links.partial, links.tx_m, measured, LinkPrediction.concatenate(predictions))
+    prior, frequency_hz = LinkPrediction.concatenate(predictions), links.tracer.settings.frequency_hz
+    told = Assimilation(links.partial, links.tx_m, measured, prior, frequency_hz)
     if abs(told.offset_db) > LARGE_OFFSET_DB:
         _log.warning(
             "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +13,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.planar import grid_edges
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 
 Floats = NDArray[np.float64]
@@ -27,8 +29,8 @@ CELL_M = 0.3
 UNKNOWN_COST = 3.0
 """Length of a walk through unknown cells, in lengths of one through free cells."""
 
-REACH_M = {"unseen": 14.0, "seen": 0.8}
-"""Walk over which residuals stay correlated, by whether the transmitter is in a cell that was seen [m]."""
+UNSEEN_REACH_M = 14.0
+"""Walk over which residuals stay correlated where the transmitter is in a cell that was not seen [m]."""
 
 LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
 """Fraction of the variance of residuals that is correlated over this walk only [m]."""
@@ -36,11 +38,29 @@ LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
 TRACE_STD_DB = 3.0
 """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
 
-NOISES_DB, LIKELY_NOISE_DB = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0
-"""Standard deviations of measurements that are tried where none is given, and the likeliest before [dB]."""
+NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0, 0.4
+"""Standard deviations of measurements that are tried where none is given, and the likeliest before, with the standard
+deviation of its logarithm [dB]."""
 
-OFFSETS_DB = {1.0: 0.999, 40.0: 0.001}
-"""Standard deviations of the offset of measurements [dB], and how likely: of path gains, and of powers as received."""
+
+class Kind(NamedTuple):
+    """What measurements may be."""
+
+    chance: float
+    """How likely before."""
+
+    offset_db: float
+    """Standard deviation of an offset that all have in common [dB]."""
+
+    shadow: float
+    """Standard deviation of a factor on what is predicted below the gain in free space [1]."""
+
+    seen_reach_m: float
+    """Walk over which residuals stay correlated where the transmitter is in a cell that was seen [m]."""
+
+
+KINDS = (Kind(0.99, 1.0, 0.0, 0.8), Kind(0.01, 40.0, 0.5, 4.0))
+"""Path gains as a trace has them, and powers that a real radio received."""
 
 MOST_POINTS = 500
 """Number of places with measurements from which on neighbours are averaged."""
@@ -105,7 +125,8 @@ class Assimilation:
     a Gaussian process, whose correlation falls off with the length of the walk between receivers. A gain at or below
     the sensitivity is known to be at most that (expectation propagation; Rasmussen and Williams, Gaussian Processes for
     Machine Learning, sections 3.6 and 3.9). Standard deviations of noise and of an offset that all measurements have in
-    common are those that make the measurements likeliest.
+    common are those that make the measurements likeliest. Where that offset is large, so that a real radio is behind
+    them, what is predicted below the gain in free space is scaled, too.
 
     Parameters
     ----------
@@ -124,10 +145,20 @@ class Assimilation:
     offset_db: float
     """What the measurements have in common above the predicted gains [dB]."""
 
-    def __init__(self, partial: PartialMap, tx_m: Floats, measured: Measurements, prior: LinkPrediction) -> None:
+    shadow_scale: float
+    """What gains below free space are multiplied by."""
+
+    def __init__(
+        self,
+        partial: PartialMap,
+        tx_m: Floats,
+        measured: Measurements,
+        prior: LinkPrediction,
+        frequency_hz: float = CARRIER_FREQUENCY_HZ,
+    ) -> None:
+        self._tx_m, self._frequency_hz = tx_m, frequency_hz
         rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
-        seen = partial.state_at(tx_m[None])[0] == CellState.FREE
-        self._reach_m = REACH_M["seen" if seen else "unseen"]
+        seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
         heard = gain_db > measured.sensitivity_db
         first, place, count = _places(rx_m, heard)
         heard = heard[first]
@@ -137,15 +168,28 @@ class Assimilation:
 
         scale_db = averaged(np.hypot(prior.gain_std_db, TRACE_STD_DB))
         residual = averaged(np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db) / scale_db
-        self._walks = _Walks(partial, rx_m[first], _REACHES * self._reach_m)
-        shape = _positive(self._correlation(rx_m[first]))
-        given_db = None if std_db is None else np.sqrt(averaged(std_db**2) / count)
-        tries = [given_db] if given_db is not None else [noise / np.sqrt(count) for noise in NOISES_DB]
-        noise_db, offset_std_db = _likeliest(shape, residual, scale_db, heard, tries, is_given=given_db is not None)
+        shadow = averaged(prior.gain_mean_db - self._free_space_db(rx_m)) / scale_db
+        longest_m = _REACHES * max(UNSEEN_REACH_M, *(kind.seen_reach_m for kind in KINDS))
+        self._walks = _Walks(partial, rx_m[first], longest_m)
+        noises = {noise: noise / np.sqrt(count) for noise in NOISES_DB}
+        if std_db is not None:
+            noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
+        best = -math.inf
+        for kind in KINDS:
+            reach_m = kind.seen_reach_m if seen else UNSEEN_REACH_M
+            common = np.stack([kind.offset_db / scale_db, kind.shadow * shadow])
+            covariance = _positive(self._correlation(rx_m[first], reach_m)) + common.T @ common
+            for noise, noise_db in noises.items():
+                log_chance = math.log(kind.chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
+                log_chance += _log_evidence(covariance, residual, noise_db / scale_db, heard)
+                if log_chance > best:
+                    best, chosen = log_chance, (kind, reach_m, common, covariance, noise_db)
+        kind, self._reach_m, common, covariance, noise_db = chosen
         self.noise_db = float(np.sqrt(np.mean(noise_db**2 * count)))
-        offset = offset_std_db**2 / np.outer(scale_db, scale_db)
-        self._weights, self._precision = _posterior(shape + offset, residual, heard, noise_db / scale_db)
-        self.offset_db = float(offset_std_db**2 * (self._weights / scale_db).sum())
+        self._weights, self._precision = _posterior(covariance, residual, heard, noise_db / scale_db)
+        in_common = common @ self._weights
+        self.offset_db = float(kind.offset_db * in_common[0])
+        self.shadow_scale = float(1.0 + kind.shadow * in_common[1])
 
     def update(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
         """Return what is predicted of the links to receivers (N, 3) [m] given the measurements, from what was before.
@@ -153,7 +197,8 @@ class Assimilation:
         What the process says of a residual is as good as a measurement of the gain with a noise of its own: it weighs
         the link states, and the distribution of the gain given each, by Bayes' rule.
         """
-        across = self._correlation(rx_m)
+        prior = self._shadowed(rx_m, prior)
+        across = self._correlation(rx_m, self._reach_m)
         told = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
         touched = told > _LEAST_TOLD
         told = np.where(touched, told, 1.0)
@@ -173,10 +218,28 @@ class Assimilation:
         stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, variance * (1.0 - pull)), 0.0))
         return prior.where(touched, LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db))
 
-    def _correlation(self, rx_m: Floats) -> Floats:
+    def _shadowed(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
+        """Scale what is predicted of gains below free space."""
+        if self.shadow_scale == 1.0:
+            return prior
+        free_db = self._free_space_db(rx_m)
+        means_db = [
+            free_db + self.shadow_scale * (mean_db - free_db)
+            for mean_db in (prior.gain_los_mean_db, prior.gain_nlos_mean_db)
+        ]
+        return LinkPrediction.of_parts(
+            np.stack([prior.p_outage, prior.p_los, prior.p_nlos]),
+            np.stack([np.full(len(free_db), GAIN_FLOOR_DB), *np.maximum(means_db, GAIN_FLOOR_DB)]),
+            np.stack([np.zeros(len(free_db)), prior.gain_los_std_db, prior.gain_nlos_std_db]),
+        )
+
+    def _free_space_db(self, rx_m: Floats) -> Floats:
+        return free_space_gain_db(np.linalg.norm(rx_m - self._tx_m, axis=1), self._frequency_hz)
+
+    def _correlation(self, rx_m: Floats, reach_m: float) -> Floats:
         """Correlation (M, N) of residuals at the measured places and at other receivers."""
         walks_m = self._walks.lengths_m(rx_m)
-        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / self._reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
+        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
 def _places(rx_m: Floats, heard: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
@@ -199,22 +262,11 @@ def _positive(correlation: Floats) -> Floats:
     return (vectors * np.maximum(values, _LEAST_TOLD)) @ vectors.T
 
 
-def _likeliest(
-    shape: Floats, residual: Floats, scale_db: Floats, heard: Bools, tries: list[Floats], *, is_given: bool
-) -> tuple[Floats, float]:
-    """Noise (P,) and standard deviation of the offset that make the gains that were heard likeliest [dB]."""
-    shape, z, scale = shape[np.ix_(heard, heard)], residual[heard], scale_db[heard]
-
-    def log_evidence(noise_db: Floats, offset_db: float) -> float:
-        matrix = shape + np.diag((noise_db[heard] / scale) ** 2) + offset_db**2 / np.outer(scale, scale)
-        factor = cho_factor(matrix, lower=True)
-        log_prior = math.log(OFFSETS_DB[offset_db])
-        if not is_given:
-            log_prior -= 0.5 * (math.log(float(noise_db.max()) / LIKELY_NOISE_DB) / 0.6) ** 2
-        return float(log_prior - 0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
-
-    candidates = [(noise_db, offset_db) for noise_db in tries for offset_db in OFFSETS_DB]
-    return max(candidates, key=lambda each: log_evidence(*each))
+def _log_evidence(covariance: Floats, residual: Floats, noise: Floats, heard: Bools) -> float:
+    """Log-likelihood of the residuals (P,) where something was heard, but for a constant."""
+    z = residual[heard]
+    factor = cho_factor(covariance[np.ix_(heard, heard)] + np.diag(noise[heard] ** 2), lower=True)
+    return float(-0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
 
 
 def _posterior(covariance: Floats, residual: Floats, heard: Bools, noise: Floats) -> tuple[Floats, Floats]:
