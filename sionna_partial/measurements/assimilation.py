@@ -47,7 +47,10 @@ class Kind(NamedTuple):
     """What measurements may be."""
 
     chance: float
-    """How likely before."""
+    """How likely it is before anything was measured, where the transmitter is in a cell that was seen."""
+
+    unseen_chance: float
+    """The same where it is not: what all measurements have in common may then be a wall that was not seen, too."""
 
     offset_db: float
     """Standard deviation of an offset that all have in common [dB]."""
@@ -59,7 +62,7 @@ class Kind(NamedTuple):
     """Walk over which residuals stay correlated where the transmitter is in a cell that was seen [m]."""
 
 
-KINDS = (Kind(0.99, 1.0, 0.0, 0.8), Kind(0.01, 40.0, 0.5, 4.0))
+KINDS = (Kind(0.99, 0.9999, 1.0, 0.0, 0.8), Kind(0.01, 0.0001, 40.0, 0.5, 4.0))
 """Path gains as a trace has them, and powers that a real radio received."""
 
 MOST_POINTS = 500
@@ -176,11 +179,11 @@ class Assimilation:
             noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
         best = -math.inf
         for kind in KINDS:
-            reach_m = kind.seen_reach_m if seen else UNSEEN_REACH_M
+            reach_m, chance = (kind.seen_reach_m, kind.chance) if seen else (UNSEEN_REACH_M, kind.unseen_chance)
             common = np.stack([kind.offset_db / scale_db, kind.shadow * shadow])
             covariance = _positive(self._correlation(rx_m[first], reach_m)) + common.T @ common
             for noise, noise_db in noises.items():
-                log_chance = math.log(kind.chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
+                log_chance = math.log(chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
                 log_chance += _log_evidence(covariance, residual, noise_db / scale_db, heard)
                 if log_chance > best:
                     best, chosen = log_chance, (kind, reach_m, common, covariance, noise_db)
