@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
+from distributed.comm import parse_address, parse_host_port
 
 from sionna_partial.checks import CountProgress, require, require_number, require_whole, settings_or_default
 from sionna_partial.datasets.home_process import (
@@ -27,7 +28,7 @@ from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, OutputError, SettingsError
-from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path
+from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes
 from sionna_partial.process import cleaned_up
 from sionna_partial.progress import counting
 from sionna_partial.settings import DatasetSettings
@@ -37,6 +38,9 @@ POLL_S = 1.0
 
 ANY_PORT = "127.0.0.1:0"
 """Address of dask's own pages: its usual port may be taken."""
+
+MAX_SCHEDULER_BYTES = 1_000_000
+"""Largest scheduler file."""
 
 CONNECT_S = 30.0
 """Time to wait for a scheduler [s]."""
@@ -285,8 +289,11 @@ def _remote_client(scheduler: str) -> Client:
     if by_file and not Path(scheduler).is_file():
         raise BackendError(f"scheduler = {scheduler!r} is not there: give the file that dask scheduler writes.")
     try:
+        if by_file:  # a client that fails on a damaged file hangs when it is collected (docs/traps.md)
+            written = json.loads(read_bytes(Path(scheduler), "scheduler", BackendError, MAX_SCHEDULER_BYTES))
+            parse_host_port(parse_address(written["address"])[1])
         return Client(**where, timeout=CONNECT_S, set_as_default=False)
-    except Exception as error:  # dask fails in many ways on damaged files
+    except Exception as error:  # damaged files fail in many ways
         raise BackendError(
             f"scheduler = {scheduler!r} does not answer ({error}): give the address that dask scheduler prints, such "
             "as tcp://host:8786, or its scheduler file."
