@@ -208,9 +208,7 @@ class Assimilation:
         scale_db = np.hypot(prior.gain_std_db, TRACE_STD_DB)
         gain_db = prior.gain_mean_db + scale_db * (self._weights @ across) / told
         noise_db2 = scale_db**2 * (1.0 - told) / told
-        probabilities = np.stack([prior.p_outage, prior.p_los, prior.p_nlos])
-        means_db = np.stack([np.full(len(told), GAIN_FLOOR_DB), prior.gain_los_mean_db, prior.gain_nlos_mean_db])
-        stds_db = np.stack([np.zeros(len(told)), prior.gain_los_std_db, prior.gain_nlos_std_db])
+        probabilities, means_db, stds_db = prior.by_state
         variance = stds_db**2 + TRACE_STD_DB**2
         total = variance + noise_db2
         with np.errstate(divide="ignore"):
@@ -226,15 +224,10 @@ class Assimilation:
         if self.shadow_scale == 1.0:
             return prior
         free_db = self._free_space_db(rx_m)
-        means_db = [
-            free_db + self.shadow_scale * (mean_db - free_db)
-            for mean_db in (prior.gain_los_mean_db, prior.gain_nlos_mean_db)
-        ]
-        return LinkPrediction.of_parts(
-            np.stack([prior.p_outage, prior.p_los, prior.p_nlos]),
-            np.stack([np.full(len(free_db), GAIN_FLOOR_DB), *np.maximum(means_db, GAIN_FLOOR_DB)]),
-            np.stack([np.zeros(len(free_db)), prior.gain_los_std_db, prior.gain_nlos_std_db]),
-        )
+        probabilities, means_db, stds_db = prior.by_state
+        scaled_db = np.maximum(free_db + self.shadow_scale * (means_db - free_db), GAIN_FLOOR_DB)
+        scaled_db[LinkState.OUTAGE] = GAIN_FLOOR_DB
+        return LinkPrediction.of_parts(probabilities, scaled_db, stds_db)
 
     def _free_space_db(self, rx_m: Floats) -> Floats:
         return free_space_gain_db(np.linalg.norm(rx_m - self._tx_m, axis=1), self._frequency_hz)

@@ -97,6 +97,16 @@ class LinkPrediction(Shown):
             gain_nlos_std_db=stds_db[LinkState.NLOS],
         )
 
+    @property
+    def by_state(self) -> tuple[Floats, Floats, Floats]:
+        """What `of_parts` combines: probabilities, means and standard deviations [dB] given each LinkState (3, N)."""
+        nothing = np.zeros_like(self.p_outage)
+        return (
+            np.stack([self.p_outage, self.p_los, self.p_nlos]),
+            np.stack([nothing + GAIN_FLOOR_DB, self.gain_los_mean_db, self.gain_nlos_mean_db]),
+            np.stack([nothing, self.gain_los_std_db, self.gain_nlos_std_db]),
+        )
+
     @classmethod
     def of_trace(cls, phi: LinkFeatures) -> "LinkPrediction":
         """Return the trace itself as the prediction, as on a complete map (paper, eq. 9): no uncertainty is left.
@@ -162,12 +172,10 @@ class LinkPrediction(Shown):
         """
         indoors = link_numbers("p_indoor", p_indoor, self.p_los.shape)
         require_each((indoors >= 0.0) & (indoors <= 1.0), "p_indoor", indoors, "it lies between 0 and 1.")
-        floor = np.full_like(indoors, GAIN_FLOOR_DB)
-        return LinkPrediction.of_parts(
-            np.stack([indoors * self.p_outage + (1.0 - indoors), indoors * self.p_los, indoors * self.p_nlos]),
-            np.stack([floor, self.gain_los_mean_db, self.gain_nlos_mean_db]),
-            np.stack([np.zeros_like(indoors), self.gain_los_std_db, self.gain_nlos_std_db]),
-        )
+        probabilities, means_db, stds_db = self.by_state
+        probabilities = indoors * probabilities
+        probabilities[LinkState.OUTAGE] += 1.0 - indoors
+        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
 
 
 @dataclass(frozen=True, eq=False)
