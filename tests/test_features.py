@@ -12,7 +12,7 @@ from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.windows import map_windows
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import TracedLinks
+from sionna_partial.tracing.links import TracedLinks
 
 drawn = functools.partial(extruded.drawn, resolution_m=1.0)
 
@@ -39,7 +39,7 @@ def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
         gain_db=np.full(count, gain_db),
         path_tx=np.zeros(0, dtype=np.int32),
         path_rx=np.zeros(0, dtype=np.int32),
-        a=np.zeros(0, dtype=complex),
+        transfer=np.zeros((0, 1, 1), dtype=complex),
         delay_s=np.zeros(0),
         departure_rad=np.zeros((0, 2)),
         arrival_rad=np.zeros((0, 2)),

@@ -124,7 +124,7 @@ def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
     vertices[[3, 4], 1] = (edge_x, edge_y, 1.0)
     zeros = np.zeros(6)
     paths = SolvedPaths.of_vertices(
-        zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
+        zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
     )
     assert diffracted_as_exact(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
 
@@ -146,7 +146,7 @@ def test_bends_count_with_so_many_walls_on_each_side(
         vertices[path, at, :2] = scene.wedges.edge_m[0]
     zeros = np.zeros(6)
     paths = SolvedPaths.of_vertices(
-        zeros.astype(np.int32), zeros.astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
+        zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
     )
     assert tuple(diffracted_as_exact(scene.wedges, paths, walls_a_side).tolist()) == expected
 

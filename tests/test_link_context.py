@@ -19,7 +19,8 @@ from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkCo
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSettings
 from sionna_partial.simulation.homes import make_home
-from sionna_partial.tracing.trace import TracedLinks, trace_links
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.trace import trace_links
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 DEPTH = 4
@@ -54,7 +55,7 @@ def traced(tx, rx, *paths):
         gain_db=np.full(shape, GAIN_FLOOR_DB),
         path_tx=np.array([path[0] for path in paths], dtype=np.int32),
         path_rx=np.array([path[1] for path in paths], dtype=np.int32),
-        a=np.array([path[2] for path in paths], dtype=complex),
+        transfer=np.array([path[2] for path in paths], dtype=complex).reshape(-1, 1, 1),
         delay_s=np.zeros(len(paths)),
         departure_rad=np.zeros((len(paths), 2)),
         arrival_rad=np.zeros((len(paths), 2)),

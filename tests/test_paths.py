@@ -15,7 +15,7 @@ def _paths(*rows: tuple[int, int, float, complex], depth: int = 1) -> SolvedPath
     return SolvedPaths(
         path_tx=tx.astype(np.int32),
         path_rx=rx.astype(np.int32),
-        a=a.astype(np.complex128),
+        transfer=a.astype(np.complex128)[:, None, None],
         delay_s=delay_s.astype(np.float64),
         departure_rad=np.stack([a.real, -a.real], axis=1).astype(float),
         arrival_rad=np.stack([2 * a.real, -2 * a.real], axis=1).astype(float),
@@ -81,7 +81,8 @@ class TestJoinPaths:
     def test_no_paths(self, parts: list[SolvedPaths], max_depth: int, depth: int) -> None:
         joined = join_paths([part for part in parts if part.interactions.shape[1] <= depth], max_depth)
         shapes = {field.name: getattr(joined, field.name).shape for field in dataclasses.fields(joined)}
-        assert {shapes[name] for name in ("path_tx", "path_rx", "a", "delay_s")} == {(0,)}
+        assert {shapes[name] for name in ("path_tx", "path_rx", "delay_s")} == {(0,)}
+        assert shapes["transfer"] == (0, 1, 1)
         assert shapes["departure_rad"] == shapes["arrival_rad"] == (0, 2)
         assert shapes["interactions"] == (0, depth)
         assert shapes["vertices_m"] == (0, depth, 3)
@@ -95,7 +96,7 @@ class TestOfVertices:
         count = len(path_rx)
         return SolvedPaths.of_vertices(
             path_rx=np.array(path_rx, np.int32),
-            a=np.ones(count, np.complex128),
+            transfer=np.ones((count, 1, 1), np.complex128),
             delay_s=np.ones(count),
             interactions=np.array(interactions, np.uint8).reshape(count, 2),
             vertices_m=np.array(vertices_m, np.float32).reshape(count, 2, 3),

@@ -19,7 +19,8 @@ from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import load_sionna
-from sionna_partial.tracing.trace import InvalidLinks, TracedLinks, trace_each, trace_links
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.trace import InvalidLinks, trace_each, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 NO_FLOOR = SceneSettings(floor_extent="none")

@@ -12,8 +12,9 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.link_context import IndirectPaths, LinkContext
 from sionna_partial.prediction.unobserved import Bools, Floats, unobserved_lengths_m
+from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.trace import TracedLinks, link_summary
+from sionna_partial.tracing.trace import link_summary
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,9 @@ from sionna_partial.prediction.unobserved import (
     walled_lengths_m,
 )
 from sionna_partial.prediction.windows import draw_windows, transmitters
+from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.trace import TracedLinks, path_gain_db
+from sionna_partial.tracing.trace import path_gain_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""

@@ -81,14 +81,13 @@ def engine_fault() -> str:
     return fault
 
 
-def open_scene(scene_xml: Path, frequency_hz: float) -> Any:
-    """Load a scene into Sionna RT, its shapes kept apart, with isotropic, vertically polarised antennas."""
+def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> Any:
+    """Load a scene into Sionna RT, its shapes kept apart, with isotropic antennas: vertical, or V and H for 2."""
     rt = load_sionna()
     scene = rt.load_scene(str(scene_xml), merge_shapes=False)
     scene.frequency = frequency_hz
-    scene.tx_array = scene.rx_array = rt.PlanarArray(
-        num_rows=1, num_cols=1, vertical_spacing=0.5, horizontal_spacing=0.5, pattern="iso", polarization="V"
-    )
+    polarization = "V" if polarisations == 1 else "VH"
+    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
     return scene
 
 
@@ -224,15 +223,18 @@ class HeldPaths:
 class SceneSolver:
     """Verifies candidates in one exported scene.
 
-    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none.
+    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none. Transfer
+    matrices of paths are for 1 or 2 polarisations.
     """
 
-    def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
+    def __init__(
+        self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings, polarisations: int = 1
+    ) -> None:
         load_sionna()
         from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
 
         self._settings = settings
-        self._scene = open_scene(scene_xml, settings.frequency_hz)
+        self._scene = open_scene(scene_xml, settings.frequency_hz, polarisations)
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
         self.shapes = [shape.mi_mesh for shape in objects]
         faces = [mesh.face_count() for mesh in self.shapes]
@@ -449,11 +451,11 @@ def _read_buffer(
 ) -> tuple[SolvedPaths, NDArray[np.intp]]:
     """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
-    valid = np.flatnonzero(buffer.valid.numpy())
-    a = buffer.a[0][0]
+    transfer = np.moveaxis([[a.real.numpy() + 1j * a.imag.numpy() for a in row] for row in buffer.a], 2, 0)
+    valid = np.flatnonzero(buffer.valid.numpy() & (transfer[:, 0, 0] != 0.0))
     paths = SolvedPaths.of_vertices(
         path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
-        a=a.real.numpy()[valid].astype(np.float64) + 1j * a.imag.numpy()[valid],
+        transfer=transfer[valid].astype(np.complex128),
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
         interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
         vertices_m=np.stack(

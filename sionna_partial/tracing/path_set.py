@@ -26,8 +26,9 @@ from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
 from sionna_partial.tracing.finder import part_of, write_scene_of
+from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
-from sionna_partial.tracing.trace import TracedLinks, checked_positions, checked_settings, link_summary
+from sionna_partial.tracing.trace import checked_positions, checked_settings, link_summary
 
 PATHS_PER_BLOCK = 50_000
 """Number of paths that are evaluated together, which bounds the memory."""

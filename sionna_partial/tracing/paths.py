@@ -15,16 +15,24 @@ REFLECTION, DIFFUSE, DIFFRACTION = 1, 2, 8
 
 @dataclass(frozen=True)
 class SolvedPaths:
-    """Verified paths in scene coordinates (fields as in `TracedLinks`; D may be less)."""
+    """Verified paths in scene coordinates (fields as in `TracedLinks`; D may be less).
+
+    `transfer` is (P, 1, 1) where only the power between vertically polarised antennas is asked for.
+    """
 
     path_tx: NDArray[np.int32]
     path_rx: NDArray[np.int32]
-    a: NDArray[np.complex128]
+    transfer: NDArray[np.complex128]
     delay_s: NDArray[np.float64]
     departure_rad: NDArray[np.float64]
     arrival_rad: NDArray[np.float64]
     interactions: NDArray[np.uint8]
     vertices_m: NDArray[Any]
+
+    @property
+    def a(self) -> NDArray[np.complex128]:
+        """Complex path gain (P,) between isotropic, vertically polarised antennas."""
+        return self.transfer[:, 0, 0]
 
     @property
     def is_direct(self) -> NDArray[np.bool_]:
@@ -52,7 +60,7 @@ class SolvedPaths:
     def of_vertices(
         cls,
         path_rx: NDArray[np.int32],
-        a: NDArray[np.complex128],
+        transfer: NDArray[np.complex128],
         delay_s: NDArray[np.float64],
         interactions: NDArray[np.uint8],
         vertices_m: NDArray[Any],
@@ -66,9 +74,9 @@ class SolvedPaths:
         direct = (count == 0)[:, None]
         first, last = vertices_m[:, 0], vertices_m[np.arange(len(count)), np.maximum(count, 1) - 1]
         return cls(
-            path_tx=np.zeros(len(a), np.int32),
+            path_tx=np.zeros(len(transfer), np.int32),
             path_rx=path_rx,
-            a=a,
+            transfer=transfer,
             delay_s=delay_s,
             departure_rad=_zenith_azimuth(np.where(direct, rx_m[path_rx], first) - tx_m),
             arrival_rad=_zenith_azimuth(np.where(direct, tx_m, last) - rx_m[path_rx]),
@@ -80,11 +88,11 @@ class SolvedPaths:
 class PathColumns:
     """All paths of a trace, in columns that grow in place: memory should not hold the millions of a dense grid twice.
 
-    A path has at most `depth` interactions.
+    A path has at most `depth` interactions, and is traced for 1 or 2 polarisations.
     """
 
-    def __init__(self, depth: int) -> None:
-        types = _column_types(depth)
+    def __init__(self, depth: int, polarisations: int = 1) -> None:
+        types = _column_types(depth, polarisations)
         self._columns: dict[str, NDArray[Any]] = {
             name: np.zeros((0, *shape), kind) for name, (shape, kind) in types.items()
         }
@@ -92,7 +100,7 @@ class PathColumns:
     def append(self, parts: list[SolvedPaths]) -> None:
         """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
         order = _path_order(parts)
-        row, start = np.empty(len(order), np.int64), len(self._columns["a"])
+        row, start = np.empty(len(order), np.int64), len(self._columns["path_rx"])
         row[order] = start + np.arange(len(order))
         for name, column in self._columns.items():
             column.resize((start + len(order), *column.shape[1:]), refcheck=False)
@@ -112,23 +120,23 @@ class PathColumns:
 class PathFiles:
     """All paths of a trace, in a `.npy` file for each column, in an existing folder."""
 
-    def __init__(self, depth: int, folder: Path) -> None:
-        self._depth, self._folder, self._count = depth, folder, 0
-        for name in _column_types(depth):
+    def __init__(self, depth: int, folder: Path, polarisations: int = 1) -> None:
+        self._folder, self._count, self._room = folder, 0, (depth, polarisations)
+        for name in _column_types(*self._room):
             self._file(name).touch()
         self.close()
 
     def append(self, parts: list[SolvedPaths]) -> None:
         """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
-        joined = join_paths(parts, self._depth)
+        joined = join_paths(parts, *self._room)
         self._count += len(joined.a)
-        for name in _column_types(self._depth):
+        for name in _column_types(*self._room):
             with self._file(name).open("ab") as stream:
                 getattr(joined, name).tofile(stream)
 
     def close(self) -> None:
         """Write the headers, whose length does not depend on the number of paths: the files can be read."""
-        for name, (shape, kind) in _column_types(self._depth).items():
+        for name, (shape, kind) in _column_types(*self._room).items():
             header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": (self._count, *shape)}
             with self._file(name).open("r+b") as stream:
                 np.lib.format.write_array_header_1_0(stream, header)
@@ -144,21 +152,23 @@ def widened(columns: NDArray[Any], depth: int, value: float) -> NDArray[Any]:
     return wide
 
 
-def _column_types(depth: int) -> dict[str, tuple[tuple[int, ...], type]]:
+def _column_types(depth: int, polarisations: int) -> dict[str, tuple[tuple[int, ...], type]]:
     """Shape of an entry, and type, of each column of paths with at most `depth` interactions."""
     shape = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
-    kind = {"path_tx": np.int32, "path_rx": np.int32, "a": np.complex128, "interactions": np.uint8}
+    shape["transfer"] = (polarisations, polarisations)
+    kind = {"path_tx": np.int32, "path_rx": np.int32, "transfer": np.complex128, "interactions": np.uint8}
     return {field.name: (shape.get(field.name, ()), kind.get(field.name, np.float64)) for field in fields(SolvedPaths)}
 
 
-def path_bytes(depth: int) -> int:
+def path_bytes(depth: int, polarisations: int) -> int:
     """Return the size of a path with room for `depth` interactions [bytes]."""
-    return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind in _column_types(depth).values())
+    types = _column_types(depth, polarisations).values()
+    return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind in types)
 
 
-def join_paths(parts: list[SolvedPaths], max_depth: int) -> SolvedPaths:
+def join_paths(parts: list[SolvedPaths], max_depth: int, polarisations: int = 1) -> SolvedPaths:
     """Join lists of paths, ordered by transmitter, receiver and delay."""
-    columns = PathColumns(max(1, max_depth))
+    columns = PathColumns(max(1, max_depth), polarisations)
     columns.append(parts)
     return columns.paths()
 

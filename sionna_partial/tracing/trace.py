@@ -1,11 +1,10 @@
 """Scene + transmitters + receivers -> TracedLinks."""
 
-import json
 import logging
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
@@ -17,7 +16,6 @@ from scipy.spatial import cKDTree
 
 from sionna_partial.checks import Progress, no_progress, require_choice, settings_or_default
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, LinkState
-from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -28,6 +26,7 @@ from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Wedges
 from sionna_partial.tracing.engine import SceneSolver, engine_fault, load_sionna, open_scene
 from sionna_partial.tracing.finder import MeshScene, PlanScene, part_of, write_scene_of
+from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import (
     DIFFRACTION,
     DIFFUSE,
@@ -40,7 +39,7 @@ from sionna_partial.tracing.paths import (
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
 InvalidLinks = Literal["raise", "nan"]
 """What becomes of links that cannot be traced."""
@@ -65,187 +64,6 @@ SAME_EDGE_M = 1e-3
 
 SAMPLE = 100
 """Number of receivers from which the number of all paths is estimated."""
-
-
-@dataclass(frozen=True)
-class TracedLinks(Shown):
-    """Every traced path from one or T transmitters to N receivers.
-
-    Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
-
-    Parameters
-    ----------
-    tx : (3,) or (T, 3) float64 array
-        Transmitter positions [m].
-    rx : (N, 3) float64 array
-        Receiver positions [m].
-    link_state : (N,) or (T, N) uint8 array of LinkState
-        255 where a link was not traced (``invalid="nan"``).
-    gain_db : (N,) or (T, N) float64 array
-        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where a link was not traced.
-    path_tx, path_rx : (P,) int32 arrays
-        Indices of the transmitter and the receiver that each path joins.
-    a : (P,) complex128 array
-        Complex path gain (isotropic antennas, vertical polarisation).
-    delay_s : (P,) float64 array
-        Propagation delay [s].
-    departure_rad, arrival_rad : (P, 2) float64 arrays
-        Zenith and azimuth of departure at the transmitter and of arrival at the receiver [rad].
-    interactions : (P, D) uint8 array
-        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
-    vertices_m : (P, D, 3) float64 array
-        Points of interaction [m]; NaN where there is none.
-    settings : TraceSettings
-        With `diffraction` True or False.
-    scene_settings : SceneSettings
-        With the map's material, if it has one.
-    """
-
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-    link_state: NDArray[np.uint8]
-    gain_db: NDArray[np.float64]
-    path_tx: NDArray[np.int32]
-    path_rx: NDArray[np.int32]
-    a: NDArray[np.complex128]
-    delay_s: NDArray[np.float64]
-    departure_rad: NDArray[np.float64]
-    arrival_rad: NDArray[np.float64]
-    interactions: NDArray[np.uint8]
-    vertices_m: NDArray[np.float64]
-    settings: TraceSettings
-    scene_settings: SceneSettings
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Which links were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
-        return self.link_state != NO_RECEIVER
-
-    def to_xarray(self) -> "xr.Dataset":
-        """Return the links and their paths as a labelled Dataset.
-
-        Its dimensions are "rx", "tx" where there are several transmitters, "path" and "interaction". Variables have
-        `units`, and settings are attributes.
-
-        Returns
-        -------
-        xarray.Dataset
-
-        Examples
-        --------
-        >>> import sionna_partial as sp
-        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
-        >>> links.to_xarray().sizes["rx"], links.to_xarray().gain_db.units
-        (2, 'dB')
-        """
-        import xarray as xr
-
-        link = ("tx", "rx")[2 - self.gain_db.ndim :]
-        shapes = {
-            **{"tx": (*link[:-1], "axis"), "rx": ("rx", "axis"), "link_state": link, "gain_db": link},
-            **dict.fromkeys(("departure_rad", "arrival_rad"), ("path", "angle")),
-            **{"interactions": ("path", "interaction"), "vertices_m": ("path", "interaction", "axis")},
-        }
-        names = [field.name for field in fields(self) if not field.name.endswith("settings")]
-        axes = {"axis": ["x", "y", "z"], "angle": ["zenith", "azimuth"]}
-        table = xr.Dataset(
-            {
-                f"{name}_m" if name in ("tx", "rx") else name: (
-                    shapes.get(name, ("path",)),
-                    getattr(self, name),
-                    _VARIABLES[name],
-                )
-                for name in names
-            },
-            coords=axes,
-            attrs={"frequency_hz": self.settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB},
-        )
-        for name in ("settings", "scene_settings"):
-            table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
-        return table
-
-    def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
-        """Return a row for each link, or for each path, as a pandas.DataFrame.
-
-        Parameters
-        ----------
-        of : {"links", "paths"}
-            Links have the numbers `tx` and `rx` and the positions [m] of their ends, `link_state`, `gain_db`,
-            `distance_m`, the number of `paths` and the shortest `delay_s` (NaN without paths). Paths have `tx`, `rx`,
-            `gain_db`, `phase_rad`, `delay_s`, angles [rad], and `interactions` by Sionna RT's `InteractionType`, such
-            as "1-1-8".
-
-        Returns
-        -------
-        pandas.DataFrame
-
-        Raises
-        ------
-        SettingsError
-            For another value of `of`.
-
-        Examples
-        --------
-        >>> import sionna_partial as sp
-        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
-        >>> links.to_dataframe().distance_m.tolist()
-        [0.5, 1.0]
-        """
-        import xarray as xr
-
-        require_choice("of", of, ("links", "paths"))
-        columns = self._link_columns() if of == "links" else self._path_columns()
-        return (
-            xr.Dataset({name: ("row", values) for name, values in columns.items()})
-            .to_dataframe()
-            .reset_index(drop=True)
-        )
-
-    def _link_columns(self) -> dict[str, NDArray[Any]]:
-        tx_m, count = self.tx.reshape(-1, 3), len(self.rx)
-        tx, rx = np.repeat(np.arange(len(tx_m)), count), np.tile(np.arange(count), len(tx_m))
-        link = self.path_tx.astype(np.int64) * count + self.path_rx
-        first, paths = np.unique(link, return_index=True, return_counts=True)[1:]  # the shortest is listed first
-        delay_s, number = np.full(len(tx), np.nan), np.zeros(len(tx), np.int64)
-        delay_s[link[first]], number[link[first]] = self.delay_s[first], paths
-        ends = {"tx": tx_m[tx], "rx": self.rx[rx]}
-        return {
-            **{"tx": tx, "rx": rx},
-            **{f"{end}_{axis}_m": at for end, at_m in ends.items() for axis, at in zip("xyz", at_m.T, strict=True)},
-            **{"link_state": self.link_state.ravel(), "gain_db": self.gain_db.ravel()},
-            **{"distance_m": np.linalg.norm(ends["rx"] - ends["tx"], axis=1), "paths": number, "delay_s": delay_s},
-        }
-
-    def _path_columns(self) -> dict[str, NDArray[Any]]:
-        angles = {"departure": self.departure_rad, "arrival": self.arrival_rad}
-        kinds = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
-        return {
-            **{"tx": self.path_tx, "rx": self.path_rx},
-            **{"gain_db": 20.0 * np.log10(np.abs(self.a)), "phase_rad": np.angle(self.a), "delay_s": self.delay_s},
-            **{f"{end}_zenith_rad": values[:, 0] for end, values in angles.items()},
-            **{f"{end}_azimuth_rad": values[:, 1] for end, values in angles.items()},
-            "interactions": np.array(kinds, dtype=object),
-        }
-
-
-def _variable(long_name: str, units: str = "1") -> dict[str, str]:
-    return {"long_name": long_name, "units": units}
-
-
-_VARIABLES = {
-    "tx": _variable("transmitter position", "m"),
-    "rx": _variable("receiver position", "m"),
-    "link_state": _variable("link state: 0 outage, 1 LOS, 2 NLOS, 255 not traced"),
-    "gain_db": _variable("omnidirectional path gain", "dB"),
-    "path_tx": _variable("transmitter of the path"),
-    "path_rx": _variable("receiver of the path"),
-    "a": _variable("complex path gain"),
-    "delay_s": _variable("propagation delay", "s"),
-    "departure_rad": _variable("angles of departure", "rad"),
-    "arrival_rad": _variable("angles of arrival", "rad"),
-    "interactions": _variable("Sionna RT's InteractionType in order from the transmitter, 0 for none"),
-    "vertices_m": _variable("points of interaction", "m"),
-}
 
 
 def trace_links(
@@ -334,12 +152,12 @@ def trace_links(
     shape = np.shape(tx)
     with reporting(progress) as report, temporary_folder() as work:
         report(0.0, "building the scene")
-        tracer = Tracer(partial, work, settings, scene_settings)
+        tracer = Tracer(partial, work, settings, scene_settings, polarisations=2)
         tracer.require_memory(tx_m, rx_m, None if folder is not None else memory_gb, valid)
         if folder is None:
             return tracer.links(tx_m.reshape(shape), rx_m, report, valid)
         with atomic_files(folder) as files:
-            columns = PathFiles(max(1, settings.max_depth), files)
+            columns = PathFiles(max(1, settings.max_depth), files, tracer.polarisations)
             link_state, gain_db = tracer.fill(columns, tx_m.reshape(shape), rx_m, report, valid)
             columns.close()
             ends = ("tx", tx_m.reshape(shape)), ("rx", rx_m)
@@ -377,6 +195,7 @@ class Tracer:
     folder: Path
     settings: TraceSettings
     scene_settings: SceneSettings
+    polarisations: int = 1
 
     @cached_property
     def _scene(self) -> PlanScene | MeshScene:
@@ -394,7 +213,9 @@ class Tracer:
         if names:
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
             _log.warning(message, " and ".join(names), self.settings.samples_per_tx)
-        return None if names or engine_fault() else SceneSolver(self._scene.xml, self._scene.shapes, self.settings)
+        if names or engine_fault():
+            return None
+        return SceneSolver(self._scene.xml, self._scene.shapes, self.settings, self.polarisations)
 
     def links(
         self,
@@ -404,7 +225,7 @@ class Tracer:
         valid: NDArray[np.bool_] | None = None,
     ) -> TracedLinks:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
-        columns = PathColumns(max(1, self.settings.max_depth))
+        columns = PathColumns(max(1, self.settings.max_depth), self.polarisations)
         link_state, gain_db = self.fill(columns, tx_m, rx_m, report, valid)
         found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
         return TracedLinks(
@@ -460,7 +281,7 @@ class Tracer:
         some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
         found = sum(len(paths.a) for paths in self.paths(tx_m[source], some, no_progress))
         count = round(found / len(some) * valid.sum())
-        size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth)) / 1e9
+        size_gb = 2 * count * path_bytes(max(1, self.settings.max_depth), self.polarisations) / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)
         if memory_gb is not None and size_gb > memory_gb:
             raise MemoryLimitError(
@@ -484,7 +305,8 @@ class Tracer:
         return (found.paths for found in self._scene.paths(self._solver, tx_m, rx_m, report))
 
     def _shot(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator[SolvedPaths]:
-        for number, paths in enumerate(stock_paths(self._scene.xml, self.settings, tx_m, rx_m), start=1):
+        found = stock_paths(self._scene.xml, self.settings, tx_m, rx_m, self.polarisations)
+        for number, paths in enumerate(found, start=1):
             report(number / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
             if isinstance(self._scene, PlanScene):
                 yield paths.take(diffracted_as_exact(self._scene.wedges, paths, self.settings.diffraction_walls))
@@ -564,7 +386,11 @@ def link_summary(
 
 
 def stock_paths(
-    scene_xml: Path, settings: TraceSettings, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
+    scene_xml: Path,
+    settings: TraceSettings,
+    tx_m: NDArray[np.float64],
+    rx_m: NDArray[np.float64],
+    polarisations: int = 1,
 ) -> Iterator[SolvedPaths]:
     """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
 
@@ -578,7 +404,7 @@ def stock_paths(
         return
     rt = load_sionna()
     try:
-        scene = open_scene(scene_xml, settings.frequency_hz)
+        scene = open_scene(scene_xml, settings.frequency_hz, polarisations)
         receiver = rt.Receiver("rx", position=_point(rx_m[0]))
         scene.add(rt.Transmitter("tx", position=_point(tx_m)))
         scene.add(receiver)
@@ -622,14 +448,15 @@ def _read_paths(
     found: Any, depth: int, index: int, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
 ) -> SolvedPaths:
     """Copy the valid paths of one receiver out of Dr.Jit, each once."""
-    valid = np.flatnonzero(found.valid.numpy().ravel())
-    real, imaginary = (part.numpy().ravel()[valid].astype(np.float64) for part in found.a)
+    real, imaginary = (np.transpose(part.numpy()[0, :, 0], (2, 0, 1)) for part in found.a)
+    transfer = real + 1j * imaginary
+    valid = np.flatnonzero(found.valid.numpy().ravel() & (transfer[:, 0, 0] != 0.0))
     interactions = found.interactions.numpy().reshape(depth, -1)[:, valid].T.astype(np.uint8)
     vertices_m = np.moveaxis(found.vertices.numpy().reshape(depth, -1, 3)[:, valid], 0, 1)
     kept = ~listed_before(interactions, vertices_m)
     return SolvedPaths.of_vertices(
         path_rx=np.full(kept.sum(), index, np.int32),
-        a=(real + 1j * imaginary)[kept],
+        transfer=transfer[valid][kept].astype(np.complex128),
         delay_s=found.tau.numpy().ravel()[valid].astype(np.float64)[kept],
         interactions=interactions[kept],
         vertices_m=vertices_m[kept],

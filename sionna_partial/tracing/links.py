@@ -1,0 +1,206 @@
+"""Traced links: the paths of every link in arrays, and as tables."""
+
+import json
+from dataclasses import asdict, dataclass, fields
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.checks import require_choice
+from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER
+from sionna_partial.display import Shown
+from sionna_partial.settings import SceneSettings, TraceSettings
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class TracedLinks(Shown):
+    """Every traced path from one or T transmitters to N receivers.
+
+    Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
+
+    Parameters
+    ----------
+    tx : (3,) or (T, 3) float64 array
+        Transmitter positions [m].
+    rx : (N, 3) float64 array
+        Receiver positions [m].
+    link_state : (N,) or (T, N) uint8 array of LinkState
+        255 where a link was not traced (``invalid="nan"``).
+    gain_db : (N,) or (T, N) float64 array
+        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where a link was not traced.
+    path_tx, path_rx : (P,) int32 arrays
+        Indices of the transmitter and the receiver that each path joins.
+    transfer : (P, 2, 2) complex128 array
+        Transfer matrix of each path between isotropic antennas: [at the receiver, at the transmitter] along the
+        spherical unit vectors theta and phi of its arrival and departure, without the phase -2 pi f delay_s.
+    delay_s : (P,) float64 array
+        Propagation delay [s].
+    departure_rad, arrival_rad : (P, 2) float64 arrays
+        Zenith and azimuth of departure at the transmitter and of arrival at the receiver [rad].
+    interactions : (P, D) uint8 array
+        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
+    vertices_m : (P, D, 3) float64 array
+        Points of interaction [m]; NaN where there is none.
+    settings : TraceSettings
+        With `diffraction` True or False.
+    scene_settings : SceneSettings
+        With the map's material, if it has one.
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    link_state: NDArray[np.uint8]
+    gain_db: NDArray[np.float64]
+    path_tx: NDArray[np.int32]
+    path_rx: NDArray[np.int32]
+    transfer: NDArray[np.complex128]
+    delay_s: NDArray[np.float64]
+    departure_rad: NDArray[np.float64]
+    arrival_rad: NDArray[np.float64]
+    interactions: NDArray[np.uint8]
+    vertices_m: NDArray[np.float64]
+    settings: TraceSettings
+    scene_settings: SceneSettings
+
+    @property
+    def a(self) -> NDArray[np.complex128]:
+        """Complex path gain (P,) between isotropic, vertically polarised antennas: ``transfer[:, 0, 0]``."""
+        return self.transfer[:, 0, 0]
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """Which links were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
+        return self.link_state != NO_RECEIVER
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Return the links and their paths as a labelled Dataset.
+
+        Its dimensions are "rx", "tx" where there are several transmitters, "path" and "interaction". Variables have
+        `units`, and settings are attributes.
+
+        Returns
+        -------
+        xarray.Dataset
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
+        >>> links.to_xarray().sizes["rx"], links.to_xarray().gain_db.units
+        (2, 'dB')
+        """
+        import xarray as xr
+
+        link = ("tx", "rx")[2 - self.gain_db.ndim :]
+        shapes = {
+            **{"tx": (*link[:-1], "axis"), "rx": ("rx", "axis"), "link_state": link, "gain_db": link},
+            **dict.fromkeys(("departure_rad", "arrival_rad"), ("path", "angle")),
+            **{"interactions": ("path", "interaction"), "vertices_m": ("path", "interaction", "axis")},
+            "transfer": ("path", "at_rx", "at_tx"),
+        }
+        names = [*(field.name for field in fields(self) if not field.name.endswith("settings")), "a"]
+        along = ["theta", "phi"]
+        axes = {"axis": ["x", "y", "z"], "angle": ["zenith", "azimuth"], "at_rx": along, "at_tx": along}
+        table = xr.Dataset(
+            {
+                f"{name}_m" if name in ("tx", "rx") else name: (
+                    shapes.get(name, ("path",)),
+                    getattr(self, name),
+                    _VARIABLES[name],
+                )
+                for name in names
+            },
+            coords=axes,
+            attrs={"frequency_hz": self.settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB},
+        )
+        for name in ("settings", "scene_settings"):
+            table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
+        return table
+
+    def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
+        """Return a row for each link, or for each path, as a pandas.DataFrame.
+
+        Parameters
+        ----------
+        of : {"links", "paths"}
+            Links have the numbers `tx` and `rx` and the positions [m] of their ends, `link_state`, `gain_db`,
+            `distance_m`, the number of `paths` and the shortest `delay_s` (NaN without paths). Paths have `tx`, `rx`,
+            `gain_db`, `phase_rad`, `delay_s`, angles [rad], and `interactions` by Sionna RT's `InteractionType`, such
+            as "1-1-8".
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Raises
+        ------
+        SettingsError
+            For another value of `of`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
+        >>> links.to_dataframe().distance_m.tolist()
+        [0.5, 1.0]
+        """
+        import xarray as xr
+
+        require_choice("of", of, ("links", "paths"))
+        columns = self._link_columns() if of == "links" else self._path_columns()
+        return (
+            xr.Dataset({name: ("row", values) for name, values in columns.items()})
+            .to_dataframe()
+            .reset_index(drop=True)
+        )
+
+    def _link_columns(self) -> dict[str, NDArray[Any]]:
+        tx_m, count = self.tx.reshape(-1, 3), len(self.rx)
+        tx, rx = np.repeat(np.arange(len(tx_m)), count), np.tile(np.arange(count), len(tx_m))
+        link = self.path_tx.astype(np.int64) * count + self.path_rx
+        first, paths = np.unique(link, return_index=True, return_counts=True)[1:]  # the shortest is listed first
+        delay_s, number = np.full(len(tx), np.nan), np.zeros(len(tx), np.int64)
+        delay_s[link[first]], number[link[first]] = self.delay_s[first], paths
+        ends = {"tx": tx_m[tx], "rx": self.rx[rx]}
+        return {
+            **{"tx": tx, "rx": rx},
+            **{f"{end}_{axis}_m": at for end, at_m in ends.items() for axis, at in zip("xyz", at_m.T, strict=True)},
+            **{"link_state": self.link_state.ravel(), "gain_db": self.gain_db.ravel()},
+            **{"distance_m": np.linalg.norm(ends["rx"] - ends["tx"], axis=1), "paths": number, "delay_s": delay_s},
+        }
+
+    def _path_columns(self) -> dict[str, NDArray[Any]]:
+        angles = {"departure": self.departure_rad, "arrival": self.arrival_rad}
+        kinds = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
+        return {
+            **{"tx": self.path_tx, "rx": self.path_rx},
+            **{"gain_db": 20.0 * np.log10(np.abs(self.a)), "phase_rad": np.angle(self.a), "delay_s": self.delay_s},
+            **{f"{end}_zenith_rad": values[:, 0] for end, values in angles.items()},
+            **{f"{end}_azimuth_rad": values[:, 1] for end, values in angles.items()},
+            "interactions": np.array(kinds, dtype=object),
+        }
+
+
+def _variable(long_name: str, units: str = "1") -> dict[str, str]:
+    return {"long_name": long_name, "units": units}
+
+
+_VARIABLES = {
+    "tx": _variable("transmitter position", "m"),
+    "rx": _variable("receiver position", "m"),
+    "link_state": _variable("link state: 0 outage, 1 LOS, 2 NLOS, 255 not traced"),
+    "gain_db": _variable("omnidirectional path gain", "dB"),
+    "path_tx": _variable("transmitter of the path"),
+    "path_rx": _variable("receiver of the path"),
+    "transfer": _variable("transfer matrix of the path between isotropic antennas"),
+    "a": _variable("complex path gain between isotropic, vertically polarised antennas"),
+    "delay_s": _variable("propagation delay", "s"),
+    "departure_rad": _variable("angles of departure", "rad"),
+    "arrival_rad": _variable("angles of arrival", "rad"),
+    "interactions": _variable("Sionna RT's InteractionType in order from the transmitter, 0 for none"),
+    "vertices_m": _variable("points of interaction", "m"),
+}
