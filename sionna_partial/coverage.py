@@ -40,6 +40,7 @@ from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
 from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.finder import part_of
 from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, nearest_m
 
 MAX_RECEIVERS = 2_000_000
@@ -53,6 +54,12 @@ COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_
 
 RECEIVERS = ("indoor", "anywhere")
 """Whose probabilities and gains they are; the first is the default."""
+
+TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
+"""Positions [m] along the dimension "tx" of the maps of several transmitters."""
+
+_OF_ALL = ("observed", "cell_state", "wall_parts")
+"""Variables that do not depend on the transmitter."""
 
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
@@ -129,7 +136,7 @@ class _Receivers:
 
 def predict_map(
     scene: PartialMap | str | Path,
-    tx: ArrayLike,
+    tx: ArrayLike | Mapping[str, ArrayLike],
     *,
     rx_height_m: float = DEFAULT_HEIGHT_M,
     spacing_m: float = 0.15,
@@ -158,8 +165,9 @@ def predict_map(
     ----------
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
-    tx : (3,) or (2,) array-like
-        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space.
+    tx : (3,) or (2,) array-like, (T, 3) array-like, or mapping of names to positions
+        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx0",
+        "tx1" and so on, or as in the mapping.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
@@ -184,6 +192,7 @@ def predict_map(
     -------
     xarray.Dataset
         On (y, x), in metres: the variables of `ATTRIBUTES`, and the settings, versions and predictor in attributes.
+        With several transmitters what depends on them is on (tx, y, x); ``.sel(tx=name)`` is the map of one.
 
     Raises
     ------
@@ -219,62 +228,65 @@ def predict_map(
         settings_or_default("scene_settings", scene_settings, SceneSettings),
     )
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    tx_m = _transmitter(partial, tx)
-    grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
-    at_once = _receivers_at_once(partial, grid, memory_gb)
-    complete = bool(is_enclosed(partial, tx_m[None], tx_m[None])[0])
+    names, positions_m = _transmitters(partial, tx)
+    grids = [_receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz) for tx_m in positions_m]
+    at_once = _receivers_at_once(partial, grids[0], memory_gb)
+    complete = bool(is_enclosed(partial, positions_m[:1], positions_m[:1])[0])
     model = None
     if predictor is not None or not complete:
         loaded = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    columns: list[dict[str, NDArray[Any]]] = []
-    measured = None if measurements is None else _measured(partial, tx_m, measurements, trace_settings.frequency_hz)
+    measured = _measured_of_each(partial, positions_m, measurements, trace_settings.frequency_hz)
+    provenance = _provenance(partial, model, scene_settings, trace_settings)
+    maps = []
     with reporting(progress) as report, temporary_folder() as work:
         report(0.0, "building the scene")
-        links = _Links(partial, tx_m, Tracer(partial, work, trace_settings, scene_settings), model)
-        told = None if measured is None else _assimilated(links, measured, at_once)
-        for start in range(0, len(grid.rx_m), at_once):
-
-            def within(fraction: float, message: str, start: int = start) -> None:
-                report(min(0.99, (start + fraction * at_once) / len(grid.rx_m)), message)
-
-            rx_m = grid.rx_m[start : start + at_once]
-            phi, prediction = links.predict(rx_m, within)
-            if told is not None:
-                prediction = told.update(rx_m, prediction)
-            columns.append(_columns(phi, prediction, links.p_indoor(rx_m, phi), anywhere=receivers == "anywhere"))
+        tracer = Tracer(partial, work, trace_settings, scene_settings)
+        for number, (tx_m, grid) in enumerate(zip(positions_m, grids, strict=True)):
+            part = part_of(report, number / len(grids), (number + 1) / len(grids))
+            links = _Links(partial, tx_m, tracer, model)
+            known = measured[number]
+            told = None if known is None else _assimilated(links, known, at_once)
+            variables = _predicted(links, grid, at_once, told, part, anywhere=receivers == "anywhere")
+            variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
+            attributes = {
+                **provenance,
+                "transmitter_m": tx_m,
+                "rx_height_m": float(rx_height_m),
+                "spacing_m": float(spacing_m),
+                "receivers": receivers,
+            }
+            if known is not None and told is not None:
+                attributes |= {
+                    "measured_links": len(known),
+                    "measured_noise_db": told.noise_db,
+                    "measured_offset_db": told.offset_db,
+                }
+            maps.append(_label(grid, variables, attributes))
         report(1.0, "done")
-    variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
-    variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
-    attributes = {
-        **_provenance(partial, model, scene_settings, trace_settings),
-        "transmitter_m": tx_m,
-        "rx_height_m": float(rx_height_m),
-        "spacing_m": float(spacing_m),
-        "receivers": receivers,
-    }
-    if measured is not None and told is not None:
-        attributes |= {
-            "measured_links": len(measured),
-            "measured_noise_db": told.noise_db,
-            "measured_offset_db": told.offset_db,
-        }
-    return _label(grid, variables, attributes)
+    return maps[0] if names is None else _together(maps, names)
 
 
-def require_coverage(coverage: xr.Dataset) -> None:
-    """Raise a SettingsError unless `coverage` has what `predict_map` returns."""
+def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
+    """Return the coverage of one transmitter, `transmitter_m` in its attributes; a SettingsError for anything else."""
     remedy = "give the xarray.Dataset that predict_map returned, or load it from its .nc file."
     kind = type(coverage).__name__
     if not isinstance(coverage, xr.Dataset):
         raise SettingsError(f"coverage is of type {kind}: {remedy}")
+    if "tx" in coverage.dims:
+        names = ", ".join(map(str, coverage["tx"].to_numpy()))
+        raise SettingsError(f"coverage has the transmitters {names}: choose one, as by coverage.isel(tx=0).")
+    if "tx" in coverage.coords:
+        position_m = np.array([float(coverage[name]) for name in TX_COORDINATES])
+        coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
     missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
     missing += [name for name in ("x", "y") if name not in coverage.coords]
     missing += [name for name in ("transmitter_m", "spacing_m", "frequency_hz") if name not in coverage.attrs]
     if missing or not coverage["valid"].size:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
+    return coverage
 
 
 def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
@@ -324,8 +336,7 @@ class CoverageAccessor:
         SettingsError
             For a threshold that is no number of dB.
         """
-        require_coverage(self._coverage)
-        above = probability_above(self._coverage, threshold_db)
+        above = probability_above(require_coverage(self._coverage), threshold_db)
         attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
         values = self._coverage["p_los"].copy(data=above.astype(np.float32))
         return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
@@ -348,9 +359,9 @@ class CoverageAccessor:
         return self._coverage.sel(x=x, y=y, method="nearest")
 
     def __repr__(self) -> str:
-        require_coverage(self._coverage)
-        rows, columns = self._coverage["valid"].shape
-        attributes = self._coverage.attrs
+        coverage = require_coverage(self._coverage)
+        rows, columns = coverage["valid"].shape
+        attributes = coverage.attrs
         grid = f"{columns} x {rows} receivers, {attributes['spacing_m']:g} m apart"
         tx = ", ".join(f"{each:.2f}" for each in attributes["transmitter_m"])
         return f"<coverage: {grid}, transmitter at ({tx}) m, {attributes['frequency_hz'] / 1e9:g} GHz>"
@@ -367,12 +378,15 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     return clear
 
 
-def _transmitter(partial: PartialMap, tx: ArrayLike) -> Floats:
-    tx = real_array("tx", tx, PositionError, "give x, y and z in metres.")
-    tx_m = partial.require_positions("tx", np.append(tx, DEFAULT_HEIGHT_M) if tx.shape == (2,) else tx)
-    if tx_m.ndim != 1:
-        raise PositionError(f"tx has shape {tx_m.shape}: give one transmitter (3,), and call once for each.")
-    return tx_m
+def _transmitters(partial: PartialMap, tx: ArrayLike | Mapping[str, ArrayLike]) -> tuple[list[str] | None, Floats]:
+    """Names of several transmitters, None for one, and positions (T, 3) [m]."""
+    positions = list(tx.values()) if isinstance(tx, Mapping) else tx
+    positions = real_array("tx", positions, PositionError, "give x, y and z in metres, the same for all transmitters.")
+    if positions.shape[-1:] == (2,):
+        positions = np.insert(positions, 2, DEFAULT_HEIGHT_M, axis=-1)
+    tx_m = partial.require_positions("tx", positions)
+    names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
+    return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)
 
 
 def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
@@ -470,9 +484,23 @@ class _Links:
         return np.where(free, 1.0, 0.0 if self.model is None else self.model.predict_indoor(phi))
 
 
-def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz: float) -> Measurements:
-    """Read the measurements of this transmitter whose receivers are at places where links can be predicted."""
+def _measured_of_each(
+    partial: PartialMap, positions_m: Floats, measurements: Any, frequency_hz: float
+) -> list[Measurements | None]:
+    """Read the measurements of each transmitter; one at least has some."""
+    if measurements is None:
+        return [None] * len(positions_m)
     measured = measurements_of(measurements)
+    near = [bool((np.linalg.norm(measured.tx - tx_m, axis=1) <= SAME_TX_M).any()) for tx_m in positions_m]
+    near[0] |= not any(near)
+    return [
+        _measured(partial, tx_m, measured, frequency_hz) if is_near else None
+        for tx_m, is_near in zip(positions_m, near, strict=True)
+    ]
+
+
+def _measured(partial: PartialMap, tx_m: Floats, measured: Measurements, frequency_hz: float) -> Measurements:
+    """Take the measurements of this transmitter whose receivers are at places where links can be predicted."""
     apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
     if not (apart_m <= SAME_TX_M).any():
         nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
@@ -515,6 +543,21 @@ def _assimilated(links: _Links, measured: Measurements, at_once: int) -> Assimil
             "above" if told.offset_db > 0 else "below",
         )
     return told
+
+
+def _predicted(
+    links: _Links, grid: _Receivers, at_once: int, told: Assimilation | None, report: Progress, *, anywhere: bool
+) -> dict[str, NDArray[Any]]:
+    """Predict all links of a transmitter, some at a time, and return the variables on the grid."""
+    columns: list[dict[str, NDArray[Any]]] = []
+    for start in range(0, len(grid.rx_m), at_once):
+        ends = (min(0.99, each / len(grid.rx_m)) for each in (start, start + at_once))
+        rx_m = grid.rx_m[start : start + at_once]
+        phi, prediction = links.predict(rx_m, part_of(report, *ends))
+        if told is not None:
+            prediction = told.update(rx_m, prediction)
+        columns.append(_columns(phi, prediction, links.p_indoor(rx_m, phi), anywhere=anywhere))
+    return _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
 
 
 def _columns(
@@ -603,6 +646,16 @@ def _provenance(
         "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
         "predictor_sha256": "" if model is None else model.fingerprint,
     }
+
+
+def _together(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
+    """Join the maps of several transmitters along a dimension "tx"."""
+    positions_m = np.array([each.attrs.pop("transmitter_m") for each in maps])
+    coordinates = {
+        name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
+    }
+    joined = xr.concat([each.drop_vars(_OF_ALL) for each in maps], "tx", combine_attrs="drop_conflicts")
+    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords(tx=names, **coordinates)
 
 
 def _label(receivers: _Receivers, variables: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> xr.Dataset:

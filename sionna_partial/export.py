@@ -39,7 +39,8 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a coverage map, in the format that the suffix names. Equal maps give equal files.
 
     ======== ==========================================================================================
-    `.nc`    NetCDF 4 (CF conventions), everything: `xarray.load_dataset` returns an equal Dataset.
+    `.nc`    NetCDF 4 (CF conventions), everything: `xarray.load_dataset` returns an equal Dataset. The others hold one
+             transmitter.
     `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN where no receiver stands;
              local metres, no coordinate reference system; the settings as tags.
     `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands.
@@ -73,9 +74,12 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     >>> sp.save_coverage(coverage, "coverage.nc")
     >>> sp.save_coverage(coverage, "coverage.csv")
     """
-    require_coverage(coverage)
     target = output_path(path)
     suffix = target.suffix.lower()
+    if suffix == ".nc" and isinstance(coverage, xr.Dataset) and "tx" in coverage.dims:
+        require_coverage(coverage.isel(tx=0))
+    else:
+        coverage = require_coverage(coverage)
     if suffix not in FORMATS:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(FORMATS)}.")
     if suffix == ".yaml":
@@ -116,7 +120,7 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
         coverage = xr.load_dataset(io.BytesIO(content), engine="h5netcdf")
     except Exception as error:
         raise SettingsError(f"path = '{path}' is no NetCDF file ({error}): give one of save_coverage.") from error
-    require_coverage(coverage)
+    require_coverage(coverage.isel(tx=0) if "tx" in coverage.dims else coverage)
     return coverage
 
 

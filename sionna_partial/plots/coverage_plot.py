@@ -120,7 +120,7 @@ def plot_coverage(
     >>> figure.savefig("coverage.png")
     >>> states = sp.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
     """
-    require_coverage(coverage)
+    coverage = require_coverage(coverage)
     chosen = _choose(layers, threshold_db)
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
     columns = sheet_columns(len(chosen), aspect)
@@ -145,8 +145,7 @@ def plot_comparison(
     The walls of the first are drawn grey in the others where these do not contain them.
     """
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
-    for coverage in coverages.values():
-        require_coverage(coverage)
+    coverages = {title: require_coverage(coverage) for title, coverage in coverages.items()}
     first, *others = coverages.values()
     chosen = _choose(layers, -100.0)
     figure, axes = _panels(len(chosen), len(coverages), first.sizes["x"] / first.sizes["y"], keys_in=1.6)

@@ -99,7 +99,7 @@ class PathColumns:
 
     def append(self, parts: list[SolvedPaths]) -> None:
         """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
-        order = _path_order(parts)
+        order = path_order(parts)
         row, start = np.empty(len(order), np.int64), len(self._columns["path_rx"])
         row[order] = start + np.arange(len(order))
         for name, column in self._columns.items():
@@ -173,7 +173,7 @@ def join_paths(parts: list[SolvedPaths], max_depth: int, polarisations: int = 1)
     return columns.paths()
 
 
-def _path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
+def path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
     """Order of all paths by transmitter, receiver and delay; Sionna RT's delays have single precision."""
     if not parts:
         return np.zeros(0, np.int64)

@@ -1,0 +1,187 @@
+"""How good draws of channels are where a map is partial, on homes that nothing was trained on.
+
+In every home a robot explores; links between random points indoors are traced in the whole home, and drawn on what the
+robot has seen. Scores of the draws of each link, by ends in observed cells: energy score over gain, delay spread and
+azimuth spreads (in units of 10 dB, 5 ns and 20 degrees; no paths count -150 dB and 0), continuous ranked probability
+score (CRPS) of each, and how often the 90 % interval holds the truth. Opponents: the trace of the partial map alone,
+and draws of TR 38.901 InH-office (table 7.5-6, 28 GHz) at the distance of the link, with link states as predicted, or
+(with an advantage that no user has) LOS as it is. The joint part compares draws with independent ones: the probability
+that all transmitters fail, and the fraction of receivers in outage. Run
+
+    python benchmarks/channel_samples.py ../shared/gibson/*/map.yaml
+    python benchmarks/channel_samples.py --made 12
+"""
+
+import argparse
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+from measurements import FIRST_SEED, points
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+
+STEPS, TRANSMITTERS, RECEIVERS, DRAWS, NEAREST_M = (0, 50, 100, 200), 3, 40, 100, 0.15
+UNITS = np.array([10.0, 5.0, 20.0, 20.0])
+COLUMNS = ("gain [dB]", "delay spread [ns]", "ASD [deg]", "ASA [deg]")
+METHODS = ("draws", "partial trace", "38.901, predicted states", "38.901, true LOS")
+Floats = NDArray[np.float64]
+
+
+def main() -> None:
+    """Score all homes, print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("maps", nargs="*", type=Path, help="complete maps")
+    parser.add_argument("--made", type=int, default=0, help="number of procedural homes")
+    arguments = parser.parse_args()
+    homes = [(path.parent.name, sp.load_map(path)) for path in arguments.maps]
+    homes += [(f"make_home({seed})", sp.make_home(seed)) for seed in range(FIRST_SEED, FIRST_SEED + arguments.made)]
+    scores: dict[tuple[str, str], list[Floats]] = defaultdict(list)
+    joint: list[Floats] = []
+    for seed, (name, home) in enumerate(homes):
+        rng = np.random.default_rng(seed)
+        of_home: dict[tuple[str, str], list[Floats]] = defaultdict(list)
+        for partial in sp.explore(home, STEPS, seed):
+            tx_m, rx_m = (points(home, partial, count, rng) for count in (TRANSMITTERS, RECEIVERS))
+            rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > NEAREST_M]
+            joint.append(score_map(home, partial, tx_m, rx_m, seed, of_home))
+        for key, values in of_home.items():
+            scores[key].append(np.concatenate(values).mean(axis=0))
+        print(f"{name} done", flush=True)
+    print_links(scores)
+    print_joint(np.array(joint))
+
+
+def score_map(
+    home: sp.PartialMap,
+    partial: sp.PartialMap,
+    tx_m: Floats,
+    rx_m: Floats,
+    seed: int,
+    scores: dict[tuple[str, str], list[Floats]],
+) -> Floats:
+    """Score the links of one partial map; return its joint scores."""
+    true, known = (sp.trace_links(each, tx_m, rx_m, progress=False) for each in (home, partial))
+    samples = sp.sample_channels(partial, tx_m, rx_m, DRAWS, seed, progress=False)
+    truth, trace = values(true)[0], values(known)[0]
+    drawn = values(samples.drawn, DRAWS)
+    distance_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
+    states = samples.link_state.reshape(DRAWS, -1)
+    rng = np.random.default_rng(seed)
+    standard = [indoor_office(distance_m, each, rng) for each in (states, np.tile(true.link_state.ravel(), (DRAWS, 1)))]
+    seen = [partial.state_at(end_m) == sp.CellState.FREE for end_m in (tx_m, rx_m)]
+    both = seen[0][:, None] + 2 * seen[1][None]
+    groups = np.array(["no end seen", "transmitter seen", "receiver seen", "both seen"])[both.ravel()]
+    for method, draws in zip(METHODS, (drawn, trace[None], *standard), strict=True):
+        rows = np.array([score(draws[:, link], truth[link]) for link in range(len(truth))])
+        for group in ("all links", *np.unique(groups)):
+            scores[group, method].append(rows[(groups == group) | (group == "all links")])
+    return joint_scores(samples.link_state, true.link_state)
+
+
+def values(links: sp.TracedLinks, draws: int = 1) -> Floats:
+    """Gain [dB], delay spread [ns] and azimuth spreads [deg] (draws, L, 4) of links; nothing where there is no path."""
+    count = links.gain_db.size
+    link = links.path_tx.astype(np.int64) * len(links.rx) + links.path_rx
+    power = np.abs(links.a) ** 2
+
+    def total(weights: Floats) -> Floats:
+        return np.bincount(link, weights=weights, minlength=count)
+
+    whole = np.maximum(total(power), 1e-30)
+    delay_ns = links.delay_s * 1e9
+    mean_ns = total(power * delay_ns) / whole
+    spread_ns = np.sqrt(total(power * (delay_ns - mean_ns[link]) ** 2) / whole)
+    columns = [links.gain_db.ravel(), spread_ns]
+    for azimuth_rad in (links.departure_rad[:, 1], links.arrival_rad[:, 1]):
+        resultant = np.hypot(total(power * np.cos(azimuth_rad)), total(power * np.sin(azimuth_rad))) / whole
+        resultant = np.where(whole > 1e-30, np.clip(resultant, 1e-9, 1.0), 1.0)
+        columns.append(np.degrees(np.sqrt(-2.0 * np.log(resultant))))
+    return np.stack(columns, axis=1).reshape(draws, -1, len(columns))
+
+
+def indoor_office(distance_m: Floats, states: NDArray[np.uint8], rng: np.random.Generator) -> Floats:
+    """Draws (n, L, 4) of TR 38.901 InH-office at 28 GHz given link states (n, L)."""
+    distance_m, log = np.maximum(distance_m, 1.0), np.log10(29.0)
+    los = states == sp.LinkState.LOS
+    z = rng.standard_normal((*states.shape, 4))
+    loss_db = 32.4 + 17.3 * np.log10(distance_m) + 20.0 * np.log10(28.0)
+    nlos_db = np.maximum(loss_db, 17.3 + 38.3 * np.log10(distance_m) + 24.9 * np.log10(28.0))
+    gain_db = -np.where(los, loss_db + 3.0 * z[..., 0], nlos_db + 8.03 * z[..., 0])
+    spread_ns = 1e9 * 10.0 ** np.where(
+        los, -0.01 * log - 7.692 + 0.18 * z[..., 1], -0.28 * log - 7.173 + (0.10 * log + 0.055) * z[..., 1]
+    )
+    departure = 10.0 ** np.where(los, 1.60 + 0.18 * z[..., 2], 1.62 + 0.25 * z[..., 2])
+    arrival = 10.0 ** np.where(
+        los,
+        -0.19 * log + 1.781 + (0.12 * log + 0.119) * z[..., 3],
+        -0.11 * log + 1.863 + (0.12 * log + 0.059) * z[..., 3],
+    )
+    drawn = np.stack([gain_db, spread_ns, np.minimum(departure, 104.0), np.minimum(arrival, 104.0)], axis=-1)
+    drawn[states == sp.LinkState.OUTAGE] = [-150.0, 0.0, 0.0, 0.0]
+    return drawn
+
+
+def score(draws: Floats, truth: Floats) -> Floats:
+    """Energy score, CRPS of each column, and whether the 90 % intervals hold the truth, of draws (n, 4)."""
+    first, second = draws / UNITS, np.roll(draws, 1, axis=0) / UNITS
+    pairs = np.abs(draws[:, None] - draws).mean(axis=(0, 1))
+    spread = np.linalg.norm(first[:, None] - first, axis=2).mean() if len(draws) > 1 else np.linalg.norm(first - second)
+    energy = np.linalg.norm(first - truth / UNITS, axis=1).mean() - 0.5 * spread
+    crps = np.abs(draws - truth).mean(axis=0) - 0.5 * pairs
+    low, high = np.percentile(draws, [5, 95], axis=0)
+    return np.concatenate([[energy], crps, (low - 1e-6 <= truth) & (truth <= high + 1e-6)])
+
+
+def joint_scores(drawn: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Floats:
+    """Brier scores of "all transmitters fail", their means, and CRPS of the fraction in outage: joint, independent."""
+    fails, fail = drawn == sp.LinkState.OUTAGE, truth == sp.LinkState.OUTAGE
+    together, alone = fails.all(axis=1).mean(axis=0), fails.mean(axis=0).prod(axis=0)
+    true = fail.all(axis=0)
+    rng = np.random.default_rng(0)
+    shuffled = rng.permuted(fails, axis=0)
+    crps = []
+    for draws in (fails, shuffled):
+        fraction = draws.mean(axis=(1, 2))
+        spread = np.abs(fraction[:, None] - fraction).mean()
+        crps.append(np.abs(fraction - fail.mean()).mean() - 0.5 * spread)
+    brier = [float(((each - true) ** 2).mean()) for each in (together, alone)]
+    return np.array([*brier, together.mean(), alone.mean(), true.mean(), *crps])
+
+
+def print_links(scores: dict[tuple[str, str], list[Floats]]) -> None:
+    """Print a table for each group, means over homes, and the paired lead in energy score over the opponents."""
+    for group in dict.fromkeys(key[0] for key in scores):
+        print(f"\n{group} ({len(scores[group, METHODS[0]])} homes)\n")
+        print(
+            "| | energy score | " + " | ".join(f"CRPS {each}" for each in COLUMNS) + " | 90 % intervals hold | lead |"
+        )
+        print("|---|---|---|---|---|---|---|---|")
+        ours = np.array(scores[group, METHODS[0]])
+        for method in METHODS:
+            rows = np.array(scores[group, method])
+            mean, lead = rows.mean(axis=0), rows[:, 0] - ours[:, 0]
+            held = "/".join(f"{each:.2f}" for each in mean[5:]) if method != METHODS[1] else ""
+            ahead = f"{lead.mean():.2f} +- {lead.std(ddof=1) / np.sqrt(len(lead)):.2f}" if lead.any() else ""
+            print(
+                f"| {method} | {mean[0]:.3f} | {' | '.join(f'{each:.2f}' for each in mean[1:5])} | {held} | {ahead} |"
+            )
+
+
+def print_joint(rows: Floats) -> None:
+    """Print what joint draws add to independent ones, means over maps and paired differences."""
+    mean = rows.mean(axis=0)
+    print("\n| | joint draws | independent draws | truth | difference |\n|---|---|---|---|---|")
+    for name, first, second, truth in (
+        ("all transmitters fail: Brier score", 0, 1, ""),
+        ("all transmitters fail: probability", 2, 3, f"{mean[4]:.3f}"),
+        ("fraction of links in outage: CRPS", 5, 6, ""),
+    ):
+        difference = rows[:, second] - rows[:, first]
+        error = difference.std(ddof=1) / np.sqrt(len(rows))
+        print(f"| {name} | {mean[first]:.4f} | {mean[second]:.4f} | {truth} | {difference.mean():.4f} +- {error:.4f} |")
+
+
+if __name__ == "__main__":
+    main()

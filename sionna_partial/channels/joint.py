@@ -1,0 +1,114 @@
+"""What links through the same unseen space have in common: Gaussian latents, one for each link and draw.
+
+Every link is a weighted sum of one Gaussian field over the plane along its direct line, as in the network shadowing
+model of Agrawal and Patwari (Correlated Link Shadow Fading in Multi-Hop Wireless Networks, IEEE Transactions on
+Wireless Communications, 2009); unknown cells weigh most. Links whose lines cross the same unknown cells fail together.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.special import ndtri
+
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.predictor import LinkPrediction
+
+Floats = NDArray[np.float64]
+
+REACH_M = 1.0
+"""Distance over which the field decorrelates: its correlation is exp(-(d / reach)^2 / 2) [m]."""
+
+KNOWN_WEIGHT = 0.1
+"""Weight of a known cell, in weights of an unknown one."""
+
+OWN_VARIANCE = 0.1
+"""Fraction of a latent's variance that no other link shares. All three maximise the likelihood of pairs of link states
+on homes of `make_home` (`benchmarks/channels.py joint`)."""
+
+_CELL_M, _MOST_CELLS = 0.35, 4096
+_POINTS = 48
+_FEWEST_DRAWS, _LINKS_AT_ONCE = 64, 1000
+
+
+@dataclass(frozen=True, eq=False)
+class JointLatents:
+    """Standard normal latents of links on a map, alike for links through the same unknown cells."""
+
+    partial: PartialMap
+
+    def correlation(self, tx_m: Floats, rx_m: Floats) -> Floats:
+        """Correlation (L, L) of the latents of links between `tx_m` (L, 3) and `rx_m` (L, 3) [m]."""
+        smooth = np.concatenate([*self._smoothed(tx_m, rx_m)])
+        return (1.0 - OWN_VARIANCE) * (smooth @ smooth.T) + OWN_VARIANCE * np.eye(len(smooth))
+
+    def quantiles(self, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]) -> Floats:
+        """Draw `count` times: quantiles (count, L) in (0, 1), evenly spread for each link."""
+        rng, draws = np.random.default_rng(seed), max(count, _FEWEST_DRAWS)
+        field = rng.standard_normal((math.prod(self._shape), draws))
+        shared = np.concatenate([rows @ field for rows in self._smoothed(tx_m, rx_m)])
+        latent = math.sqrt(1.0 - OWN_VARIANCE) * shared
+        latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape)
+        rank = latent.argsort(axis=1).argsort(axis=1)[:, :count]
+        return ((rank + rng.random(rank.shape)) / draws).T
+
+    def draw(
+        self, links: LinkPrediction, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]
+    ) -> tuple[NDArray[np.uint8], Floats]:
+        """Draw states and gains (count, T, N) [dB] of predicted links (T, N) from `tx_m` (T, 3) to `rx_m` (N, 3) [m].
+
+        The lowest quantiles of a link are its outages, the highest its LOS, and the gain of each state has quantiles of
+        its own.
+        """
+        ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
+        shape = (count, len(tx_m), len(rx_m))
+        of_state, of_gain = (self.quantiles(*ends, count, [*seed, number]).reshape(shape) for number in (0, 1))
+        probabilities, means_db, stds_db = links.by_state
+        p_outage = probabilities[LinkState.OUTAGE]
+        state = np.where(of_state < p_outage + probabilities[LinkState.NLOS], LinkState.NLOS, LinkState.LOS)
+        state = np.where(of_state < p_outage, LinkState.OUTAGE, state).astype(np.uint8)
+        mean_db, std_db = (np.take_along_axis(each, state.astype(np.intp), axis=0) for each in (means_db, stds_db))
+        gain_db = np.clip(mean_db + std_db * ndtri(of_gain), GAIN_FLOOR_DB, 0.0)
+        return state, np.where(state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+
+    @cached_property
+    def _step(self) -> int:
+        """Edge of a cell of the field, in cells of the map."""
+        edge_m = max(_CELL_M, math.sqrt(self.partial.state.size / _MOST_CELLS) * self.partial.resolution_m)
+        return max(1, math.ceil(edge_m / self.partial.resolution_m))
+
+    @property
+    def _shape(self) -> tuple[int, int]:
+        ny, nx = self.partial.shape
+        return -(-ny // self._step), -(-nx // self._step)
+
+    @cached_property
+    def _weight(self) -> Floats:
+        """Weights of the cells of the field (ny nx,)."""
+        (ny, nx), step = self._shape, self._step
+        padding = [(0, -count % step) for count in self.partial.shape]
+        unknown = np.pad(self.partial.state == CellState.UNKNOWN, padding, constant_values=True)
+        return KNOWN_WEIGHT + unknown.reshape(ny, step, nx, step).mean(axis=(1, 3)).ravel()
+
+    def _smoothed(self, tx_m: Floats, rx_m: Floats) -> Iterator[Floats]:
+        """Weights on white noise in the cells of the field, of unit norm, for some links at a time."""
+        edge_m = self._step * self.partial.resolution_m
+        along = (np.arange(_POINTS)[:, None] + 0.5) / _POINTS
+        limit = np.array(self._shape)[::-1] - 1
+        for start in range(0, len(tx_m), _LINKS_AT_ONCE):
+            ends_m = tx_m[start : start + _LINKS_AT_ONCE, None, :2], rx_m[start : start + _LINKS_AT_ONCE, None, :2]
+            points_m = ends_m[0] * (1.0 - along) + ends_m[1] * along
+            column, row = np.moveaxis((points_m - self.partial.origin_m) / edge_m, 2, 0)
+            cell = np.clip(np.floor(row), 0, limit[1]) * self._shape[1] + np.clip(np.floor(column), 0, limit[0])
+            index = cell.astype(np.intp)
+            rows = np.zeros((len(index), len(self._weight)))
+            np.add.at(rows, (np.arange(len(index))[:, None], index), self._weight[index])
+            smooth = ndimage.gaussian_filter(
+                rows.reshape(-1, *self._shape), (0.0, *2 * (REACH_M / math.sqrt(2.0) / edge_m,)), mode="constant"
+            ).reshape(rows.shape)
+            yield smooth / np.linalg.norm(smooth, axis=1, keepdims=True)

@@ -1,0 +1,183 @@
+"""Paths where nothing was seen: which traced paths survive, and which others there are.
+
+A small network gives the probability that a path traced on a partial map exists in the building. What the trace lacks
+is taken from links of homes of `make_home` that are alike, among those of the same link state: their paths that a
+partial map did not show, turned to the direct line of the link (the method of analogues; Lorenz, Atmospheric
+Predictability as Revealed by Naturally Occurring Analogues, 1969). `path_training` makes both.
+"""
+
+import io
+from dataclasses import dataclass, fields
+from functools import cache, cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import expit
+
+from sionna_partial.constants import CellState, LinkState
+from sionna_partial.cores import core_count
+from sionna_partial.errors import PredictorError
+from sionna_partial.files import atomic_write, read_bytes
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import DIFFRACTION
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Integers = NDArray[np.intp]
+
+STATES = (LinkState.LOS, LinkState.NLOS)
+
+ALIKE = 8
+"""Number of analogues from which one is drawn."""
+
+_SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0]])
+"""Units in which links with LOS, and without, are compared: gain above free space [dB], logarithms of distance and
+unobserved length, gain of the surviving paths above that of the link [dB], whether each end is in an observed cell."""
+
+_WEAKEST_DB = -30.0
+_MAX_BYTES = 20_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class LinkGeometry:
+    """Direct lines of L links on a map, arrays (L,): lengths [m], ends in observed cells, zenith and azimuth [rad]."""
+
+    distance_m: Floats
+    unobserved_m: Floats
+    tx_seen: Bools
+    rx_seen: Bools
+    departure_rad: Floats
+    free_space_db: Floats
+
+    @classmethod
+    def of(cls, partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> "LinkGeometry":
+        """Measure the lines between transmitters and receivers (L, 3) [m]."""
+        x, y, z = (rx_m - tx_m).T
+        distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
+        tx_seen, rx_seen = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in (tx_m, rx_m))
+        departure_rad = np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)
+        free_space_db = free_space_gain_db(distance_m, frequency_hz)
+        unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m)
+        return cls(distance_m, unobserved_m, tx_seen, rx_seen, departure_rad, free_space_db)
+
+    @property
+    def arrival_rad(self) -> Floats:
+        """Zenith and azimuth (L, 2) of arrival at the receiver."""
+        zenith_rad, azimuth_rad = self.departure_rad.T
+        return np.stack([np.pi - zenith_rad, wrapped(azimuth_rad + np.pi)], axis=1)
+
+    def take(self, index: Integers | Bools) -> "LinkGeometry":
+        """Return some of the links."""
+        return LinkGeometry(*(getattr(self, column.name)[index] for column in fields(self)))
+
+    def keys(self, state: LinkState, gain_db: Floats, survivors_db: Floats) -> Floats:
+        """Return by what links of one state are compared, (L, 6): their gain and that of their surviving paths too."""
+        columns = (
+            gain_db - self.free_space_db,
+            np.log(self.distance_m),
+            np.log1p(self.unobserved_m),
+            np.clip(survivors_db - gain_db, _WEAKEST_DB, 0.0),
+            self.tx_seen,
+            self.rx_seen,
+        )
+        return np.stack(columns, axis=1) / _SCALE[STATES.index(state)]
+
+
+def survival_inputs(links: TracedLinks, unobserved_m: Floats, geometry: LinkGeometry, link: Integers) -> Floats:
+    """Return the inputs (P, 8) of the network for traced paths, whose links are numbers `link` (P,) of `geometry`."""
+    columns = (
+        np.log1p(4.0 * unobserved_m),
+        unobserved_m > 1e-3,
+        (links.interactions > 0).sum(axis=1),
+        (links.interactions == DIFFRACTION).any(axis=1),
+        np.log10(np.maximum(np.abs(links.a), 1e-12)) + 4.0,
+        geometry.distance_m[link] / 5.0,
+        geometry.tx_seen[link],
+        geometry.rx_seen[link],
+    )
+    return np.stack([np.asarray(column, dtype=np.float64) for column in columns], axis=1)
+
+
+def wrapped(angle_rad: Floats) -> Floats:
+    """Angles within [-pi, pi)."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@dataclass(frozen=True, eq=False)
+class PathModel:
+    """The network of survival, and B analogues with Q paths in all, those with LOS first.
+
+    Parameters
+    ----------
+    weights : tuple of 6 arrays
+        Kernel and bias of each layer; the last input is 1 with LOS, 0 without.
+    keys : (B, 6) float32 array
+        By what links are compared.
+    los_count : () int array
+        Number of analogues with LOS.
+    first : (B + 1,) int64 array
+        First path of each.
+    spread_ns : (B,) float32 array
+        Delay spread of each [ns].
+    fraction : (Q,) float16 array
+        Of the power of the paths of an analogue.
+    excess_ns : (Q,) float16 array
+        Delay after that of the direct line [ns].
+    departure_rad, arrival_rad : (Q, 2) float16 arrays
+        Zenith and azimuth, from those of the direct line [rad].
+    """
+
+    weights: tuple[Floats, ...]
+    keys: NDArray[np.float32]
+    los_count: NDArray[np.int64]
+    first: NDArray[np.int64]
+    spread_ns: NDArray[np.float32]
+    fraction: NDArray[np.float16]
+    excess_ns: NDArray[np.float16]
+    departure_rad: NDArray[np.float16]
+    arrival_rad: NDArray[np.float16]
+
+    def survival(self, inputs: Floats, state: LinkState) -> Floats:
+        """Probability (P,) that indirect paths exist, given the state of their links."""
+        values = np.column_stack([inputs, np.full(len(inputs), float(state == LinkState.LOS))])
+        for layer in (0, 2):
+            values = np.maximum(values @ self.weights[layer] + self.weights[layer + 1], 0.0)
+        return np.asarray(expit((values @ self.weights[4] + self.weights[5])[:, 0]))
+
+    def analogues(self, state: LinkState, keys: Floats, quantile: Floats) -> Integers:
+        """Numbers (L,) of analogues of links of one state: of those alike, that of a quantile (L,) of delay spread."""
+        tree, start = self._trees[STATES.index(state)]
+        alike = tree.query(keys, k=np.arange(1, min(ALIKE, tree.n) + 1), workers=core_count())[1] + start
+        order = np.take_along_axis(alike, np.argsort(self.spread_ns[alike], axis=1), axis=1)
+        chosen = (quantile * order.shape[1]).astype(np.intp)
+        return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]
+
+    @cached_property
+    def _trees(self) -> tuple[tuple[cKDTree, int], ...]:
+        los_count = int(self.los_count)
+        return (cKDTree(self.keys[:los_count]), 0), (cKDTree(self.keys[los_count:]), los_count)
+
+    def save(self, path: Path) -> None:
+        """Write an `.npz` file."""
+        arrays = {column.name: getattr(self, column.name) for column in fields(self)[1:]}
+        arrays |= {f"weights{number}": values.astype(np.float32) for number, values in enumerate(self.weights)}
+        packed = io.BytesIO()
+        np.savez_compressed(packed, **arrays)
+        with atomic_write(path) as stream:
+            stream.write(packed.getvalue())
+
+    @classmethod
+    @cache
+    def load(cls) -> "PathModel":
+        """Read the shipped model."""
+        path = PREDICTORS_FOLDER / "paths.npz"
+        content = read_bytes(path, "path", PredictorError, _MAX_BYTES, "install sionna-partial again.")
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            weights = tuple(stored[f"weights{number}"].astype(np.float64) for number in range(6))
+            return cls(weights, **{column.name: stored[column.name] for column in fields(cls)[1:]})

@@ -1,0 +1,182 @@
+"""Training of the `PathModel`: paths on partial maps held against those in the whole of a home."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sionna_partial.channels.path_model import (
+    STATES,
+    Bools,
+    Floats,
+    Integers,
+    LinkGeometry,
+    PathModel,
+    survival_inputs,
+    wrapped,
+)
+from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.link_context import path_unobserved_m
+from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.simulation.explore import explore
+from sionna_partial.simulation.homes import make_home
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.trace import path_gain_db, trace_links
+
+ANALOGUES_OF_STATE = 3_000
+"""Number of links with LOS, and of links without, whose paths are kept."""
+
+RANGE_DB, MOST_PATHS = 25.0, 24
+"""Paths of an analogue are at most so much weaker than its strongest [dB], and at most so many."""
+
+LENGTH_M, DIRECTION, GAIN_DB = 0.3, 0.09, 4.0
+"""How near two paths of a link are that count as one: length [m], unit vectors at both ends [1], and gain [dB]."""
+
+HOME_STEPS, FLOOR_STEPS = (0, 50, 120, 250), (0, 200, 500)
+TRANSMITTERS, RECEIVERS, NEAREST_M = 3, 50, 0.15
+"""Steps after which homes and floors are taken, numbers of random ends, and their smallest distance [m]."""
+
+_UNITS, _PASSES, _BATCH = 20, 8, 512
+
+
+@dataclass(frozen=True, eq=False)
+class Example:
+    """Links of one partial map: inputs and truth of survival, and analogues by state, each a key and its paths (K, 6).
+
+    Paths are rows of fraction of power, delay after the direct line [ns], zenith and azimuth at both ends [rad].
+    """
+
+    inputs: Floats
+    exists: Bools
+    analogues: tuple[list[tuple[Floats, Floats]], ...]
+
+
+def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -> Example:
+    """Trace links between transmitters (T, 3) and receivers (N, 3) [m] on a partial map and in its home."""
+    known, true = (trace_links(each, tx_m, rx_m, progress=False) for each in (partial, home))
+    ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
+    geometry = LinkGeometry.of(partial, *ends, known.settings.frequency_hz)
+    link, true_link = (each.path_tx.astype(np.intp) * len(rx_m) + each.path_rx for each in (known, true))
+    unobserved_m = path_unobserved_m(
+        partial, tx_m[known.path_tx], known.interactions, known.vertices_m, rx_m[known.path_rx]
+    )
+    same = _same(known, link, true, true_link)
+    state = true.link_state.ravel()
+    taught = (known.interactions > 0).any(axis=1) & (state[link] != LinkState.OUTAGE)
+    inputs = np.column_stack([survival_inputs(known, unobserved_m, geometry, link), state[link] == LinkState.LOS])[
+        taught
+    ]
+    new = np.ones(len(true_link), dtype=bool)
+    new[same[same >= 0]] = False
+    new &= (true.interactions > 0).any(axis=1)
+    return Example(
+        inputs, (same >= 0)[taught], tuple(_analogues(true, true_link, new, geometry, each) for each in STATES)
+    )
+
+
+def _same(known: TracedLinks, link: Integers, true: TracedLinks, true_link: Integers) -> Integers:
+    """For each path on the partial map the path in the home that it is, -1 if there is none."""
+
+    def points(links: TracedLinks, link: Integers) -> Floats:
+        angles = np.hstack([links.departure_rad, links.arrival_rad])
+        sines, cosines = np.sin(angles), np.cos(angles)
+        directions = [
+            part
+            for start in (0, 2)
+            for part in (
+                sines[:, start] * cosines[:, start + 1],
+                sines[:, start] * sines[:, start + 1],
+                cosines[:, start],
+            )
+        ]
+        length_m, gain_db = links.delay_s * SPEED_OF_LIGHT_M_S, path_gain_db(np.abs(links.a) ** 2)
+        columns = [*(each / DIRECTION for each in directions), length_m / LENGTH_M, gain_db / GAIN_DB, 10.0 * link]
+        return np.stack(columns, axis=1)
+
+    if not len(true_link) or not len(link):
+        return np.full(len(link), -1)
+    apart, index = cKDTree(points(true, true_link)).query(points(known, link), distance_upper_bound=1.0)
+    return np.where(np.isfinite(apart), index, -1)
+
+
+def _analogues(
+    true: TracedLinks, link: Integers, new: Bools, geometry: LinkGeometry, state: LinkState
+) -> list[tuple[Floats, Floats]]:
+    """Key and new paths of each link of one state."""
+    power, count = np.abs(true.a) ** 2, len(geometry.distance_m)
+    indirect = (true.interactions > 0).any(axis=1)
+    survivors_db = path_gain_db(np.bincount(link, weights=power * (~new & indirect), minlength=count))
+    keys = geometry.keys(state, true.gain_db.ravel(), survivors_db)
+    excess_ns = 1e9 * (true.delay_s - geometry.distance_m[link] / SPEED_OF_LIGHT_M_S)
+    turned = [true.departure_rad - geometry.departure_rad[link], true.arrival_rad - geometry.arrival_rad[link]]
+    rows = np.column_stack([power, excess_ns, wrapped(np.hstack(turned))])
+    found = []
+    for number in np.flatnonzero(true.link_state.ravel() == state):
+        here = np.flatnonzero((link == number) & new)
+        here = here[power[here] > power[here].max(initial=0.0) * 10.0 ** (-RANGE_DB / 10.0)]
+        paths = rows[here[np.argsort(-power[here], kind="stable")][:MOST_PATHS]]
+        paths[:, 0] /= paths[:, 0].sum() if len(paths) else 1.0
+        found.append((keys[number], paths))
+    return found
+
+
+def fit_path_model(examples: Iterable[Example], seed: int = 0) -> PathModel:
+    """Train on examples; the same examples and seed give the same model."""
+    inputs, exists = [], []
+    banks: tuple[list[tuple[Floats, Floats]], ...] = tuple([] for _ in STATES)
+    for each in examples:
+        inputs.append(each.inputs)
+        exists.append(each.exists)
+        for bank, found in zip(banks, each.analogues, strict=True):
+            bank.extend(found)
+    rng = np.random.default_rng(seed)
+    chosen = [[bank[index] for index in np.sort(rng.permutation(len(bank))[:ANALOGUES_OF_STATE])] for bank in banks]
+    keys, paths = zip(*(each for bank in chosen for each in bank), strict=True)
+    rows = np.concatenate(paths).astype(np.float16)
+    return PathModel(
+        _fit_survival(np.concatenate(inputs), np.concatenate(exists), seed),
+        np.array(keys, dtype=np.float32),
+        np.array(len(chosen[0])),
+        np.cumsum([0, *map(len, paths)]),
+        np.array([_spread_ns(each) for each in paths], dtype=np.float32),
+        *(rows[:, columns] for columns in (0, 1, slice(2, 4), slice(4, 6))),
+    )
+
+
+def _spread_ns(paths: Floats) -> float:
+    fraction, delay_ns = paths[:, 0], paths[:, 1]
+    return float(np.sqrt(max(0.0, fraction @ delay_ns**2 - (fraction @ delay_ns) ** 2)))
+
+
+def _fit_survival(inputs: Floats, exists: Bools, seed: int) -> tuple[Floats, ...]:
+    """Train by cross-entropy; scaling of the inputs is part of the first layer."""
+    keras = import_keras()
+    keras.utils.set_random_seed(seed)
+    mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
+    layers = [keras.layers.Dense(units, activation="relu") for units in (_UNITS, _UNITS)]
+    network = keras.Sequential([keras.Input((inputs.shape[1],)), *layers, keras.layers.Dense(1, activation="sigmoid")])
+    network.compile("adam", "binary_crossentropy")
+    network.fit((inputs - mean) / std, exists.astype(np.float32), epochs=_PASSES, batch_size=_BATCH, verbose=0)
+    kernel, bias, *rest = (np.asarray(each, dtype=np.float64) for each in network.get_weights())
+    return kernel / std[:, None], bias - (mean / std) @ kernel, *rest
+
+
+def made_examples(homes: int = 60, floors: int = 10, first_seed: int = 320_000) -> Iterator[Example]:
+    """Examples of homes and office floors of `make_home`, as a robot has seen them after several numbers of steps."""
+    for number in range(homes + floors):
+        seed, is_home = first_seed + number, number < homes
+        home = make_home(seed) if is_home else make_home(seed, kind="floor")
+        rng = np.random.default_rng([seed, 1])
+        for partial in explore(home, HOME_STEPS if is_home else FLOOR_STEPS, seed):
+            tx_m, rx_m = (_points(home, count, rng) for count in (TRANSMITTERS, RECEIVERS))
+            apart_m = np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1)
+            yield example(partial, home, tx_m, rx_m[apart_m > NEAREST_M])
+
+
+def _points(home: PartialMap, count: int, rng: np.random.Generator) -> Floats:
+    """Points (count, 3) in free cells, off their borders [m]."""
+    row, column = rng.permutation(np.argwhere(home.state == CellState.FREE))[:count].T
+    cell = np.stack([column, row], axis=1) + rng.uniform(0.25, 0.75, (len(row), 2))
+    return np.column_stack([home.origin_m + cell * home.resolution_m, np.full(len(row), DEFAULT_HEIGHT_M)])

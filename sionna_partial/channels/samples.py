@@ -1,0 +1,399 @@
+"""Draws of the channels of links on a partial map: what the paths may be in the building."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.special import ndtri
+
+from sionna_partial.channels.joint import JointLatents
+from sionna_partial.channels.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
+from sionna_partial.checks import Progress, require_number, require_whole
+from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.display import Shown
+from sionna_partial.errors import MemoryLimitError
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import link_features
+from sionna_partial.prediction.link_context import path_unobserved_m
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.unobserved import is_enclosed
+from sionna_partial.progress import reporting
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import SolvedPaths, path_order
+from sionna_partial.tracing.trace import path_gain_db, trace_links
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+UNSEEN = 255
+"""Interaction of paths through what was not seen, in place of Sionna RT's `InteractionType`."""
+
+MOST_DRAWS = 10_000
+
+RANGE_DB = 30.0
+"""Traced paths that much weaker than the strongest indirect one of an uncertain link are left out [dB]."""
+
+_COLUMNS = tuple(name for name in SolvedPaths.__dataclass_fields__ if name != "vertices_m")
+_NO_VERTICES = np.zeros((0, 1, 3))
+_PATHS_AT_ONCE = 1_000_000
+_PATHS_OF_DRAW, _PATH_BYTES = 20, 300
+_SURVIVAL, _ANALOGUE, _REST = 2, 3, 4
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelSamples(Shown):
+    """n draws of the channels of links, from `sample_channels`.
+
+    Every draw is one building as it may be: links through the same unseen space are alike in it. Powers, delays and
+    angles are drawn; the phase of whatever crosses the unseen is uniform, as 1 mm is 34 degrees at 28 GHz.
+
+    Parameters
+    ----------
+    link_state : (n, N) or (n, T, N) uint8 array of LinkState
+    gain_db : (n, N) or (n, T, N) float64 array
+        Omnidirectional path gain [dB], -150 in an outage.
+    drawn : TracedLinks
+        All paths: those of draw k and transmitter t are of its transmitter ``k * T + t``. Interactions are 255 where a
+        path was not traced, and there are no vertices.
+    """
+
+    link_state: NDArray[np.uint8]
+    gain_db: NDArray[np.float64]
+    drawn: TracedLinks
+
+    def __len__(self) -> int:
+        """Return the number of draws n."""
+        return len(self.link_state)
+
+    def links(self, draw: int) -> TracedLinks:
+        """Return one draw, as `trace_links` returns links."""
+        count = len(self.drawn.tx) // len(self)
+        first = draw * count
+        chosen = np.flatnonzero((self.drawn.path_tx >= first) & (self.drawn.path_tx < first + count))
+        columns = (*_COLUMNS[1:], "vertices_m")
+        one = self.link_state.ndim == 2
+        return replace(
+            self.drawn,
+            tx=self.drawn.tx[first] if one else self.drawn.tx[first : first + count],
+            link_state=self.link_state[draw],
+            gain_db=self.gain_db[draw],
+            path_tx=self.drawn.path_tx[chosen] - first,
+            **{name: getattr(self.drawn, name)[chosen] for name in columns},
+        )
+
+    def cir(self, **options: Any) -> "xr.Dataset":
+        """Return channel impulse responses as `TracedLinks.cir` does, along a first dimension "draw"."""
+        return self._labelled(self.drawn.cir(**self._tiled(options)))
+
+    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> Any:
+        """Return channel frequency responses as `TracedLinks.cfr` does, along a first dimension "draw"."""
+        return self._labelled(self.drawn.cfr(frequencies_hz, **self._tiled(options)))
+
+    def beam_gains(self, *arguments: Any, **options: Any) -> Any:
+        """Return gains of beam pairs as `TracedLinks.beam_gains` does, along a first dimension "draw"."""
+        return self._labelled(self.drawn.beam_gains(*arguments, **self._tiled(options)))
+
+    def spreads(self) -> "xr.Dataset":
+        """Return delay and angular spreads as `TracedLinks.spreads` does, along a first dimension "draw"."""
+        return self._labelled(self.drawn.spreads())
+
+    def _tiled(self, options: dict[str, Any]) -> dict[str, Any]:
+        """Repeat orientations of the transmitters for each draw."""
+        orientation = options.get("tx_orientation_rad")
+        if orientation is None or np.ndim(orientation) != 2:
+            return options
+        return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
+
+    def _labelled(self, found: Any) -> Any:
+        if self.link_state.ndim == 2:
+            return found.rename(tx="draw")
+        return found.coarsen(tx=self.link_state.shape[1]).construct(tx=("draw", "tx"))
+
+
+def sample_channels(
+    scene: PartialMap | str | Path,
+    tx: ArrayLike,
+    rx: ArrayLike,
+    n: int = 100,
+    seed: int = 0,
+    *,
+    predictor: Predictor | str | Path | None = None,
+    trace_settings: TraceSettings | None = None,
+    scene_settings: SceneSettings | None = None,
+    memory_gb: float = MEMORY_GB,
+    progress: Progress | bool | None = None,
+) -> ChannelSamples:
+    """Draw the channels of links on a partial map n times: states, gains and paths.
+
+    Link state and gain of each link are drawn from what `predict_map` predicts, so that they agree with it; with 64
+    draws or more each link has its share of every state. Links share latents over space (`JointLatents`), so that a
+    draw looks like one building: neighbours, and transmitters behind the same unseen wall, fail together. Given state
+    and gain, traced paths survive with a learned probability, and analogues from procedural homes supply the rest
+    (`PathModel`). On a complete map every draw is the trace.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        What is known of the building.
+    tx : (3,) or (T, 3) array-like
+        Transmitter positions [m].
+    rx : (N, 3) array-like
+        Receiver positions [m], indoors.
+    n : int
+        Number of draws, up to 10,000.
+    seed : int
+        Of the draws, at least 0: equal seeds give equal draws.
+    predictor : None, "map", "paper", path or Predictor
+        As for `predict_map`.
+    trace_settings : TraceSettings, optional
+    scene_settings : SceneSettings, optional
+    memory_gb : float
+        How much memory the drawn paths may take [GB].
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
+
+    Returns
+    -------
+    ChannelSamples
+
+    Raises
+    ------
+    MemoryLimitError
+        If the paths may take more than `memory_gb`; nothing was begun.
+    MapError, PositionError, SettingsError, PredictorError, BackendError
+        As `trace_links` and `predict_map`.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> samples = sp.sample_channels(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5)], n=20)
+    >>> len(samples), samples.gain_db.shape
+    (20, (20, 1))
+    """
+    require_whole("n", n, 1, MOST_DRAWS)
+    require_whole("seed", seed, 0, 2**63)
+    require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
+    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    size_gb = n * np.size(tx) / 3 * np.size(rx) / 3 * _PATHS_OF_DRAW * _PATH_BYTES / 1e9
+    if size_gb > memory_gb:
+        raise MemoryLimitError(
+            f"memory_gb = {memory_gb:g} is too little: {n:,} draws of {round(np.size(tx) * np.size(rx) / 9):,} links "
+            f"take up to {size_gb:.1f} GB. Give fewer draws or receivers at a time, or more memory_gb."
+        )
+    with reporting(progress) as report:
+        report(0.0, "tracing")
+        traced = trace_links(
+            partial,
+            tx,
+            rx,
+            trace_settings=trace_settings,
+            scene_settings=scene_settings,
+            memory_gb=memory_gb,
+            progress=False,
+        )
+        tx_m = traced.tx.reshape(-1, 3)
+        phi = link_features(partial, traced).flat()
+        if bool(is_enclosed(partial, tx_m[:1], tx_m[:1])[0]):
+            prediction = LinkPrediction.of_trace(phi)
+        else:
+            model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+            prediction = model.predict(phi)
+        report(0.5, "drawing")
+        draws = _Draws(partial, traced, prediction, n, seed)
+        columns = draws.columns()
+        report(1.0, "done")
+    shape = (n, *traced.gain_db.shape)
+    drawn = replace(
+        traced,
+        tx=np.tile(tx_m, (n, 1)),
+        link_state=draws.state.reshape(n * len(tx_m), -1),
+        gain_db=draws.gain_db.reshape(n * len(tx_m), -1),
+        **columns,
+        vertices_m=np.broadcast_to(math.nan, (*columns["interactions"].shape, 3)),
+    )
+    return ChannelSamples(draws.state.reshape(shape), draws.gain_db.reshape(shape), drawn)
+
+
+class _Draws:
+    """n draws of L links, transmitter by transmitter: `state` and `gain_db` (n, L), and their paths."""
+
+    def __init__(
+        self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
+    ) -> None:
+        tx_m, rx_m = traced.tx.reshape(-1, 3), traced.rx
+        self._traced, self._count, self._seed, self._rx_count = traced, count, seed, len(rx_m)
+        self._link = traced.path_tx.astype(np.intp) * len(rx_m) + traced.path_rx
+        tx_of, rx_of = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
+        self._geometry = LinkGeometry.of(partial, tx_of, rx_of, traced.settings.frequency_hz)
+        unobserved_m = path_unobserved_m(
+            partial, tx_m[traced.path_tx], traced.interactions, traced.vertices_m, rx_m[traced.path_rx]
+        )
+        self._crosses = unobserved_m > 0.0
+        probabilities, _, stds_db = prediction.by_state
+        certain = (probabilities.max(axis=0) == 1.0) & ((probabilities > 0.0) * stds_db == 0.0).all(axis=0)
+        self._certain = certain
+        latents = JointLatents(partial)
+        matrix = prediction.reshaped((len(tx_m), len(rx_m)))
+        state, gain_db = (each.reshape(count, -1) for each in latents.draw(matrix, tx_m, rx_m, count, [seed]))
+        self._quantiles = {
+            each: latents.quantiles(tx_of, rx_of, count, [seed, each]) for each in (_SURVIVAL, _ANALOGUE)
+        }
+        # no path with LOS is weaker than free space
+        gain_db = np.where(state == LinkState.LOS, np.maximum(gain_db, self._geometry.free_space_db), gain_db)
+        self.state, self.gain_db = state, np.where(certain, traced.gain_db.ravel(), gain_db)
+        self._model = PathModel.load()
+        inputs = survival_inputs(traced, unobserved_m, self._geometry, self._link)
+        self._survival = {each: self._model.survival(inputs, each) for each in (LinkState.LOS, LinkState.NLOS)}
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return the paths of all draws, ordered as `TracedLinks` has them, without vertices."""
+        parts = [*self._parts()]
+        order = path_order(parts)
+        return {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS}
+
+    def _parts(self) -> Iterator[SolvedPaths]:
+        """Paths of all draws, some links at a time."""
+        paths = np.flatnonzero(self._certain[self._link])
+        yield self._copies(np.repeat(np.arange(self._count), len(paths)), np.tile(paths, self._count), None, None)
+        uncertain = np.flatnonzero(~self._certain)
+        paths_of_link = np.bincount(self._link, minlength=len(self._certain))[uncertain] + _PATHS_OF_DRAW
+        block = np.cumsum(paths_of_link * self._count) // _PATHS_AT_ONCE
+        for number in np.unique(block):
+            yield from self._uncertain(uncertain[block == number], np.random.default_rng([self._seed, _REST, number]))
+
+    def _uncertain(self, links: NDArray[np.intp], rng: np.random.Generator) -> Iterator[SolvedPaths]:
+        """Paths of draws of some links: the surviving ones, the direct ones, and those of analogues."""
+        state, power = self.state[:, links], 10.0 ** (self.gain_db[:, links] / 10.0)
+        is_los = state == LinkState.LOS
+        rest = np.maximum(power - is_los * 10.0 ** (self._geometry.free_space_db[links] / 10.0), 0.0)
+        paths, place = self._indirect(links)
+        traced_power = np.abs(self._traced.a[paths]) ** 2
+        chance = np.where(is_los[:, place], *(self._survival[each][paths] for each in (LinkState.LOS, LinkState.NLOS)))
+        latent = ndtri(self._quantiles[_SURVIVAL][:, links])[:, place] + rng.standard_normal(chance.shape)
+        survives = (latent < math.sqrt(2.0) * ndtri(chance)) & (state[:, place] != LinkState.OUTAGE)
+        belongs = csr_array((traced_power, (np.arange(len(paths)), place)), shape=(len(paths), len(links)))
+        survivors = survives.astype(np.float64) @ belongs
+        analogue = self._analogues(links, survivors)
+        has_paths = (np.diff(self._model.first)[analogue] > 0) & (analogue >= 0)
+        # without an analogue's paths the survivors have all of the power
+        scale = np.where((survivors > rest) | ~has_paths, rest / np.maximum(survivors, 1e-30), 1.0)
+        draw, row = np.nonzero(survives & (scale > 0.0)[:, place])
+        yield self._copies(draw, paths[row], np.sqrt(scale[draw, place[row]]), rng)
+        left = np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
+        alone = ~has_paths & (survivors == 0.0) & (state == LinkState.NLOS)
+        draw, row = np.nonzero(is_los | alone)
+        direct = np.where(is_los[draw, row], 10.0 ** (self._geometry.free_space_db[links[row]] / 10.0), rest[draw, row])
+        nothing = np.zeros((len(draw), 2))
+        kind = np.where(is_los[draw, row], 0, UNSEEN)
+        yield self._made(draw, links[row], direct, np.zeros(len(draw)), nothing, nothing, kind, rng)
+        yield self._of_analogues(links, analogue, left, rng)
+
+    def _indirect(self, links: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indirect traced paths of some links that are not too weak, and the place of the link of each in `links`."""
+        place = np.full(len(self._certain), -1)
+        place[links] = np.arange(len(links))
+        paths = np.flatnonzero((place[self._link] >= 0) & (self._traced.interactions > 0).any(axis=1))
+        power, at = np.abs(self._traced.a[paths]) ** 2, place[self._link[paths]]
+        strongest = np.zeros(len(links))
+        np.maximum.at(strongest, at, power)
+        kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
+        return paths[kept], at[kept]
+
+    def _analogues(self, links: NDArray[np.intp], survivors: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Analogues (n, L) of draws of some links; -1 in an outage."""
+        analogue = np.full(survivors.shape, -1)
+        for state in (LinkState.LOS, LinkState.NLOS):
+            draw, row = np.nonzero(self.state[:, links] == state)
+            geometry, survivors_db = self._geometry.take(links[row]), path_gain_db(survivors[draw, row])
+            keys = geometry.keys(state, self.gain_db[draw, links[row]], survivors_db)
+            quantile = self._quantiles[_ANALOGUE][draw, links[row]]
+            analogue[draw, row] = self._model.analogues(state, keys, quantile)
+        return analogue
+
+    def _of_analogues(
+        self,
+        links: NDArray[np.intp],
+        analogue: NDArray[np.intp],
+        power: NDArray[np.float64],
+        rng: np.random.Generator,
+    ) -> SolvedPaths:
+        """Paths of analogues (n, L) with a power in sum (n, L), mirrored at random for each link and draw."""
+        draw, row = np.nonzero(power > 0.0)
+        chosen, mirror = analogue[draw, row], rng.choice([-1.0, 1.0], len(draw))
+        first, count = self._model.first[chosen], np.diff(self._model.first)[chosen]
+        each = np.repeat(np.arange(len(draw)), count)
+        path = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+        fraction = self._model.fraction[path].astype(np.float64)
+        total = np.bincount(each, weights=fraction, minlength=len(draw))
+        turned = np.column_stack([np.ones(len(path)), mirror[each]])
+        return self._made(
+            draw[each],
+            links[row[each]],
+            power[draw, row][each] * fraction / total[each],
+            1e-9 * np.maximum(self._model.excess_ns[path].astype(np.float64), 0.0),
+            turned * self._model.departure_rad[path],
+            turned * self._model.arrival_rad[path],
+            np.full(len(path), UNSEEN),
+            rng,
+        )
+
+    def _copies(
+        self,
+        draw: NDArray[np.intp],
+        paths: NDArray[np.intp],
+        scale: NDArray[np.float64] | None,
+        rng: np.random.Generator | None,
+    ) -> SolvedPaths:
+        """Traced paths in some draws; what crosses the unseen has a random phase."""
+        columns = {name: getattr(self._traced, name)[paths] for name in _COLUMNS}
+        if rng is not None and scale is not None:
+            turn = np.where(self._crosses[paths], rng.uniform(0.0, 2.0 * np.pi, len(paths)), 0.0)
+            columns["transfer"] = columns["transfer"] * (scale * np.exp(1j * turn))[:, None, None]
+        columns["path_tx"] = (columns["path_tx"] + draw * self._tx_count).astype(np.int32)
+        return SolvedPaths(**columns, vertices_m=_NO_VERTICES)
+
+    def _made(
+        self,
+        draw: NDArray[np.intp],
+        link: NDArray[np.intp],
+        power: NDArray[np.float64],
+        excess_s: NDArray[np.float64],
+        departure_rad: NDArray[np.float64],
+        arrival_rad: NDArray[np.float64],
+        kind: NDArray[np.intp],
+        rng: np.random.Generator,
+    ) -> SolvedPaths:
+        """Paths that were not traced: angles are those from the direct line, and they keep the polarisation."""
+        line, depth = self._geometry.take(link), max(1, self._traced.interactions.shape[1])
+        seen = (kind == 0) & (self._geometry.unobserved_m[link] == 0.0)
+        amplitude = np.sqrt(power) * np.exp(2j * np.pi * np.where(seen, 0.0, rng.random(len(link))))
+        interactions = np.zeros((len(link), depth), np.uint8)
+        interactions[:, 0] = kind
+        angles = []
+        for direct_rad, turned_rad in ((line.departure_rad, departure_rad), (line.arrival_rad, arrival_rad)):
+            zenith, azimuth = (direct_rad + turned_rad).T
+            angles.append(np.stack([np.clip(zenith, 0.0, np.pi), wrapped(azimuth)], axis=1))
+        return SolvedPaths(
+            path_tx=(draw * self._tx_count + link // self._rx_count).astype(np.int32),
+            path_rx=(link % self._rx_count).astype(np.int32),
+            transfer=amplitude[:, None, None] * np.diag([1.0, -1.0]),
+            delay_s=line.distance_m / SPEED_OF_LIGHT_M_S + excess_s,
+            departure_rad=angles[0],
+            arrival_rad=angles[1],
+            interactions=interactions,
+            vertices_m=_NO_VERTICES,
+        )
+
+    @property
+    def _tx_count(self) -> int:
+        return len(self._traced.tx.reshape(-1, 3))

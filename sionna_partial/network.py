@@ -1,0 +1,196 @@
+"""Networks of several transmitters: coverage maps -> best server, SINR and rate, with their uncertainty."""
+
+import math
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.channels.joint import JointLatents
+from sionna_partial.checks import real_array, require, require_number, require_whole
+from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, TX_COORDINATES, require_coverage
+from sionna_partial.errors import SettingsError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.predictor import LinkPrediction
+
+Floats = NDArray[np.float64]
+
+NOISE_DENSITY_DBM_HZ = -174.0
+"""Thermal noise at 290 K [dBm/Hz]."""
+
+MOST_DRAWS = 1_000
+_RECEIVERS_AT_ONCE = 5_000
+_LOWEST_SINR_DB = -60.0
+
+
+def _described(long_name: str, units: str = "1") -> dict[str, str]:
+    return {"long_name": long_name, "units": units}
+
+
+VARIABLES = {
+    "best_server": _described("number of the transmitter that is most probably the strongest, -1 for no receiver"),
+    "p_best": _described("probability that this transmitter is the strongest"),
+    "p_all_outage": _described("probability that all links are in outage"),
+    "sinr_mean_db": _described("mean SINR of the strongest transmitter", "dB"),
+    "sinr_p10_db": _described("10th percentile of the SINR", "dB"),
+    "p_sinr_above": _described("probability that the SINR exceeds sinr_threshold_db"),
+    "rate_bit_s": _described("mean Shannon rate", "bit/s"),
+    "handover_margin_db": _described("mean lead of the strongest transmitter over the next", "dB"),
+}
+"""Variables of a network map on (y, x), `p_best` on (tx, y, x), and their attributes."""
+
+
+def network_map(
+    coverage: xr.Dataset,
+    *,
+    tx_power_dbm: ArrayLike = 20.0,
+    noise_figure_db: float = 7.0,
+    bandwidth_hz: float = 100e6,
+    load: float = 1.0,
+    sinr_threshold_db: float = 0.0,
+    n: int = 100,
+    seed: int = 0,
+) -> xr.Dataset:
+    """Predict best server, SINR and rate of a network, from the coverage of its transmitters.
+
+    Links of several transmitters are drawn together (`JointLatents`): one unseen wall blocks all of them. In each draw
+    a receiver is served by the strongest transmitter, and the others interfere:
+    ``SINR = P_b / (N + load * sum of the other P)``, with the received powers P = transmit power x path gain and the
+    noise N = -174 dBm/Hz + 10 log10(bandwidth) + noise figure. The rate is bandwidth x log2(1 + SINR).
+
+    Parameters
+    ----------
+    coverage : xarray.Dataset
+        From `predict_map` with T transmitters.
+    tx_power_dbm : float or (T,) array-like
+        Transmit power [dBm].
+    noise_figure_db : float
+        Of the receivers [dB].
+    bandwidth_hz : float
+    load : float
+        Fraction of time in which an interferer transmits, in [0, 1].
+    sinr_threshold_db : float
+        Of `p_sinr_above` [dB].
+    n : int
+        Number of draws, up to 1,000.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    xarray.Dataset
+        The `VARIABLES` on (y, x); NaN where no receiver stands. SINRs below -60 dB count as -60 dB.
+
+    Raises
+    ------
+    SettingsError
+        For a coverage of one transmitter, or a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> home = sp.make_home(7)
+    >>> coverage = sp.predict_map(home, {"hall": (3.0, 4.0, 2.2), "desk": (6.0, 3.0, 1.0)}, spacing_m=0.5)
+    >>> network = sp.network_map(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6)
+    >>> sorted(network.data_vars)[:3]
+    ['best_server', 'handover_margin_db', 'p_all_outage']
+    """
+    if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
+        raise SettingsError("coverage has no dimension tx: give what predict_map returned for several transmitters.")
+    require_coverage(coverage.isel(tx=0))
+    count = coverage.sizes["tx"]
+    remedy = f"give one power [dBm], or one for each of the {count} transmitters."
+    power_dbm = real_array("tx_power_dbm", tx_power_dbm, SettingsError, remedy)
+    require(
+        power_dbm.shape in ((), (count,)) and bool((np.abs(power_dbm) <= 200.0).all()),
+        "tx_power_dbm",
+        tx_power_dbm,
+        remedy,
+    )
+    require_number("noise_figure_db", noise_figure_db, 0.0, 100.0)
+    require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
+    require_number("load", load, 0.0, 1.0)
+    require_number("sinr_threshold_db", sinr_threshold_db, -200.0, 200.0)
+    require_whole("n", n, 2, MOST_DRAWS)
+    require_whole("seed", seed, 0, 2**63)
+    noise_dbm = NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(bandwidth_hz) + noise_figure_db
+    valid = coverage["valid"].to_numpy().all(axis=0)
+    y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
+    rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
+    tx_m = np.stack([coverage[name].to_numpy() for name in TX_COORDINATES], axis=1)
+    columns = {name: coverage[name].to_numpy()[:, valid].astype(np.float64) for name in (*DISTRIBUTION, *COMPONENTS)}
+    latents = JointLatents(_map_of(coverage))
+    parts = []
+    for start in range(0, len(rx_m), _RECEIVERS_AT_ONCE):
+        here = slice(start, start + _RECEIVERS_AT_ONCE)
+        links = LinkPrediction(**{name: values[:, here] for name, values in columns.items()})
+        gain_db = latents.draw(links, tx_m, rx_m[here], n, [seed])[1]
+        received_dbm = np.where(gain_db > GAIN_FLOOR_DB, gain_db, -np.inf) + np.broadcast_to(power_dbm, count)[:, None]
+        parts.append(_statistics(received_dbm, noise_dbm, float(load), float(sinr_threshold_db), float(bandwidth_hz)))
+    found = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in VARIABLES}
+    return _labelled(
+        coverage,
+        found,
+        valid,
+        {
+            "tx_power_dbm": power_dbm,
+            "noise_figure_db": float(noise_figure_db),
+            "bandwidth_hz": float(bandwidth_hz),
+            "load": float(load),
+            "sinr_threshold_db": float(sinr_threshold_db),
+            "draws": n,
+            "seed": seed,
+        },
+    )
+
+
+def _map_of(coverage: xr.Dataset) -> PartialMap:
+    """Return the map at the receivers, as far as the coverage shows it."""
+    spacing_m = float(coverage.attrs["spacing_m"])
+    corner_m = (float(coverage["x"][0]) - spacing_m / 2, float(coverage["y"][0]) - spacing_m / 2)
+    return PartialMap(coverage["cell_state"].to_numpy().astype(np.uint8), spacing_m, corner_m)
+
+
+def _statistics(
+    received_dbm: Floats, noise_dbm: float, load: float, threshold_db: float, bandwidth_hz: float
+) -> dict[str, NDArray[Any]]:
+    """Variables of receivers from their draws (n, T, N)."""
+    power_mw = 10.0 ** (received_dbm / 10.0)
+    best_mw, best = power_mw.max(axis=1), power_mw.argmax(axis=1)
+    heard = best_mw > 0.0
+    noise_mw = 10.0 ** (noise_dbm / 10.0)
+    sinr = best_mw / (noise_mw + load * (power_mw.sum(axis=1) - best_mw))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sinr_db = np.maximum(10.0 * np.log10(sinr), _LOWEST_SINR_DB)
+        next_mw = np.sort(power_mw, axis=1)[:, -2] if power_mw.shape[1] > 1 else np.zeros_like(best_mw)
+        margin_db = 10.0 * np.log10(best_mw / np.maximum(next_mw, noise_mw))
+    count = power_mw.shape[1]
+    p_best = np.stack([((best == number) & heard).mean(axis=0) for number in range(count)])
+    return {
+        "best_server": np.where(heard.any(axis=0), p_best.argmax(axis=0), -1).astype(np.int16),
+        "p_best": p_best,
+        "p_all_outage": (~heard).mean(axis=0),
+        "sinr_mean_db": sinr_db.mean(axis=0),
+        "sinr_p10_db": np.percentile(sinr_db, 10.0, axis=0),
+        "p_sinr_above": (sinr_db > threshold_db).mean(axis=0),
+        "rate_bit_s": bandwidth_hz * np.log2(1.0 + sinr).mean(axis=0),
+        "handover_margin_db": np.where(heard, np.maximum(margin_db, 0.0), 0.0).mean(axis=0),
+    }
+
+
+def _labelled(
+    coverage: xr.Dataset, found: dict[str, NDArray[Any]], valid: NDArray[np.bool_], settings: dict[str, Any]
+) -> xr.Dataset:
+    layers: dict[str, Any] = {}
+    for name, values in found.items():
+        whole = values.dtype.kind == "i"
+        layer = np.full(
+            (*values.shape[:-1], *valid.shape), -1 if whole else np.nan, values.dtype if whole else np.float32
+        )
+        layer[..., valid] = values
+        layers[name] = (("tx", "y", "x")[3 - layer.ndim :], layer, VARIABLES[name])
+    kept = coverage[["cell_state", "observed", "wall_parts"]]
+    kept = kept.assign_coords({name: coverage[name] for name in ("tx", *TX_COORDINATES)})
+    return kept.assign(layers).assign_attrs(title="Predicted network in a partially observed environment", **settings)
