@@ -35,7 +35,9 @@ ROOMS = {
         *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "trace"),
         "path_set",
+        "antennas",
     ),
+    "channels": ("responses",),
     "prediction": (
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
