@@ -19,7 +19,7 @@ from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import ChannelPaths
 
-BLOCK_BYTES = 32_000_000
+BLOCK_BYTES = 100_000_000
 """Size of the coefficients that are computed together, which bounds the memory."""
 
 UPRIGHT = 1e-3
@@ -99,9 +99,9 @@ class ArrayPaths:
         gains, at_rx_m, at_tx_m = self.parts(rows)
         delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
         if self.synthetic_array:
-            phase = [np.exp(2j * np.pi / wavelength_m * each) for each in (at_rx_m, at_tx_m)]
-            left = (gains[:, :, None, :] * phase[0][:, None, :, None]).astype(np.complex64)
-            a = left[..., None] * phase[1].astype(np.complex64)[:, None, None, None, :]
+            at_rx, at_tx = (phasors(2.0 * np.pi / wavelength_m * each) for each in (at_rx_m, at_tx_m))
+            left = gains.astype(np.complex64)[:, :, None, :] * at_rx[:, None, :, None]
+            a = left[..., None] * at_tx[:, None, None, None, :]
         else:
             length_m = SPEED_OF_LIGHT_M_S * delay_s
             longer_m = self._longer_m(rows, at_rx_m, at_tx_m)
@@ -112,7 +112,8 @@ class ArrayPaths:
             reached = np.flatnonzero(np.diff(first))
             shortest = np.minimum.reduceat(delay_s.min(axis=(1, 2)), first[reached])
             delay_s = delay_s - np.repeat(shortest, np.diff(first)[reached])[:, None, None]
-        carrier = np.exp(-2j * np.pi * np.mod(self.paths.settings.frequency_hz * delay_s, 1.0)).astype(np.complex64)
+        kind = np.float32 if self.synthetic_array else np.float64  # the first rounds as Sionna RT does
+        carrier = phasors(kind(-2.0 * np.pi) * kind(self.paths.settings.frequency_hz) * delay_s.astype(kind))
         return Block(slice(start, stop), first, a.reshape(len(a), len(self.rx), len(self.tx)) * carrier, delay_s)
 
     def parts(self, rows: slice) -> tuple[NDArray[np.complex128], NDArray[np.float64], NDArray[np.float64]]:
@@ -146,6 +147,15 @@ class ArrayPaths:
             ]
             longer_m[split] = unfolded.longer_at_edges_m(split, *moved)
         return longer_m
+
+
+def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
+    """Return exp(j angle) of angles [rad], which are reduced to a turn in the precision that they have."""
+    turn = angle.dtype.type(2.0 * np.pi)
+    angle = (angle - turn * np.floor(angle * (angle.dtype.type(1.0) / turn))).astype(np.float32)
+    found = np.empty(angle.shape, np.complex64)
+    found.real, found.imag = np.cos(angle), np.sin(angle)
+    return found
 
 
 @dataclass(frozen=True)
@@ -270,7 +280,7 @@ def cfr(
     _require_memory(arrays, len(offsets_hz), "frequencies", memory_gb)
 
     def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
-        return np.exp(-2j * np.pi * delay_s[..., None] * offsets_hz).astype(np.complex64)
+        return phasors(-2.0 * np.pi * delay_s[..., None] * offsets_hz)
 
     h = _filtered(arrays, kernel, len(offsets_hz))
     variables = {"h": (("link", "rx_ant", "tx_ant", "frequency"), h, {"long_name": "frequency response", "units": "1"})}
