@@ -1,14 +1,18 @@
 """Channel responses: against stock Sionna RT on the same paths, and against traces from antenna to antenna."""
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from test_trace import _room
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.paths import DIFFRACTION
@@ -151,7 +155,7 @@ class TestAgainstStock:
         for receiver, most in enumerate((0.004, 0.004, 0.015)):
             error, of_plane = (np.abs(h[receiver] - expected[receiver]).max().item() for h in (exact, plane))
             assert error < most * np.abs(expected[receiver]).max()
-            assert error < 0.1 * of_plane
+            assert error < 0.5 * of_plane
 
 
 class TestPerAntenna:
@@ -188,3 +192,188 @@ class TestPerAntenna:
                 kinds |= {*links.interactions[path].tolist()}
         assert checked > (2 if depth == 0 else 40)
         assert kinds == ({0} if depth == 0 else {0, 1, DIFFRACTION})
+
+
+def some_links() -> sp.TracedLinks:
+    """Two transmitters, three receivers; one of them is reached by no path."""
+    rx = [[2.0, 1.0, 1.5], [5.0, 3.0, 1.2], [7.0, 1.0, 1.5]]
+    settings = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
+    return sp.trace_links(_room(), [(1.0, 1.0, 1.5), (4.5, 1.2, 1.4)], rx, trace_settings=settings, invalid="nan")
+
+
+@pytest.fixture(scope="module")
+def several() -> sp.TracedLinks:
+    return some_links()
+
+
+class TestResponses:
+    def test_links_are_numbered_by_transmitter_and_receiver(self, several: sp.TracedLinks) -> None:
+        channels = several.cir(normalize_delays=False)
+        assert channels.tx.values.tolist() == [0, 0, 0, 1, 1, 1]
+        assert channels.rx_m.sel(axis="y").values.tolist() == [1.0, 3.0, 1.0] * 2
+        assert channels.paths.values.reshape(2, 3)[:, 2].tolist() == [0, 0]
+        power = (np.abs(channels.a) ** 2).sum(["rx_ant", "tx_ant", "path"]).values.reshape(2, 3)
+        np.testing.assert_allclose(10 * np.log10(power[:, :2]), several.gain_db[:, :2], atol=1e-4)
+        later = several.path_tx == 1
+        found = channels.delay_s.values[3][: (several.path_rx[later] == 0).sum()]
+        np.testing.assert_array_equal(found, several.delay_s[later][several.path_rx[later] == 0])
+        assert np.isnan(channels.delay_s.values[2]).all()
+        assert not channels.a.values[5].any()
+
+    def test_blocks_change_nothing(self, several: sp.TracedLinks, monkeypatch: pytest.MonkeyPatch) -> None:
+        arrays = {"tx_array": array_of(2, 2), "rx_array": array_of(1, 2, "dipole", "VH")}
+        whole = [several.cir(synthetic_array=each, **arrays) for each in (True, False)]
+        monkeypatch.setattr("sionna_partial.channels.responses.BLOCK_BYTES", 16 * 16 * 5)
+        for each, synthetic_array in zip(whole, (True, False), strict=True):
+            np.testing.assert_array_equal(several.cir(synthetic_array=synthetic_array, **arrays).a, each.a)
+
+    @pytest.mark.parametrize("synthetic_array", [True, False])
+    def test_sums_over_paths(self, several: sp.TracedLinks, synthetic_array: bool) -> None:
+        options = {"tx_array": array_of(2, 2), "synthetic_array": synthetic_array}
+        channels, offsets_hz = several.cir(**options), np.array([-3e8, 0.0, 1e8])
+        delay_s = channels.delay_s.fillna(0.0)
+        for name, found, weight in (
+            ("frequency", several.cfr(offsets_hz, **options), lambda x: np.exp(-2j * np.pi * offsets_hz[x] * delay_s)),
+            ("tap", several.taps(2e8, **options), lambda x: xr.apply_ufunc(np.sinc, x - 6 - 2e8 * delay_s)),
+        ):
+            for number in range(found.sizes[name]):
+                expected = (channels.a * weight(number)).sum("path")
+                np.testing.assert_allclose(found.h[..., number], expected.transpose(*found.h.dims[:-1]), atol=1e-9)
+        assert found.tap.values[-1] == 6 + np.ceil(2e8 * several.cir().delay_s.max())
+
+    def test_no_links(self) -> None:
+        links = sp.trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)))
+        assert links.cir().a.shape == (0, 1, 1, 0)
+        assert links.cfr([0.0]).h.shape == (0, 1, 1, 1)
+        assert links.beam_gains(np.eye(1)).gain_db.shape == (0, 1, 1)
+
+    def test_memory_is_asked_for_first(self, several: sp.TracedLinks) -> None:
+        many = replace(several, rx=np.broadcast_to(several.rx[:1], (1_000_000, 3)))
+        arrays = {"tx_array": array_of(8, 8), "rx_array": array_of(8, 8)}
+        message = (
+            r"memory_gb = 2 is too little for 2,000,000 links x 64 x 64 antennas x \d+ paths, which take [\d,.]+ GB"
+        )
+        with pytest.raises(MemoryLimitError, match=message):
+            many.cir(**arrays)
+        with pytest.raises(MemoryLimitError, match=r"x 8 frequencies, which take 524\.3 GB: give"):
+            many.cfr(np.arange(8), **arrays)
+        with pytest.raises(MemoryLimitError, match="4096 pairs of beams, which take"):
+            many.beam_gains(np.eye(64), **arrays)
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda links: links.cir(tx_array="8x8"), "tx_array = '8x8' is not allowed: give a sionna.rt.PlanarArray"),
+            (lambda links: links.cir(rx_orientation_rad=(0, 0)), "rx_orientation_rad = .* or .N, 3. for the 3 ends"),
+            (lambda links: links.cir(tx_orientation_rad=(0, np.nan, 0)), "tx_orientation_rad = .* give three angles"),
+            (lambda links: links.cir(synthetic_array=1), "synthetic_array = 1 is not allowed: give True or False"),
+            (lambda links: links.cir(memory_gb=0), "memory_gb = 0 is not allowed"),
+            (lambda links: links.cfr([28e9]), "frequencies_hz = .* below the carrier of 2.8e.10 Hz"),
+            (lambda links: links.cfr([]), "frequencies_hz = .* relative to the carrier"),
+            (lambda links: links.taps(0.0), r"bandwidth_hz = 0.0 is not allowed: give a number in \(0, 1e\+12\]"),
+            (lambda links: links.taps(1e6, 5, 4), r"l_max = 4 is not allowed: give a whole number in \[5"),
+            (lambda links: links.taps(1e6, 0.5), "l_min = 0.5 is not allowed"),
+            (lambda links: links.beam_gains(np.ones((2, 3))), r"codebook = .*\(2, 3\).* give \(beams, 1\) weights"),
+            (lambda links: links.beam_gains([[np.nan]]), "codebook = .* such as those of dft_codebook"),
+            (lambda links: links.beam_gains([[1]], "x"), "rx_codebook = 'x' is not numeric"),
+            (lambda links: sp.dft_codebook(0, 8), "rows = 0 is not allowed"),
+            (lambda links: sp.dft_codebook(80, 80), r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas"),
+            (lambda links: sp.dft_codebook(8, 8, 3), "polarisations = 3 is not allowed"),
+            (
+                lambda links: replace(links, transfer=links.transfer[:, :1, :1]).cir(),
+                "transfer = .* traced for one polarisation; trace the links with trace_links",
+            ),
+        ],
+    )
+    def test_refused(self, several: sp.TracedLinks, call: Callable[[Any], object], message: str) -> None:
+        with pytest.raises(SettingsError, match=message):
+            call(several)
+
+
+class TestBeams:
+    @pytest.mark.parametrize("polarization", ["V", "VH"])
+    def test_gain_is_that_of_all_antennas(self, several: sp.TracedLinks, polarization: str) -> None:
+        arrays = {"tx_array": array_of(4, 2, "tr38901", "VH"), "rx_array": array_of(1, 2, "dipole", polarization)}
+        options = {**arrays, "tx_orientation_rad": (0.3, 0.1, 0.0), "rx_orientation_rad": np.ones((3, 3))}
+        rng, count = np.random.default_rng(0), 2 * len(polarization)
+        at_tx = sp.dft_codebook(4, 2, 2)
+        at_rx = rng.normal(size=(3, count)) + 1j * rng.normal(size=(3, count))
+        beams = several.beam_gains(at_tx, at_rx, **options)
+        a = several.cir(**options).a.values
+        power = (np.abs(np.einsum("br,lrtp,ct->lbcp", at_rx.conj(), a, at_tx)) ** 2).sum(axis=-1)
+        np.testing.assert_allclose(beams.gain_db, 10 * np.log10(power.clip(1e-15)), atol=1e-3)
+        flat = np.sort(power.reshape(6, -1), axis=1)
+        np.testing.assert_allclose(beams.margin_db[:2], 10 * np.log10(flat[:2, -1] / flat[:2, -2]), atol=1e-3)
+        best = power.reshape(6, -1).argmax(axis=1)
+        assert (beams.best_rx_beam * len(at_tx) + beams.best_tx_beam)[[0, 1, 3, 4]].values.tolist() == best[
+            [0, 1, 3, 4]
+        ].tolist()
+        assert beams.best_tx_beam[[2, 5]].values.tolist() == [-1, -1]
+        assert np.isnan(beams.margin_db[[2, 5]]).all()
+
+    def test_codebook_is_orthonormal_and_points(self) -> None:
+        beams = sp.dft_codebook(4, 8, 2)
+        np.testing.assert_allclose(beams @ beams.conj().T, np.eye(64), atol=1e-12)
+        field = sp.PartialMap(np.zeros((60, 60), dtype=np.uint8), 0.1)
+        y = 4.0 * np.tan(np.arcsin(2 * np.arange(4) / 8))  # sin(azimuth) = 2 k / columns: the k-th beam across
+        rx = np.column_stack([np.full(4, 5.0), 1.0 + y, np.full(4, 1.5)])[:3]
+        links = sp.trace_links(field, (1.0, 1.0, 1.5), rx, scene_settings=sp.SceneSettings(floor_extent="none"))
+        found = links.beam_gains(sp.dft_codebook(4, 8), tx_array=array_of(4, 8))
+        assert found.best_tx_beam.values.tolist() == [0, 4, 8]
+        gain_db = found.gain_db.max(["rx_beam", "tx_beam"]).values - links.gain_db
+        np.testing.assert_allclose(gain_db, 10 * np.log10(32), atol=1e-2)
+
+
+def made_links(*paths: tuple[float, float, float, int]) -> sp.TracedLinks:
+    """One link with paths (power, delay [ns], azimuth of departure [rad], interaction)."""
+    power, delay_ns, azimuth, kind = np.array(paths, dtype=float).reshape(-1, 4).T
+    count = len(power)
+    transfer = np.zeros((count, 2, 2), complex)
+    transfer[:, 0, 0] = np.sqrt(power)
+    gain_db = 10 * np.log10(power.sum()) if count else -150.0
+    return sp.TracedLinks(
+        tx=np.zeros(3),
+        rx=np.ones((1, 3)),
+        link_state=np.ones(1, np.uint8),
+        gain_db=np.array([gain_db]),
+        path_tx=np.zeros(count, np.int32),
+        path_rx=np.zeros(count, np.int32),
+        transfer=transfer,
+        delay_s=1e-9 * delay_ns,
+        departure_rad=np.stack([np.full(count, np.pi / 2), azimuth], axis=1),
+        arrival_rad=np.stack([azimuth / 2, np.full(count, 3.0)], axis=1),
+        interactions=kind.astype(np.uint8)[:, None],
+        vertices_m=np.full((count, 1, 3), np.nan),
+        settings=sp.TraceSettings(),
+        scene_settings=sp.SceneSettings(),
+    )
+
+
+class TestSpreads:
+    """Cases by hand, with the definitions of TR 38.901."""
+
+    def test_two_paths(self) -> None:
+        found = made_links((3e-8, 10.0, np.pi - 0.1, 0), (1e-8, 50.0, 0.1 - np.pi, 1)).spreads()
+        assert found.delay_spread_s.values == pytest.approx([40e-9 * np.sqrt(0.75 * 0.25)])
+        assert found.k_factor_db.values == pytest.approx([10 * np.log10(3.0)])
+        assert found.path_loss_db.values == pytest.approx([-10 * np.log10(4e-8)])
+        length = np.hypot(np.cos(0.1), 0.5 * np.sin(0.1))  # across the end of the range of azimuth
+        assert found.azimuth_departure_spread_rad.values == pytest.approx([np.sqrt(-2 * np.log(length))])
+        assert found.zenith_departure_spread_rad.values == pytest.approx([0.0], abs=1e-7)
+        assert found.azimuth_arrival_spread_rad.values == pytest.approx([0.0], abs=1e-7)
+        assert found.zenith_arrival_spread_rad.units == "rad"
+        assert found.path_loss_db.dims == ("rx",)
+
+    def test_line_of_sight_alone(self) -> None:
+        found = made_links((1e-8, 10.0, 0.3, 0)).spreads()
+        assert found.k_factor_db.values.tolist() == [np.inf]
+        assert found.delay_spread_s.values.tolist() == [0.0]
+
+    def test_no_line_of_sight(self) -> None:
+        assert np.isnan(made_links((1e-8, 10.0, 0.3, 1)).spreads().k_factor_db).all()
+
+    def test_no_paths(self) -> None:
+        assert np.isnan(made_links().spreads().to_array()).all()
+
+    def test_several_transmitters(self, several: sp.TracedLinks) -> None:
+        assert several.spreads().delay_spread_s.dims == ("tx", "rx")

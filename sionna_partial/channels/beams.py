@@ -1,15 +1,19 @@
 """Beams: DFT codebooks, and the gain of every pair of beams of a link."""
 
+import itertools
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.channels.responses import ArrayPaths, labelled, phasors, require_memory
+from sionna_partial.channels.responses import ArrayPaths, labelled, require_memory
 from sionna_partial.checks import real_array, require, require_whole
-from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB
 from sionna_partial.errors import SettingsError
+from sionna_partial.tracing.antennas import Antennas
+from sionna_partial.tracing.trace import path_gain_db
 
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import ChannelPaths
@@ -62,25 +66,75 @@ def beam_gains(
     rx_codebook: ArrayLike | None = None,
     *,
     memory_gb: float = MEMORY_GB,
-    **options: Any,
+    **antennas: Any,
 ) -> xr.Dataset:
-    """Gains of pairs of beams (`TracedLinks.beam_gains`).
+    """Gains of pairs of beams (`TracedLinks.beam_gains`)."""
+    arrays = ArrayPaths.of(paths, **antennas)
+    at_tx = _weights("codebook", codebook, arrays.tx)
+    at_rx = _weights("rx_codebook", np.eye(len(arrays.rx)) if rx_codebook is None else rx_codebook, arrays.rx).conj()
+    pairs = len(at_rx) * len(at_tx)
+    require_memory(arrays, 4 * pairs, f"{pairs} pairs of beams", memory_gb)
+    gain_db = np.full((arrays.links, len(at_rx), len(at_tx)), GAIN_FLOOR_DB, np.float32)
+    best, margin_db = np.full((arrays.links, 2), -1), np.full(arrays.links, np.nan)
+    for links, rows, first in arrays.spans(PATHS_AT_ONCE):
+        rows_of, (received, sent) = itertools.pairwise(first), _factors(arrays, rows, at_rx, at_tx)
+        power = np.stack([_product(received[low:high], sent[low:high]) for low, high in rows_of])
+        gain_db[links] = path_gain_db(power)
+        flat, reached = power.reshape(len(power), -1), np.diff(first) > 0
+        found = np.stack(np.unravel_index(flat.argmax(axis=1), power.shape[1:]), axis=1)
+        best[links][reached] = found[reached]
+        if pairs > 1:
+            second, strongest = np.partition(flat, pairs - 2, axis=1)[:, -2:].T
+            with np.errstate(divide="ignore"):
+                margin_db[links][reached] = 10.0 * np.log10(strongest[reached] / second[reached])
+    every, numbers = ("link", "rx_beam", "tx_beam"), {"units": "1"}
+    variables = {
+        "gain_db": (every, gain_db, {"long_name": "path gain between beams", "units": "dB"}),
+        "best_rx_beam": (
+            "link",
+            best[:, 0],
+            numbers | {"long_name": "receive beam of the best pair, -1 for none"},
+        ),
+        "best_tx_beam": (
+            "link",
+            best[:, 1],
+            numbers | {"long_name": "transmit beam of the best pair, -1 for none"},
+        ),
+        "margin_db": ("link", margin_db, {"long_name": "gain of the strongest pair over the next", "units": "dB"}),
+    }
+    return labelled(arrays, variables)
 
-    A plane wave of a path excites a receive beam by u_k and a transmit beam by v_k, for each pattern k of the receiving
-    antennas. The power |sum_k u_k v_k|^2 is a sum of products of a number of one beam and a number of the other, so
-    that those of all pairs and paths of a link are one product of matrices.
+
+def _product(received: NDArray[np.float32], sent: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sum products (B, C) over paths and their numbers."""
+    return received.reshape(-1, received.shape[-1]).T @ sent.reshape(-1, sent.shape[-1])
+
+
+def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.complex64]:
+    """Weights (beams, patterns, positions) of a codebook (beams, antennas)."""
+    count = len(antennas)
+    remedy = f"give (beams, {count}) weights, one for each antenna, such as those of dft_codebook."
+    weights = real_array(name, codebook, SettingsError, remedy, kinds="iufc")
+    fits = weights.ndim == 2 and weights.shape[1:] == (count,) and len(weights) and np.isfinite(weights).all()
+    require(bool(fits), name, f"array of shape {weights.shape}", remedy)
+    return weights.reshape(len(weights), len(antennas.patterns), -1).astype(np.complex64)
+
+
+def _factors(
+    arrays: ArrayPaths, rows: slice, at_rx: NDArray[np.complex64], at_tx: NDArray[np.complex64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Numbers of receive beams (P, M, B) and of transmit beams (P, M, C) whose products, over M, are powers of paths.
+
+    A path excites a beam by u_k at the receiver and v_k at the transmitter, for each pattern k of the receiver. The
+    power |sum_k u_k v_k|^2 has the terms |u_k|^2 |v_k|^2, and for two patterns 2 Re(u_1 u_2* v_1 v_2*).
     """
-    arrays = ArrayPaths.of(paths, **options)
-    at_tx = _weights("codebook", codebook, len(arrays.tx))
-    at_rx = _weights("rx_codebook", np.eye(len(arrays.rx)) if rx_codebook is None else rx_codebook, len(arrays.rx))
-    shape = arrays.links, len(at_rx), len(at_tx)
-    require_memory(arrays, len(at_rx) * len(at_tx), "pairs of beams", memory_gb, each_bytes=4)
-    gain = np.zeros(shape, np.float32)
-    for start, stop, rows, first in arrays.chunks(PATHS_AT_ONCE):
-        received, sent = _excitations(arrays, rows, at_rx, at_tx)
-        for link, (low, high) in enumerate(zip(first[:-1], first[1:], strict=True), start):
-            gain[link] = np.tensordot(received[low:high], sent[low:high], ((0, 1), (0, 1)))
-    ranked = np.sort(gain.reshape(shape[0], -1), axis=1)[:, ::-1]
-    best = np.stack(np.unravel_index(gain.reshape(shape[0], -1).argmax(axis=1), shape[1:]), axis=1)
-    reached = ranked[:, 0] > 0.0
-    ...
+    gains, rx, tx = arrays.plane_waves(rows)
+    received = np.stack([rx @ each.T for each in at_rx.swapaxes(0, 1)], axis=1)
+    sent = gains @ np.stack([tx @ each.T for each in at_tx.swapaxes(0, 1)], axis=1)
+    if received.shape[1] == 1:
+        return np.abs(received) ** 2, np.abs(sent) ** 2
+    cross = [math.sqrt(2.0) * each[:, 0] * each[:, 1].conj() for each in (received, sent)]
+    return (
+        np.concatenate([np.abs(received) ** 2, np.stack([cross[0].real, -cross[0].imag], axis=1)], axis=1),
+        np.concatenate([np.abs(sent) ** 2, np.stack([cross[1].real, cross[1].imag], axis=1)], axis=1),
+    )

@@ -82,31 +82,32 @@ class ArrayPaths:
         """The largest number of paths of a link."""
         return int(np.diff(self.first).max(initial=0))
 
-    def blocks(self) -> Iterator["Block"]:
-        """Compute the coefficients, the paths of some links at a time."""
-        at_once = max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))
+    def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, NDArray[np.intp]]]:
+        """Yield links, their paths, and where those of each link begin and end among them, some at a time."""
         start = 0
         while start < self.links:
-            stop = int(np.searchsorted(self.first, self.first[start] + at_once, side="right")) - 1
+            stop = int(np.searchsorted(self.first, self.first[start] + paths_at_once, side="right")) - 1
             stop = min(max(stop, start + 1), self.links)
-            yield self._block(start, stop)
+            rows = slice(int(self.first[start]), int(self.first[stop]))
+            yield slice(start, stop), rows, self.first[start : stop + 1] - rows.start
             start = stop
 
-    def _block(self, start: int, stop: int) -> "Block":
-        rows = slice(int(self.first[start]), int(self.first[stop]))
-        first = self.first[start : stop + 1] - rows.start
-        wavelength_m = SPEED_OF_LIGHT_M_S / self.paths.settings.frequency_hz
-        gains, at_rx_m, at_tx_m = self.parts(rows)
+    def blocks(self) -> Iterator["Block"]:
+        """Compute the coefficients, the paths of some links at a time."""
+        for span in self.spans(max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))):
+            yield self._block(*span)
+
+    def _block(self, links: slice, rows: slice, first: NDArray[np.intp]) -> "Block":
         delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
         if self.synthetic_array:
-            at_rx, at_tx = (phasors(2.0 * np.pi / wavelength_m * each) for each in (at_rx_m, at_tx_m))
-            left = gains.astype(np.complex64)[:, :, None, :] * at_rx[:, None, :, None]
+            gains, at_rx, at_tx = self.plane_waves(rows)
+            left = gains[:, :, None, :] * at_rx[:, None, :, None]
             a = left[..., None] * at_tx[:, None, None, None, :]
         else:
             length_m = SPEED_OF_LIGHT_M_S * delay_s
-            longer_m = self._longer_m(rows, at_rx_m, at_tx_m)
+            gains, longer_m = self._gains(rows), self._longer_m(rows)
             factor = (length_m / (length_m + longer_m)).astype(np.complex64)
-            a = gains.astype(np.complex64)[:, :, None, :, None] * factor[:, None, :, None, :]
+            a = gains[:, :, None, :, None] * factor[:, None, :, None, :]
             delay_s = delay_s + np.tile(longer_m / SPEED_OF_LIGHT_M_S, (1, *gains.shape[1:]))
         if self.normalize_delays and len(delay_s):
             reached = np.flatnonzero(np.diff(first))
@@ -114,24 +115,34 @@ class ArrayPaths:
             delay_s = delay_s - np.repeat(shortest, np.diff(first)[reached])[:, None, None]
         kind = np.float32 if self.synthetic_array else np.float64  # the first rounds as Sionna RT does
         carrier = phasors(kind(-2.0 * np.pi) * kind(self.paths.settings.frequency_hz) * delay_s.astype(kind))
-        return Block(slice(start, stop), first, a.reshape(len(a), len(self.rx), len(self.tx)) * carrier, delay_s)
+        return Block(links, first, a.reshape(len(a), len(self.rx), len(self.tx)) * carrier, delay_s)
 
-    def parts(self, rows: slice) -> tuple[NDArray[np.complex128], NDArray[np.float64], NDArray[np.float64]]:
-        """Gains of paths from pattern to pattern (P, K_rx, K_tx), and the advance at each position of both arrays."""
+    def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
+        """Gains of paths from pattern to pattern (P, K_rx, K_tx), and phases at each position of both arrays."""
+        radians = 2.0 * np.pi * self.paths.settings.frequency_hz / SPEED_OF_LIGHT_M_S
+        at_rx, at_tx = (phasors(radians * each) for each in self._advances_m(rows))
+        return self._gains(rows), at_rx, at_tx
+
+    def _gains(self, rows: slice) -> NDArray[np.complex64]:
         each = self.paths
-        arrival = np.asarray(each.arrival_rad[rows]), each.path_rx[rows]
-        departure = np.asarray(each.departure_rad[rows]), each.path_tx[rows]
-        gains = self.rx.fields(*arrival).conj() @ each.transfer[rows] @ self.tx.fields(*departure).transpose(0, 2, 1)
-        return gains, self.rx.advance_m(*arrival), self.tx.advance_m(*departure)
+        at_rx = self.rx.fields(np.asarray(each.arrival_rad[rows]), each.path_rx[rows])
+        at_tx = self.tx.fields(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
+        gains: NDArray[np.complex128] = at_rx.conj() @ each.transfer[rows] @ at_tx.transpose(0, 2, 1)
+        return gains.astype(np.complex64)
 
-    def _longer_m(self, rows: slice, at_rx_m: NDArray[np.float64], at_tx_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _advances_m(self, rows: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        each = self.paths
+        at_rx_m = self.rx.advance_m(np.asarray(each.arrival_rad[rows]), each.path_rx[rows])
+        return at_rx_m, self.tx.advance_m(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
+
+    def _longer_m(self, rows: slice) -> NDArray[np.float64]:
         """By how much paths between antenna positions (P, A_rx, A_tx) are longer than between the centres [m].
 
         A path of reflections is a straight line from the image of the transmitter, which moves by M dt if the
         transmitter moves by dt. At a vertical edge the point of diffraction follows both ends: around it the path is a
         straight line too, in the unfolded half planes of both ends. At other edges and diffuse reflections it stays.
         """
-        unfolded = Unfolded.of(self.paths, rows)
+        unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self.paths, rows), self._advances_m(rows)
         rotations = self.rx.rotations(self.paths.path_rx[rows]), self.tx.rotations(self.paths.path_tx[rows])
         length_m = SPEED_OF_LIGHT_M_S * np.asarray(self.paths.delay_s[rows])[:, None, None]
         between = rotations[0].transpose(0, 2, 1) @ unfolded.before @ rotations[1]
@@ -243,8 +254,9 @@ class Unfolded:
 def cir(paths: "ChannelPaths", *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
     """Impulse responses (`TracedLinks.cir`)."""
     arrays = ArrayPaths.of(paths, **options)
-    delays = 1 if arrays.synthetic_array else len(arrays.rx) * len(arrays.tx)
-    _require_memory(arrays, arrays.most, "paths", memory_gb, 8 * delays)
+    pairs = len(arrays.rx) * len(arrays.tx)
+    path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
+    require_memory(arrays, arrays.most * path_bytes, f"{arrays.most} paths", memory_gb)
     shape = arrays.links, arrays.most, len(arrays.rx), len(arrays.tx)
     a = np.zeros(shape, np.complex64)
     delay_s = np.full(shape[:2] if arrays.synthetic_array else shape, np.nan)
@@ -277,12 +289,11 @@ def cfr(
     carrier_hz = paths.settings.frequency_hz
     inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
     require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")
-    _require_memory(arrays, len(offsets_hz), "frequencies", memory_gb)
 
     def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
         return phasors(-2.0 * np.pi * delay_s[..., None] * offsets_hz)
 
-    h = _filtered(arrays, kernel, len(offsets_hz))
+    h = _filtered(arrays, kernel, len(offsets_hz), "frequencies", memory_gb)
     variables = {"h": (("link", "rx_ant", "tx_ant", "frequency"), h, {"long_name": "frequency response", "units": "1"})}
     attributes = {"long_name": "frequency relative to the carrier", "units": "Hz"}
     return labelled(arrays, variables).assign_coords(frequency=("frequency", offsets_hz, attributes))
@@ -304,16 +315,15 @@ def taps(
         l_max = MORE_TAPS + math.ceil(bandwidth_hz * _longest_s(arrays))
     require_whole("l_min", l_min, -1_000_000, 1_000_000)
     require_whole("l_max", l_max, l_min, 1_000_000_000)
-    _require_memory(arrays, l_max - l_min + 1, "taps", memory_gb)
-    tap = np.arange(l_min, l_max + 1)
 
     def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
+        tap = np.arange(l_min, l_max + 1)
         return np.sinc(tap - bandwidth_hz * delay_s[..., None]).astype(np.complex64)
 
-    h = _filtered(arrays, kernel, len(tap))
+    h = _filtered(arrays, kernel, l_max - l_min + 1, "taps", memory_gb)
     attributes = {"long_name": "channel tap", "units": "1"}
     table = labelled(arrays, {"h": (("link", "rx_ant", "tx_ant", "tap"), h, attributes)})
-    return table.assign_coords(tap=tap).assign_attrs(bandwidth_hz=float(bandwidth_hz))
+    return table.assign_coords(tap=np.arange(l_min, l_max + 1)).assign_attrs(bandwidth_hz=float(bandwidth_hz))
 
 
 def _longest_s(arrays: ArrayPaths) -> float:
@@ -326,9 +336,10 @@ def _longest_s(arrays: ArrayPaths) -> float:
 
 
 def _filtered(
-    arrays: ArrayPaths, kernel: Callable[[NDArray[np.float64]], NDArray[Any]], size: int
+    arrays: ArrayPaths, kernel: Callable[[NDArray[np.float64]], NDArray[Any]], size: int, what: str, memory_gb: float
 ) -> NDArray[np.complex64]:
     """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size)."""
+    require_memory(arrays, 8 * len(arrays.rx) * len(arrays.tx) * size, f"{size} {what}", memory_gb)
     h = np.zeros((arrays.links, len(arrays.rx), len(arrays.tx), size), np.complex64)
     for block in arrays.blocks():
         for link, (low, high) in enumerate(zip(block.first[:-1], block.first[1:], strict=True), block.links.start):
@@ -355,13 +366,13 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
     return xr.Dataset({**variables, **positions}, coords=coordinates, attrs=attributes)
 
 
-def _require_memory(arrays: ArrayPaths, size: int, what: str, memory_gb: float, more_bytes: int = 0) -> None:
-    """Raise a MemoryLimitError if channels would take more than `memory_gb`."""
+def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float) -> None:
+    """Raise a MemoryLimitError if all links would take more than `memory_gb`."""
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    rx, tx = len(arrays.rx), len(arrays.tx)
-    size_gb = arrays.links * size * (8 * rx * tx + more_bytes) / 1e9
+    size_gb = arrays.links * link_bytes / 1e9
     if size_gb > memory_gb:
         raise MemoryLimitError(
-            f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {rx} x {tx} antennas x {size} "
-            f"{what}, which take {size_gb:,.1f} GB: give fewer links or antennas, more memory_gb, or use save_channels."
+            f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {len(arrays.rx)} x {len(arrays.tx)} "
+            f"antennas x {what}, which take {size_gb:,.1f} GB: give fewer links or antennas, more memory_gb, or use "
+            "save_channels."
         )

@@ -79,6 +79,8 @@ def _evaluated(pattern: Any, local_rad: NDArray[np.float64]) -> list[NDArray[np.
     """Zenith and azimuth component (P,) of a pattern, which Sionna RT evaluates."""
     import mitsuba as mi
 
+    if not len(local_rad):  # Dr.Jit would abort
+        return [np.zeros(0, np.complex128)] * 2
     angles = (to_device(mi.Float, column.astype(np.float32)) for column in local_rad.T)
     return [np.zeros(len(local_rad)) + (part.real.numpy() + 1j * part.imag.numpy()) for part in pattern(*angles)]
 

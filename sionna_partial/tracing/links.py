@@ -151,6 +151,56 @@ class ChannelPaths:
         """
         return later("channels.responses:taps")(self, bandwidth_hz, l_min, l_max, **options)
 
+    def beam_gains(
+        self,
+        codebook: ArrayLike,
+        rx_codebook: ArrayLike | None = None,
+        *,
+        tx_array: Any = None,
+        rx_array: Any = None,
+        tx_orientation_rad: ArrayLike | None = None,
+        rx_orientation_rad: ArrayLike | None = None,
+        memory_gb: float = MEMORY_GB,
+    ) -> "xr.Dataset":
+        """Return the gain of every pair of beams of each link.
+
+        The gain of beams w and u is the sum of |u^H A w|^2 over the paths, whose coefficients A are those of `cir` for
+        plane waves: the mean over a wide band, as `gain_db` is. The matrices A themselves are never formed.
+
+        Parameters
+        ----------
+        codebook : (C, tx_ant) array-like
+            Weights of the transmitting antennas, a beam in each row, such as those of `dft_codebook`.
+        rx_codebook : (B, rx_ant) array-like, optional
+            Those of the receiving antennas. By default each antenna alone.
+        tx_array, rx_array, tx_orientation_rad, rx_orientation_rad, memory_gb
+            As in `cir`.
+
+        Returns
+        -------
+        xarray.Dataset
+            `gain_db` (link, rx_beam, tx_beam), at least -150 dB; `best_rx_beam` and `best_tx_beam` (link) of the
+            strongest pair, -1 without paths; `margin_db` (link), by which it is stronger than the next, NaN without
+            paths or for a single pair.
+
+        Raises
+        ------
+        SettingsError, MemoryLimitError
+            As `cir`, and for weights of another shape.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> from sionna.rt import PlanarArray
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> array = PlanarArray(num_rows=4, num_cols=4, pattern="iso", polarization="V")
+        >>> beams = links.beam_gains(sp.dft_codebook(4, 4), tx_array=array)
+        >>> beams.best_tx_beam.item()  # broadside
+        0
+        """
+        options = {key: value for key, value in locals().items() if key != "self"}
+        return later("channels.beams:beam_gains")(self, **options)
+
 
 @dataclass(frozen=True)
 class TracedLinks(ChannelPaths, Shown):
@@ -256,6 +306,34 @@ class TracedLinks(ChannelPaths, Shown):
         for name in ("settings", "scene_settings"):
             table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
         return table
+
+    def spreads(self) -> "xr.Dataset":
+        """Return delay and angular spreads, K-factor and path loss of each link.
+
+        Paths are weighted by |a|^2, their power between isotropic, vertically polarised antennas.
+
+        Returns
+        -------
+        xarray.Dataset
+            On "rx", and "tx" where there are several. `path_loss_db`; `k_factor_db`, the power of the line of sight
+            over that of all other paths; `delay_spread_s`, the standard deviation of the delay; and four circular
+            standard deviations `zenith_departure_spread_rad`, `azimuth_departure_spread_rad`,
+            `zenith_arrival_spread_rad` and `azimuth_arrival_spread_rad`. NaN without paths, and K without line of
+            sight.
+
+        Notes
+        -----
+        Source: 3GPP TR 38.901, section 7.5 (delay spread, K-factor) and annex A.1 (angular spread
+        sqrt(-2 ln |sum P exp(j angle) / sum P|)).
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> bool(links.spreads().k_factor_db > 0)
+        True
+        """
+        return later("channels.spreads:spreads")(self)
 
     def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
         """Return a row for each link, or for each path, as a pandas.DataFrame.
