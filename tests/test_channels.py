@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -12,7 +13,7 @@ from test_trace import _room
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
-from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.paths import DIFFRACTION
@@ -377,3 +378,120 @@ class TestSpreads:
 
     def test_several_transmitters(self, several: sp.TracedLinks) -> None:
         assert several.spreads().delay_spread_s.dims == ("tx", "rx")
+
+
+class TestFiles:
+    ARRAYS: ClassVar = {"tx_array": (2, 2, "iso", "VH"), "rx_array": (1, 2)}
+
+    @pytest.fixture
+    def options(self) -> dict[str, Any]:
+        return {name: array_of(*shape) for name, shape in self.ARRAYS.items()}
+
+    @pytest.mark.parametrize("synthetic_array", [True, False])
+    @pytest.mark.parametrize("suffix", [".nc", ".h5", ".zarr"])
+    def test_links_as_sionna_has_them(
+        self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any], suffix: str, synthetic_array: bool
+    ) -> None:
+        options["synthetic_array"] = synthetic_array
+        whole, path = several.cir(**options), tmp_path / f"channels{suffix}"
+        sp.save_channels(several, path, **options)
+        found = sp.load_channels(path)
+        assert found.a.dims == ("rx", "rx_ant", "tx", "tx_ant", "path", "time")
+        assert found.a.shape == (3, 2, 2, 8, whole.sizes["path"], 1)
+        assert found.tau.dims == (("rx", "tx", "path") if synthetic_array else found.a.dims[:-1])
+        for tx, rx in np.ndindex(2, 3):
+            link = whole.isel(link=3 * tx + rx)
+            np.testing.assert_array_equal(found.a[rx, :, tx, ..., 0], link.a)
+            np.testing.assert_array_equal(found.tau.isel(rx=rx, tx=tx), link.delay_s.fillna(-1.0))
+        np.testing.assert_array_equal(found.rx_m, several.rx)
+        assert found.tx_m.shape == (2, 3)
+        assert [each.name for each in tmp_path.iterdir()] == [path.name]
+        if suffix == ".h5":
+            with h5py.File(path) as file:
+                np.testing.assert_array_equal(file["a"], found.a)
+
+    def test_computed_channels(self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any]) -> None:
+        channels, response = several.cir(**options), several.cfr([0.0, 1e6], **options)
+        sp.save_channels(channels, tmp_path / "whole.nc")
+        sp.save_channels(several, tmp_path / "links.nc", **options)
+        xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "links.nc"))
+        sp.save_channels(response, tmp_path / "h.nc")
+        found = sp.load_channels(tmp_path / "h.nc")
+        assert found.h.dims == ("rx", "rx_ant", "tx", "tx_ant", "time", "frequency")
+        np.testing.assert_array_equal(found.h[1, :, 1, :, 0], response.h[4])
+        assert found.frequency.values.tolist() == [0.0, 1e6]
+
+    def test_as_deepmimo_has_them(self, tmp_path: Path) -> None:
+        links = links_of(1)
+        sp.save_channels(links, tmp_path / "one.h5", layout="deepmimo", tx_array=array_of(2, 2))
+        found, whole = sp.load_channels(tmp_path / "one.h5"), links.cir(tx_array=array_of(2, 2))
+        assert found.channel.dims == ("rx", "rx_ant", "tx_ant", "path")
+        np.testing.assert_array_equal(found.channel, whole.a)
+        np.testing.assert_array_equal(found.delay, whole.delay_s)
+        sp.save_channels(links.cfr([0.0, 1e6]), tmp_path / "h.h5", layout="deepmimo")
+        assert sp.load_channels(tmp_path / "h.h5").channel.dims == ("rx", "rx_ant", "tx_ant", "frequency")
+
+    def test_a_generator_yields_what_sionna_takes(self, several: sp.TracedLinks, tmp_path: Path) -> None:
+        """`CIRDataset` takes a generator of a [rx, rx_ant, tx, tx_ant, path, time] and tau [rx, tx, path]."""
+        sp.save_channels(several, tmp_path / "channels.zarr", tx_array=array_of(2, 2))
+        found = sp.load_channels(tmp_path / "channels.zarr")
+        for rx in range(3):
+            a, tau = (found[name].isel(rx=[rx]).to_numpy() for name in ("a", "tau"))
+            assert a.shape == (1, 1, 2, 4, found.sizes["path"], 1)
+            assert tau.shape == (1, 2, found.sizes["path"])
+            assert a.dtype == np.complex64
+
+    def test_blocks_and_progress(
+        self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fractions: list[float] = []
+        sp.save_channels(several, tmp_path / "whole.nc")
+        monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
+        sp.save_channels(several, tmp_path / "parts.nc", progress=lambda fraction, _: fractions.append(fraction))
+        xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "parts.nc"))
+        assert fractions[-1] == 1.0
+        assert len({*fractions}) == 7
+
+    @pytest.mark.parametrize(
+        ("name", "error", "message"),
+        [
+            ("channels.mat", OutputError, r"has the suffix '.mat': choose one of .zarr, .nc, .h5"),
+            ("there.zarr", OutputError, "is there already: remove it, or choose another name"),
+            ("folder.nc", OutputError, "this path is a folder"),
+        ],
+    )
+    def test_paths_that_are_refused(
+        self, several: sp.TracedLinks, tmp_path: Path, name: str, error: type[Exception], message: str
+    ) -> None:
+        (tmp_path / "there.zarr").mkdir()
+        (tmp_path / "folder.nc").mkdir()
+        with pytest.raises(error, match=message):
+            sp.save_channels(several, tmp_path / name)
+        assert len([*tmp_path.iterdir()]) == 2
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda path, links: sp.save_channels(links, path, layout="matlab"), "layout = 'matlab' is not allowed"),  # type: ignore[arg-type]
+            (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
+            (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels = .* give links, or what their cir"),
+            (lambda path, links: sp.save_channels(links.cir(), path, rx_array=None), "options = 'rx_array' is not"),
+            (lambda path, links: sp.save_channels(made_links(), path), "channels = '1 links' .* none has a path"),
+            (lambda path, links: sp.load_channels(path), "channels.nc' cannot be read"),
+            (lambda path, links: sp.load_channels(path.with_suffix(".zarr")), "channels.zarr' cannot be read"),
+            (lambda path, links: sp.load_channels(path.with_suffix(".mat")), "path = .*mat' is not allowed: give a"),
+            (
+                lambda path, links: sp.load_channels(path.with_name("text.nc")),
+                "text.nc' cannot be read .*save_channels",
+            ),
+            (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
+        ],
+    )
+    def test_refused(
+        self, several: sp.TracedLinks, tmp_path: Path, call: Callable[[Path, Any], object], message: str
+    ) -> None:
+        (tmp_path / "text.nc").write_text("no NetCDF")
+        xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+        with pytest.raises(SettingsError, match=message):
+            call(tmp_path / "channels.nc", several)
+        assert not (tmp_path / "channels.nc").exists()

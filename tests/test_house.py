@@ -37,7 +37,7 @@ ROOMS = {
         "path_set",
         "antennas",
     ),
-    "channels": ("responses", "beams", "spreads"),
+    "channels": ("responses", "beams", "spreads", "files"),
     "prediction": (
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),

@@ -57,7 +57,7 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
     count = polarisations * rows * columns
     require(count <= MAX_ANTENNAS, "rows, columns", (rows, columns), f"give {MAX_ANTENNAS} antennas at most.")
     vertical, horizontal = (np.fft.fft(np.eye(size)) / np.sqrt(size) for size in (rows, columns))
-    return np.kron(np.eye(polarisations), np.kron(horizontal, vertical))
+    return np.kron(np.eye(polarisations), np.kron(horizontal, vertical)).astype(np.complex128)
 
 
 def beam_gains(
@@ -79,7 +79,7 @@ def beam_gains(
     for links, rows, first in arrays.spans(PATHS_AT_ONCE):
         rows_of, (received, sent) = itertools.pairwise(first), _factors(arrays, rows, at_rx, at_tx)
         power = np.stack([_product(received[low:high], sent[low:high]) for low, high in rows_of])
-        gain_db[links] = path_gain_db(power)
+        gain_db[links] = path_gain_db(power.astype(np.float64))
         flat, reached = power.reshape(len(power), -1), np.diff(first) > 0
         found = np.stack(np.unravel_index(flat.argmax(axis=1), power.shape[1:]), axis=1)
         best[links][reached] = found[reached]

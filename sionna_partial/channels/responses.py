@@ -82,6 +82,11 @@ class ArrayPaths:
         """The largest number of paths of a link."""
         return int(np.diff(self.first).max(initial=0))
 
+    def empty(self, links: int) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+        """Return arrays for `Block.fill`: 0 and NaN."""
+        shape = links, self.most, len(self.rx), len(self.tx)
+        return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
+
     def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, NDArray[np.intp]]]:
         """Yield links, their paths, and where those of each link begin and end among them, some at a time."""
         start = 0
@@ -95,9 +100,10 @@ class ArrayPaths:
     def blocks(self) -> Iterator["Block"]:
         """Compute the coefficients, the paths of some links at a time."""
         for span in self.spans(max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))):
-            yield self._block(*span)
+            yield self.block(*span)
 
-    def _block(self, links: slice, rows: slice, first: NDArray[np.intp]) -> "Block":
+    def block(self, links: slice, rows: slice, first: NDArray[np.intp]) -> "Block":
+        """Compute the coefficients of one of the `spans`."""
         delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
         if self.synthetic_array:
             gains, at_rx, at_tx = self.plane_waves(rows)
@@ -113,8 +119,9 @@ class ArrayPaths:
             reached = np.flatnonzero(np.diff(first))
             shortest = np.minimum.reduceat(delay_s.min(axis=(1, 2)), first[reached])
             delay_s = delay_s - np.repeat(shortest, np.diff(first)[reached])[:, None, None]
-        kind = np.float32 if self.synthetic_array else np.float64  # the first rounds as Sionna RT does
-        carrier = phasors(kind(-2.0 * np.pi) * kind(self.paths.settings.frequency_hz) * delay_s.astype(kind))
+        kind = np.dtype(np.float32 if self.synthetic_array else np.float64)  # the first rounds as Sionna RT does
+        per_second = np.array(-2.0 * np.pi, kind) * np.array(self.paths.settings.frequency_hz, kind)
+        carrier = phasors(per_second * delay_s.astype(kind))
         return Block(links, first, a.reshape(len(a), len(self.rx), len(self.tx)) * carrier, delay_s)
 
     def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
@@ -180,6 +187,14 @@ class Block:
     first: NDArray[np.intp]
     a: NDArray[np.complex64]
     delay_s: NDArray[np.float64]
+
+    def fill(self, a: NDArray[np.complex64], delay_s: NDArray[np.float64]) -> None:
+        """Put them into arrays (links, paths, antennas of rx, of tx), the delays likewise or (links, paths)."""
+        count = np.diff(self.first)
+        link = np.repeat(np.arange(len(count)), count)
+        number = np.arange(len(link)) - np.repeat(self.first[:-1], count)
+        a[link, number] = self.a
+        delay_s[link, number] = self.delay_s[:, 0, 0] if delay_s.ndim == 2 else self.delay_s
 
 
 @dataclass(frozen=True)
@@ -257,14 +272,9 @@ def cir(paths: "ChannelPaths", *, memory_gb: float = MEMORY_GB, **options: Any) 
     pairs = len(arrays.rx) * len(arrays.tx)
     path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
     require_memory(arrays, arrays.most * path_bytes, f"{arrays.most} paths", memory_gb)
-    shape = arrays.links, arrays.most, len(arrays.rx), len(arrays.tx)
-    a = np.zeros(shape, np.complex64)
-    delay_s = np.full(shape[:2] if arrays.synthetic_array else shape, np.nan)
+    a, delay_s = arrays.empty(arrays.links)
     for block in arrays.blocks():
-        link = np.repeat(np.arange(block.links.start, block.links.stop), np.diff(block.first))
-        number = np.arange(len(link)) - np.repeat(block.first[:-1], np.diff(block.first))
-        a[link, number] = block.a
-        delay_s[link, number] = block.delay_s[:, 0, 0] if arrays.synthetic_array else block.delay_s
+        block.fill(a[block.links], delay_s[block.links])
     every = ("link", "rx_ant", "tx_ant", "path")
     delay = ("link", "path") if arrays.synthetic_array else every
     variables = {

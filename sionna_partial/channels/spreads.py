@@ -17,7 +17,7 @@ def spreads(links: "TracedLinks") -> xr.Dataset:
     power = np.abs(links.a) ** 2
 
     def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(link, values, len(tx_m) * count)
+        return np.bincount(link, values, len(tx_m) * count).astype(np.float64)
 
     with np.errstate(divide="ignore", invalid="ignore"):
         all_power = total(power)

@@ -451,7 +451,7 @@ def _read_buffer(
 ) -> tuple[SolvedPaths, NDArray[np.intp]]:
     """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
-    transfer = np.moveaxis([[a.real.numpy() + 1j * a.imag.numpy() for a in row] for row in buffer.a], 2, 0)
+    transfer = np.moveaxis(np.array([[a.real.numpy() + 1j * a.imag.numpy() for a in row] for row in buffer.a]), 2, 0)
     valid = np.flatnonzero(buffer.valid.numpy() & (transfer[:, 0, 0] != 0.0))
     paths = SolvedPaths.of_vertices(
         path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
