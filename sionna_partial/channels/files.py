@@ -76,12 +76,7 @@ def save_channels(
     >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
     >>> sp.save_channels(links, "channels.nc", normalize_delays=False)
     """
-    require_choice("layout", layout, get_args(Layout))
-    target = output_path(path)
-    if target.suffix not in SUFFIXES:
-        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(SUFFIXES)}.")
-    if target.suffix == ".zarr" and os.path.lexists(target):
-        raise OutputError(f"path = '{target}' is there already: remove it, or choose another name.")
+    target = checked_target(path, layout)
     with reporting(progress) as report, dask.config.set(scheduler="synchronous"):
         if isinstance(channels, xr.Dataset):
             table = _unstacked(channels, options)
@@ -98,6 +93,17 @@ def save_channels(
             with atomic_path(target) as file:
                 table.to_netcdf(file, engine="h5netcdf", encoding=packed)
         report(1.0, f"wrote {target.name}")
+
+
+def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
+    """Return where channels can be written in a layout."""
+    require_choice("layout", layout, get_args(Layout))
+    target = output_path(path)
+    if target.suffix not in SUFFIXES:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(SUFFIXES)}.")
+    if target.suffix == ".zarr" and os.path.lexists(target):
+        raise OutputError(f"path = '{target}' is there already: remove it, or choose another name.")
+    return target
 
 
 def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:

@@ -6,10 +6,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import real_array, require
+from sionna_partial.checks import real_array, require, require_choice, require_whole
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import SettingsError
 from sionna_partial.tracing.engine import load_sionna, to_device
+
+PATTERNS, POLARISATIONS = ("iso", "dipole", "hw_dipole", "tr38901"), ("V", "H", "VH", "cross")
+"""Antenna patterns and polarisations that Sionna RT has."""
+
+
+def planar_array(rows: int, columns: int, pattern: str = "iso", polarization: str = "V") -> Any:
+    """Make a `sionna.rt.PlanarArray` whose antennas are half a wavelength apart."""
+    require_choice("pattern", pattern, PATTERNS)
+    require_choice("polarization", polarization, POLARISATIONS)
+    for name, value in (("rows", rows), ("columns", columns)):
+        require_whole(name, value, 1, 1024)
+    return load_sionna().PlanarArray(num_rows=rows, num_cols=columns, pattern=pattern, polarization=polarization)
 
 
 @dataclass(frozen=True)
@@ -30,8 +42,7 @@ class Antennas:
     ) -> "Antennas":
         """Take a `sionna.rt.PlanarArray` (None: one isotropic, vertical antenna) for the `count` ends of a side."""
         rt = load_sionna()
-        if array is None:
-            array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+        array = planar_array(1, 1) if array is None else array
         require(
             isinstance(array, rt.antenna_array.AntennaArray),
             f"{side}_array",
