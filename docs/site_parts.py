@@ -21,7 +21,15 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 SECTIONS = {
     "Start": ["docs/install", "docs/usage"],
     "Guides": [
-        *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/transmitters", "docs/measured_powers"),
+        *(
+            "docs/ros_map",
+            "docs/scan",
+            "docs/sionna",
+            "docs/robots",
+            "docs/channels",
+            "docs/transmitters",
+            "docs/measured_powers",
+        ),
         *("docs/calibration", "docs/placement", "docs/differentiable", "docs/training", "docs/cluster"),
     ],
     "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],
@@ -38,6 +46,7 @@ ROOMS = {
     "maps": "Maps",
     "scene": "Scenes",
     "tracing": "Tracing",
+    "channels": "Channels",
     "prediction": "Prediction",
     "coverage": "Coverage",
     "export": "Coverage",

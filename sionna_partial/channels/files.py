@@ -89,7 +89,10 @@ def save_channels(
             with atomic_files(target) as folder:
                 table.to_zarr(folder, mode="w", consolidated=False)
         else:
-            packed: dict[Any, Any] = {name: {"zlib": True, "complevel": 1} for name in table if table[name].ndim > 2}
+            of_receiver = {name: (1, *each.shape[1:]) for name, each in table.items() if each.ndim > 3}
+            packed: dict[Any, Any] = {
+                name: {"zlib": True, "complevel": 1, "chunksizes": sizes} for name, sizes in of_receiver.items()
+            }
             with atomic_path(target) as file:
                 table.to_netcdf(file, engine="h5netcdf", encoding=packed)
         report(1.0, f"wrote {target.name}")
