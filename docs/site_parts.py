@@ -21,16 +21,9 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 SECTIONS = {
     "Start": ["docs/install", "docs/usage"],
     "Guides": [
-        *(
-            "docs/ros_map",
-            "docs/scan",
-            "docs/sionna",
-            "docs/robots",
-            "docs/channels",
-            "docs/transmitters",
-            "docs/measured_powers",
-        ),
-        *("docs/calibration", "docs/placement", "docs/differentiable", "docs/training", "docs/cluster"),
+        *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/channels", "docs/transmitters"),
+        *("docs/measured_powers", "docs/calibration", "docs/placement", "docs/differentiable", "docs/training"),
+        "docs/cluster",
     ],
     "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],
     "Reference": ["build/api/index", "docs/conventions", "docs/glossary"],

@@ -451,11 +451,12 @@ def _read_buffer(
 ) -> tuple[SolvedPaths, NDArray[np.intp]]:
     """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
-    transfer = np.moveaxis(np.array([[a.real.numpy() + 1j * a.imag.numpy() for a in row] for row in buffer.a]), 2, 0)
-    valid = np.flatnonzero(buffer.valid.numpy() & (transfer[:, 0, 0] != 0.0))
+    a = buffer.a[0][0]
+    valid = np.flatnonzero(buffer.valid.numpy() & ((a.real.numpy() != 0.0) | (a.imag.numpy() != 0.0)))
+    transfer = np.array([[a.real.numpy()[valid] + 1j * a.imag.numpy()[valid] for a in row] for row in buffer.a])
     paths = SolvedPaths.of_vertices(
         path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
-        transfer=transfer[valid].astype(np.complex128),
+        transfer=np.moveaxis(transfer, 2, 0).astype(np.complex128),
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
         interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
         vertices_m=np.stack(
