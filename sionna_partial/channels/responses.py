@@ -71,6 +71,11 @@ class ArrayPaths:
         """The number of links, T N."""
         return len(self.paths.tx.reshape(-1, 3)) * len(self.paths.rx)
 
+    @property
+    def antennas(self) -> str:
+        """How many there are, for messages."""
+        return f"{len(self.rx)} x {len(self.tx)} antennas"
+
     @cached_property
     def first(self) -> NDArray[np.intp]:
         """Where the paths of each link begin, and the number of all paths: (links + 1,)."""
@@ -115,10 +120,8 @@ class ArrayPaths:
             factor = (length_m / (length_m + longer_m)).astype(np.complex64)
             a = gains[:, :, None, :, None] * factor[:, None, :, None, :]
             delay_s = delay_s + np.tile(longer_m / SPEED_OF_LIGHT_M_S, (1, *gains.shape[1:]))
-        if self.normalize_delays and len(delay_s):
-            reached = np.flatnonzero(np.diff(first))
-            shortest = np.minimum.reduceat(delay_s.min(axis=(1, 2)), first[reached])
-            delay_s = delay_s - np.repeat(shortest, np.diff(first)[reached])[:, None, None]
+        if self.normalize_delays:
+            delay_s = _after_shortest(delay_s, first)
         kind = np.dtype(np.float32 if self.synthetic_array else np.float64)  # the first rounds as Sionna RT does
         per_second = np.array(-2.0 * np.pi, kind) * np.array(self.paths.settings.frequency_hz, kind)
         carrier = phasors(per_second * delay_s.astype(kind))
@@ -174,6 +177,15 @@ def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
     found = np.empty(angle.shape, np.complex64)
     found.real, found.imag = np.cos(angle), np.sin(angle)
     return found
+
+
+def _after_shortest(delay_s: NDArray[np.float64], first: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return delays (P, ., .) after the shortest of each link."""
+    reached, count = np.flatnonzero(np.diff(first)), np.diff(first)
+    if not len(reached):
+        return delay_s
+    shortest = np.minimum.reduceat(delay_s.min(axis=(1, 2)), first[reached])
+    return delay_s - np.repeat(shortest, count[reached])[:, None, None]
 
 
 @dataclass(frozen=True)
@@ -271,7 +283,7 @@ def cir(paths: "ChannelPaths", *, memory_gb: float = MEMORY_GB, **options: Any) 
     arrays = ArrayPaths.of(paths, **options)
     pairs = len(arrays.rx) * len(arrays.tx)
     path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
-    require_memory(arrays, arrays.most * path_bytes, f"{arrays.most} paths", memory_gb)
+    require_memory(arrays, arrays.most * path_bytes, f"{arrays.antennas} x {arrays.most} paths", memory_gb)
     a, delay_s = arrays.empty(arrays.links)
     for block in arrays.blocks():
         block.fill(a[block.links], delay_s[block.links])
@@ -322,7 +334,9 @@ def taps(
     require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
     arrays = ArrayPaths.of(paths, **options)
     if l_max is None:
-        l_max = MORE_TAPS + math.ceil(bandwidth_hz * _longest_s(arrays))
+        delay_s = np.asarray(paths.delay_s)[:, None, None]
+        counted_s = _after_shortest(delay_s, arrays.first) if arrays.normalize_delays else delay_s
+        l_max = MORE_TAPS + math.ceil(bandwidth_hz * counted_s.max(initial=0.0))
     require_whole("l_min", l_min, -1_000_000, 1_000_000)
     require_whole("l_max", l_max, l_min, 1_000_000_000)
 
@@ -336,29 +350,20 @@ def taps(
     return table.assign_coords(tap=np.arange(l_min, l_max + 1)).assign_attrs(bandwidth_hz=float(bandwidth_hz))
 
 
-def _longest_s(arrays: ArrayPaths) -> float:
-    """Longest delay of all paths between the centres, after that of the shortest of their link if normalized."""
-    delay_s, first = np.asarray(arrays.paths.delay_s), arrays.first
-    if arrays.normalize_delays:
-        reached = np.flatnonzero(np.diff(first))
-        delay_s = delay_s - np.repeat(delay_s[first[reached]], np.diff(first)[reached])
-    return float(delay_s.max(initial=0.0))
-
-
 def _filtered(
     arrays: ArrayPaths, kernel: Callable[[NDArray[np.float64]], NDArray[Any]], size: int, what: str, memory_gb: float
 ) -> NDArray[np.complex64]:
     """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size)."""
-    require_memory(arrays, 8 * len(arrays.rx) * len(arrays.tx) * size, f"{size} {what}", memory_gb)
+    link_bytes = 8 * len(arrays.rx) * len(arrays.tx) * size
+    require_memory(arrays, link_bytes, f"{arrays.antennas} x {size} {what}", memory_gb)
     h = np.zeros((arrays.links, len(arrays.rx), len(arrays.tx), size), np.complex64)
     for block in arrays.blocks():
         for link, (low, high) in enumerate(zip(block.first[:-1], block.first[1:], strict=True), block.links.start):
-            weight = kernel(block.delay_s[low:high])
-            a = np.moveaxis(block.a[low:high], 0, 2)
             if arrays.synthetic_array:
-                h[link] = a @ weight[:, 0, 0]
-            else:
-                h[link] = np.einsum("rtp,prts->rts", a, weight)
+                h[link] = np.moveaxis(block.a[low:high], 0, 2) @ kernel(block.delay_s[low:high, 0, 0])
+                continue
+            for a, delay_s in zip(block.a[low:high], block.delay_s[low:high], strict=True):
+                h[link] += a[..., None] * kernel(delay_s)
     return h
 
 
@@ -382,7 +387,6 @@ def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: fl
     size_gb = arrays.links * link_bytes / 1e9
     if size_gb > memory_gb:
         raise MemoryLimitError(
-            f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {len(arrays.rx)} x {len(arrays.tx)} "
-            f"antennas x {what}, which take {size_gb:,.1f} GB: give fewer links or antennas, more memory_gb, or use "
-            "save_channels."
+            f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {what}, which take {size_gb:,.1f} "
+            "GB: give fewer of them, more memory_gb, or use save_channels, which needs memory for some links only."
         )

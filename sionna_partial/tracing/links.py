@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 
 class ChannelPaths:
-    """Channels of paths with antennas, for classes with the arrays of `TracedLinks` that describe paths."""
+    """Channels of paths with antennas, for classes that have the arrays of `TracedLinks`.
+
+    Paths are ordered by transmitter and receiver.
+    """
 
     tx: NDArray[np.float64]
     rx: NDArray[np.float64]
