@@ -167,8 +167,8 @@ class ChannelPaths:
     ) -> "xr.Dataset":
         """Return the gain of every pair of beams of each link.
 
-        The gain of beams w and u is the sum of |u^H A w|^2 over the paths, whose coefficients A are those of `cir` for
-        plane waves: the mean over a wide band, as `gain_db` is. The matrices A themselves are never formed.
+        The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, whose coefficients A are those of `cir`
+        for plane waves: the mean over a wide band, as `gain_db` is. The matrices A themselves are never formed.
 
         Parameters
         ----------
@@ -313,7 +313,7 @@ class TracedLinks(ChannelPaths, Shown):
     def spreads(self) -> "xr.Dataset":
         """Return delay and angular spreads, K-factor and path loss of each link.
 
-        Paths are weighted by |a|^2, their power between isotropic, vertically polarised antennas.
+        Paths are weighted by ``|a|^2``, their power between isotropic, vertically polarised antennas.
 
         Returns
         -------
@@ -327,7 +327,7 @@ class TracedLinks(ChannelPaths, Shown):
         Notes
         -----
         Source: 3GPP TR 38.901, section 7.5 (delay spread, K-factor) and annex A.1 (angular spread
-        sqrt(-2 ln |sum P exp(j angle) / sum P|)).
+        ``sqrt(-2 ln |sum P exp(j angle) / sum P|)``).
 
         Examples
         --------
