@@ -77,37 +77,28 @@ def beam_gains(
     gain_db = np.full((arrays.links, len(at_rx), len(at_tx)), GAIN_FLOOR_DB, np.float32)
     best, margin_db = np.full((arrays.links, 2), -1), np.full(arrays.links, np.nan)
     for links, rows, first in arrays.spans(PATHS_AT_ONCE):
-        rows_of, (received, sent) = itertools.pairwise(first), _factors(arrays, rows, at_rx, at_tx)
-        power = np.stack([_product(received[low:high], sent[low:high]) for low, high in rows_of])
-        gain_db[links] = path_gain_db(power.astype(np.float64))
-        flat, reached = power.reshape(len(power), -1), np.diff(first) > 0
-        found = np.stack(np.unravel_index(flat.argmax(axis=1), power.shape[1:]), axis=1)
-        best[links][reached] = found[reached]
-        if pairs > 1:
-            second, strongest = np.partition(flat, pairs - 2, axis=1)[:, -2:].T
-            with np.errstate(divide="ignore"):
-                margin_db[links][reached] = 10.0 * np.log10(strongest[reached] / second[reached])
-    every, numbers = ("link", "rx_beam", "tx_beam"), {"units": "1"}
+        received, sent = _factors(arrays, rows, at_rx, at_tx)
+        for link, (low, high) in enumerate(itertools.pairwise(first), links.start):
+            if low == high:
+                continue
+            each = received[low:high].reshape(-1, len(at_rx)).T @ sent[low:high].reshape(-1, len(at_tx))
+            power = np.maximum(each.astype(np.float64), 0.0)  # rounding
+            gain_db[link], best[link] = path_gain_db(power), np.unravel_index(power.argmax(), power.shape)
+            if pairs > 1:
+                second, strongest = np.partition(path_gain_db(power.ravel()), -2)[-2:]
+                margin_db[link] = strongest - second
+    number = {"long_name": "number of the best beam, -1 for none", "units": "1"}
     variables = {
-        "gain_db": (every, gain_db, {"long_name": "path gain between beams", "units": "dB"}),
-        "best_rx_beam": (
-            "link",
-            best[:, 0],
-            numbers | {"long_name": "receive beam of the best pair, -1 for none"},
+        "gain_db": (
+            ("link", "rx_beam", "tx_beam"),
+            gain_db,
+            {"long_name": "path gain between beams", "units": "dB"},
         ),
-        "best_tx_beam": (
-            "link",
-            best[:, 1],
-            numbers | {"long_name": "transmit beam of the best pair, -1 for none"},
-        ),
-        "margin_db": ("link", margin_db, {"long_name": "gain of the strongest pair over the next", "units": "dB"}),
+        "best_rx_beam": ("link", best[:, 0], number),
+        "best_tx_beam": ("link", best[:, 1], number),
+        "margin_db": ("link", margin_db, {"long_name": "gain of the best pair over the next", "units": "dB"}),
     }
     return labelled(arrays, variables)
-
-
-def _product(received: NDArray[np.float32], sent: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum products (B, C) over paths and their numbers."""
-    return received.reshape(-1, received.shape[-1]).T @ sent.reshape(-1, sent.shape[-1])
 
 
 def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.complex64]:
