@@ -19,7 +19,7 @@ from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import ChannelPaths
 
-BLOCK_BYTES = 100_000_000
+BLOCK_BYTES = 25_000_000
 """Size of the coefficients that are computed together, which bounds the memory."""
 
 UPRIGHT = 1e-3
@@ -111,21 +111,23 @@ class ArrayPaths:
         """Compute the coefficients of one of the `spans`."""
         delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
         if self.synthetic_array:
+            delay_s = _after_shortest(delay_s, first) if self.normalize_delays else delay_s
             gains, at_rx, at_tx = self.plane_waves(rows)
-            left = gains[:, :, None, :] * at_rx[:, None, :, None]
+            left = (gains * self._carrier(delay_s.astype(np.float32)))[:, :, None, :] * at_rx[:, None, :, None]
             a = left[..., None] * at_tx[:, None, None, None, :]
         else:
-            length_m = SPEED_OF_LIGHT_M_S * delay_s
-            gains, longer_m = self._gains(rows), self._longer_m(rows)
-            factor = (length_m / (length_m + longer_m)).astype(np.complex64)
-            a = gains[:, :, None, :, None] * factor[:, None, :, None, :]
-            delay_s = delay_s + np.tile(longer_m / SPEED_OF_LIGHT_M_S, (1, *gains.shape[1:]))
-        if self.normalize_delays:
-            delay_s = _after_shortest(delay_s, first)
-        kind = np.dtype(np.float32 if self.synthetic_array else np.float64)  # the first rounds as Sionna RT does
-        per_second = np.array(-2.0 * np.pi, kind) * np.array(self.paths.settings.frequency_hz, kind)
-        carrier = phasors(per_second * delay_s.astype(kind))
-        return Block(links, first, a.reshape(len(a), len(self.rx), len(self.tx)) * carrier, delay_s)
+            gains, longer_m = self._gains(rows)[:, :, None, :, None], self._longer_m(rows)
+            spread = (1.0 / (1.0 + longer_m / (SPEED_OF_LIGHT_M_S * delay_s))).astype(np.complex64)
+            delay_s = delay_s + longer_m / SPEED_OF_LIGHT_M_S
+            delay_s = _after_shortest(delay_s, first) if self.normalize_delays else delay_s
+            a = gains * (spread * self._carrier(delay_s))[:, None, :, None, :]
+            delay_s = np.tile(delay_s, (1, gains.shape[1], gains.shape[3]))
+        return Block(links, first, a.reshape(len(a), len(self.rx), len(self.tx)), delay_s)
+
+    def _carrier(self, delay_s: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
+        """Return exp(-j 2 pi f delay); with delays of single precision it is rounded as in Sionna RT."""
+        per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.paths.settings.frequency_hz)
+        return phasors(per_second * delay_s)
 
     def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
         """Gains of paths from pattern to pattern (P, K_rx, K_tx), and phases at each position of both arrays."""
