@@ -21,8 +21,9 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 SECTIONS = {
     "Start": ["docs/install", "docs/usage"],
     "Guides": [
-        *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/transmitters", "docs/measured_powers"),
-        *("docs/calibration", "docs/placement", "docs/differentiable", "docs/training", "docs/cluster"),
+        *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/channels", "docs/transmitters"),
+        *("docs/measured_powers", "docs/calibration", "docs/placement", "docs/differentiable", "docs/training"),
+        "docs/cluster",
     ],
     "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],
     "Reference": ["build/api/index", "docs/conventions", "docs/glossary"],
@@ -38,6 +39,7 @@ ROOMS = {
     "maps": "Maps",
     "scene": "Scenes",
     "tracing": "Tracing",
+    "channels": "Channels",
     "prediction": "Prediction",
     "coverage": "Coverage",
     "export": "Coverage",

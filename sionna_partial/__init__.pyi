@@ -2,6 +2,9 @@
 
 from sionna_partial.calibration.calibration import MaterialCalibration as MaterialCalibration
 from sionna_partial.calibration.calibration import calibrate_materials as calibrate_materials
+from sionna_partial.channels.beams import dft_codebook as dft_codebook
+from sionna_partial.channels.files import load_channels as load_channels
+from sionna_partial.channels.files import save_channels as save_channels
 from sionna_partial.constants import CellState as CellState
 from sionna_partial.constants import LinkState as LinkState
 from sionna_partial.coverage import predict_map as predict_map

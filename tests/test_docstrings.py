@@ -10,7 +10,11 @@ import sionna_partial as sp
 
 pytestmark = QUIET
 
-CHAINS = (("build_dataset", "read_dataset", "train", "evaluate"), ("save_coverage", "load_coverage", "plot_coverage"))
+CHAINS = (
+    ("build_dataset", "read_dataset", "train", "evaluate"),
+    ("save_coverage", "load_coverage", "plot_coverage"),
+    ("save_channels", "load_channels"),
+)
 """Names whose examples read the files that the first of them wrote."""
 
 ALONE = tuple((name,) for name in sp.__all__ if name not in {*sum(CHAINS, ()), "__version__"})

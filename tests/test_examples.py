@@ -39,6 +39,12 @@ def trace_paths(said: str, names: dict[str, Any]) -> None:
     assert "link 1: NLOS" in said
 
 
+def ofdm_bit_error_rate(said: str, names: dict[str, Any]) -> None:
+    assert float(re.findall(r"theory: ([\d.]+)", said)[0]) < 0.005
+    needed_dbm = {state: int(power) for state, power in re.findall(r"(LOS|NLOS): bit .* (-?\d+) dBm", said)}
+    assert needed_dbm["LOS"] + 10 < needed_dbm["NLOS"]
+
+
 def several_transmitters(said: str, names: dict[str, Any]) -> None:
     *single_db, both_db = (float(found) for found in re.findall(r"(-[\d.]+) dB", said))
     assert both_db > max(single_db)
@@ -61,7 +67,7 @@ def calibrate_materials(said: str, names: dict[str, Any]) -> None:
 CHECKS = {
     check.__name__: check
     for check in (
-        *(predict_coverage, explore_home, trace_paths),
+        *(predict_coverage, explore_home, trace_paths, ofdm_bit_error_rate),
         *(several_transmitters, place_transmitter, calibrate_materials),
     )
 }

@@ -35,7 +35,9 @@ ROOMS = {
         *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "trace"),
         "path_set",
+        "antennas",
     ),
+    "channels": ("responses", "beams", "spreads", "files"),
     "prediction": (
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
@@ -53,7 +55,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("options", "prediction", "learning", "planning", "app"),
+    "cli": ("options", "prediction", "channels", "learning", "planning", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
@@ -189,7 +191,7 @@ class TestLightImports:
         "command",
         [
             *("", "predict", "export-scene", "explore", "dataset", "train", "evaluate"),
-            *("calibrate", "place", "demo", "info"),
+            *("calibrate", "place", "channels", "demo", "info"),
         ],
     )
     def test_help(self, command: str) -> None:

@@ -1,1 +1,1 @@
-"""Channels of links: antenna arrays, responses in delay and frequency, beams, spreads, samples, files."""
+"""Channels of links: antenna arrays, responses in delay and frequency, beams, spreads, files."""

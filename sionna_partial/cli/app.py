@@ -11,6 +11,7 @@ import typer
 from typer.core import TyperGroup
 
 from sionna_partial import __version__
+from sionna_partial.cli.channels import channels
 from sionna_partial.cli.learning import dataset, evaluate, train
 from sionna_partial.cli.options import TransmitterCommand
 from sionna_partial.cli.planning import calibrate, place
@@ -94,5 +95,6 @@ def _prepare(
 
 
 app.command(cls=TransmitterCommand)(predict)
+app.command(cls=TransmitterCommand)(channels)
 for _command in (export_scene, explore, dataset, train, evaluate, calibrate, place, demo, info):
     app.command()(_command)

@@ -176,7 +176,7 @@ _ALIGNMENT_BYTES = 64
 """Alignment of Dr.Jit's own arrays [bytes]."""
 
 
-def _to_device(kind: Any, values: NDArray[Any]) -> Any:
+def to_device(kind: Any, values: NDArray[Any]) -> Any:
     """Hand an array over to Dr.Jit, aligned as its own arrays are: for other mixtures it compiles kernels anew."""
     count = values.size * values.itemsize
     room = np.empty(count + _ALIGNMENT_BYTES, np.uint8)
@@ -343,7 +343,7 @@ class SceneSolver:
         import mitsuba as mi
 
         buffer = self._buffer(candidates)
-        buffer._src_indices = _to_device(mi.UInt, tx_index.astype(np.uint32))
+        buffer._src_indices = to_device(mi.UInt, tx_index.astype(np.uint32))
         return verification.verify(self._scene, buffer, *ends, candidates.wedges is not None)
 
     def _power(self, verification: _Verification, buffer: Any, ends: tuple[Any, Any], diffraction: bool) -> Any:
@@ -389,11 +389,11 @@ class SceneSolver:
         shape, primitive = self._shape_of_face[face], self._primitive_of_face[face]
         buffer = PathsBuffer(*face.shape, candidates.wedges is not None)
         buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (
-            _to_device(mi.TensorXf, axis.astype(np.float32)) for axis in np.moveaxis(candidates.vertices_m, 2, 0)
+            to_device(mi.TensorXf, axis.astype(np.float32)) for axis in np.moveaxis(candidates.vertices_m, 2, 0)
         )
-        buffer._shapes, buffer._primitives = _to_device(mi.TensorXu, shape), _to_device(mi.TensorXu, primitive)
-        buffer._interaction_types = _to_device(mi.TensorXu, kind)
-        buffer._tgt_indices = _to_device(mi.UInt, candidates.rx.astype(np.uint32))
+        buffer._shapes, buffer._primitives = to_device(mi.TensorXu, shape), to_device(mi.TensorXu, primitive)
+        buffer._interaction_types = to_device(mi.TensorXu, kind)
+        buffer._tgt_indices = to_device(mi.UInt, candidates.rx.astype(np.uint32))
         buffer._paths_counter = mi.UInt(len(face))
         if candidates.wedges is not None and candidates.wedge is not None:
             buffer._diffracting_wedges = self._wedge_geometry(candidates.wedges, candidates.wedge)
@@ -411,12 +411,12 @@ class SceneSolver:
         face, normal, flat = wedges.face[index], wedges.normal[index], np.zeros(len(index))
 
         def vectors(kind: Any, *columns: NDArray[np.float64]) -> Any:
-            return kind(*(_to_device(mi.Float, column.astype(np.float32)) for column in columns))
+            return kind(*(to_device(mi.Float, column.astype(np.float32)) for column in columns))
 
         return WedgeGeometry(
-            shape=dr.reinterpret_array(mi.MeshPtr, _to_device(mi.UInt, self._shape_of_face[face[:, 0]])),
-            prim0=_to_device(mi.UInt, self._primitive_of_face[face[:, 0]]),
-            primn=_to_device(mi.UInt, self._primitive_of_face[face[:, 1]]),
+            shape=dr.reinterpret_array(mi.MeshPtr, to_device(mi.UInt, self._shape_of_face[face[:, 0]])),
+            prim0=to_device(mi.UInt, self._primitive_of_face[face[:, 0]]),
+            primn=to_device(mi.UInt, self._primitive_of_face[face[:, 1]]),
             local_edge=dr.zeros(mi.UInt, len(index)),
             o=vectors(mi.Point3f, x, y, np.where(upward, 0.0, wedges.height_m)),
             e_hat=vectors(mi.Vector3f, flat, flat, np.where(upward, 1.0, -1.0)),
@@ -441,7 +441,7 @@ def _points(positions_m: NDArray[np.float64]) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    points = mi.Point3f(*(_to_device(mi.Float, column.astype(np.float32)) for column in positions_m.T))
+    points = mi.Point3f(*(to_device(mi.Float, column.astype(np.float32)) for column in positions_m.T))
     dr.make_opaque(points)
     return points
 
@@ -451,11 +451,12 @@ def _read_buffer(
 ) -> tuple[SolvedPaths, NDArray[np.intp]]:
     """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
-    transfer = np.moveaxis([[a.real.numpy() + 1j * a.imag.numpy() for a in row] for row in buffer.a], 2, 0)
-    valid = np.flatnonzero(buffer.valid.numpy() & (transfer[:, 0, 0] != 0.0))
+    a = buffer.a[0][0]
+    valid = np.flatnonzero(buffer.valid.numpy() & ((a.real.numpy() != 0.0) | (a.imag.numpy() != 0.0)))
+    transfer = np.array([[a.real.numpy()[valid] + 1j * a.imag.numpy()[valid] for a in row] for row in buffer.a])
     paths = SolvedPaths.of_vertices(
         path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
-        transfer=transfer[valid].astype(np.complex128),
+        transfer=np.moveaxis(transfer, 2, 0).astype(np.complex128),
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
         interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
         vertices_m=np.stack(

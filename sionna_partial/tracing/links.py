@@ -5,19 +5,208 @@ from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import require_choice
-from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER
-from sionna_partial.display import Shown
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER
+from sionna_partial.display import Shown, later
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
+class ChannelPaths:
+    """Channels of paths with antennas, for classes that have the arrays of `TracedLinks`.
+
+    Paths are ordered by transmitter and receiver.
+    """
+
+    tx: NDArray[np.float64]
+    rx: NDArray[np.float64]
+    path_tx: NDArray[np.int32]
+    path_rx: NDArray[np.int32]
+    transfer: NDArray[np.complex128]
+    delay_s: NDArray[np.float64]
+    departure_rad: NDArray[np.float64]
+    arrival_rad: NDArray[np.float64]
+    interactions: NDArray[np.uint8]
+    vertices_m: NDArray[np.float64]
+    settings: TraceSettings
+
+    def cir(
+        self,
+        *,
+        tx_array: Any = None,
+        rx_array: Any = None,
+        tx_orientation_rad: ArrayLike | None = None,
+        rx_orientation_rad: ArrayLike | None = None,
+        synthetic_array: bool = True,
+        normalize_delays: bool = True,
+        memory_gb: float = MEMORY_GB,
+    ) -> "xr.Dataset":
+        """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
+
+        Nothing is traced again. Paths that matter little between vertically polarised, isotropic antennas are left out
+        of the trace: use ``TraceSettings(power_tolerance_db=0.0)`` for others that are very directive or horizontal.
+
+        Parameters
+        ----------
+        tx_array, rx_array : sionna.rt.PlanarArray, optional
+            By default one isotropic, vertically polarised antenna.
+        tx_orientation_rad : (3,) or (T, 3) array-like, optional
+            Angles of rotation of the transmitters about z, y and x [rad], as Sionna RT takes them.
+        rx_orientation_rad : (3,) or (N, 3) array-like, optional
+            The same of the receivers.
+        synthetic_array : bool
+            True: plane waves at the arrays. False: the exact length of each path between each two antennas; patterns
+            and reflection coefficients remain those between the centres.
+        normalize_delays : bool
+            Count delays from the shortest path of each link.
+        memory_gb : float
+            How much memory the result may take [GB].
+
+        Returns
+        -------
+        xarray.Dataset
+            `a` (link, rx_ant, tx_ant, path): complex baseband gains a exp(-j 2 pi f delay), 0 where there is no path.
+            `delay_s` (link, path), or as `a` unless `synthetic_array`: NaN where there is no path. `paths` (link):
+            their number. Link ``tx * N + rx`` is from transmitter `tx` to receiver `rx`, which are coordinates.
+
+        Raises
+        ------
+        SettingsError
+            For arrays that are none, or orientations of other shapes.
+        MemoryLimitError
+            If the result would take more than `memory_gb`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> from sionna.rt import PlanarArray
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
+        >>> array = PlanarArray(num_rows=8, num_cols=8, pattern="tr38901", polarization="VH")
+        >>> channels = links.cir(tx_array=array)
+        >>> channels.sizes["link"], channels.sizes["tx_ant"]
+        (2, 128)
+        """
+        options = {key: value for key, value in locals().items() if key != "self"}
+        return later("channels.responses:cir")(self, **options)
+
+    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> "xr.Dataset":
+        """Return the channel frequency response of each link, as `sionna.rt.Paths.cfr` does.
+
+        Parameters
+        ----------
+        frequencies_hz : (F,) array-like
+            Frequencies relative to the carrier [Hz], such as those of subcarriers.
+        **options
+            Arguments of `cir`.
+
+        Returns
+        -------
+        xarray.Dataset
+            `h` (link, rx_ant, tx_ant, frequency), complex.
+
+        Raises
+        ------
+        SettingsError, MemoryLimitError
+            As `cir`, and for frequencies of another shape or not below the carrier's.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> links.cfr(np.arange(-32, 32) * 120e3).h.shape
+        (1, 1, 1, 64)
+        """
+        return later("channels.responses:cfr")(self, frequencies_hz, **options)
+
+    def taps(self, bandwidth_hz: float, l_min: int = -6, l_max: int | None = None, **options: Any) -> "xr.Dataset":
+        """Return the taps of a channel that is filtered to a bandwidth, as `sionna.rt.Paths.taps` does.
+
+        Parameters
+        ----------
+        bandwidth_hz : float
+            Bandwidth, and sampling rate, of the sinc filter [Hz].
+        l_min, l_max : int
+            First and last tap. The last is by default six after the longest delay.
+        **options
+            Arguments of `cir`.
+
+        Returns
+        -------
+        xarray.Dataset
+            `h` (link, rx_ant, tx_ant, tap), complex.
+
+        Raises
+        ------
+        SettingsError, MemoryLimitError
+            As `cir`, and for a bandwidth or taps out of range.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> links.taps(100e6, l_max=20).sizes["tap"]
+        27
+        """
+        return later("channels.responses:taps")(self, bandwidth_hz, l_min, l_max, **options)
+
+    def beam_gains(
+        self,
+        codebook: ArrayLike,
+        rx_codebook: ArrayLike | None = None,
+        *,
+        tx_array: Any = None,
+        rx_array: Any = None,
+        tx_orientation_rad: ArrayLike | None = None,
+        rx_orientation_rad: ArrayLike | None = None,
+        memory_gb: float = MEMORY_GB,
+    ) -> "xr.Dataset":
+        """Return the gain of every pair of beams of each link.
+
+        The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, whose coefficients A are those of `cir`
+        for plane waves: the mean over a wide band, as `gain_db` is. The matrices A themselves are never formed.
+
+        Parameters
+        ----------
+        codebook : (C, tx_ant) array-like
+            Weights of the transmitting antennas, a beam in each row, such as those of `dft_codebook`.
+        rx_codebook : (B, rx_ant) array-like, optional
+            Those of the receiving antennas. By default each antenna alone.
+        tx_array, rx_array, tx_orientation_rad, rx_orientation_rad, memory_gb
+            As in `cir`.
+
+        Returns
+        -------
+        xarray.Dataset
+            `gain_db` (link, rx_beam, tx_beam), at least -150 dB; `best_rx_beam` and `best_tx_beam` (link) of the
+            strongest pair, -1 without paths; `margin_db` (link), by which it is stronger than the next, NaN without
+            paths or for a single pair.
+
+        Raises
+        ------
+        SettingsError, MemoryLimitError
+            As `cir`, and for weights of another shape.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> from sionna.rt import PlanarArray
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> array = PlanarArray(num_rows=4, num_cols=4, pattern="iso", polarization="V")
+        >>> beams = links.beam_gains(sp.dft_codebook(4, 4), tx_array=array)
+        >>> beams.best_tx_beam.item()  # broadside
+        0
+        """
+        options = {key: value for key, value in locals().items() if key != "self"}
+        return later("channels.beams:beam_gains")(self, **options)
+
+
 @dataclass(frozen=True)
-class TracedLinks(Shown):
+class TracedLinks(ChannelPaths, Shown):
     """Every traced path from one or T transmitters to N receivers.
 
     Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
@@ -120,6 +309,34 @@ class TracedLinks(Shown):
         for name in ("settings", "scene_settings"):
             table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
         return table
+
+    def spreads(self) -> "xr.Dataset":
+        """Return delay and angular spreads, K-factor and path loss of each link.
+
+        Paths are weighted by ``|a|^2``, their power between isotropic, vertically polarised antennas.
+
+        Returns
+        -------
+        xarray.Dataset
+            On "rx", and "tx" where there are several. `path_loss_db`; `k_factor_db`, the power of the line of sight
+            over that of all other paths; `delay_spread_s`, the standard deviation of the delay; and four circular
+            standard deviations `zenith_departure_spread_rad`, `azimuth_departure_spread_rad`,
+            `zenith_arrival_spread_rad` and `azimuth_arrival_spread_rad`. NaN without paths, and K without line of
+            sight.
+
+        Notes
+        -----
+        Source: 3GPP TR 38.901, section 7.5 (delay spread, K-factor) and annex A.1 (angular spread
+        ``sqrt(-2 ln |sum P exp(j angle) / sum P|)``).
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> bool(links.spreads().k_factor_db > 0)
+        True
+        """
+        return later("channels.spreads:spreads")(self)
 
     def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
         """Return a row for each link, or for each path, as a pandas.DataFrame.

@@ -120,7 +120,7 @@ class PathColumns:
 class PathFiles:
     """All paths of a trace, in a `.npy` file for each column, in an existing folder."""
 
-    def __init__(self, depth: int, folder: Path, polarisations: int = 1) -> None:
+    def __init__(self, depth: int, folder: Path, polarisations: int) -> None:
         self._folder, self._count, self._room = folder, 0, (depth, polarisations)
         for name in _column_types(*self._room):
             self._file(name).touch()

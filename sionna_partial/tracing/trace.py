@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,9 +37,6 @@ from sionna_partial.tracing.paths import (
     path_bytes,
 )
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
-
-if TYPE_CHECKING:
-    pass
 
 InvalidLinks = Literal["raise", "nan"]
 """What becomes of links that cannot be traced."""

@@ -1,0 +1,131 @@
+"""Beams: DFT codebooks, and the gain of every pair of beams of a link."""
+
+import itertools
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.channels.responses import ArrayPaths, labelled, require_memory
+from sionna_partial.checks import real_array, require, require_whole
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB
+from sionna_partial.errors import SettingsError
+from sionna_partial.tracing.antennas import Antennas
+from sionna_partial.tracing.trace import path_gain_db
+
+if TYPE_CHECKING:
+    from sionna_partial.tracing.links import ChannelPaths
+
+MAX_ANTENNAS = 4096
+"""Largest number of antennas of a codebook."""
+
+PATHS_AT_ONCE = 20_000
+"""Number of paths whose beams are computed together, which bounds the memory."""
+
+
+def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.complex128]:
+    """Return the beams of a planar array that are orthogonal to each other, as weights of its antennas.
+
+    Parameters
+    ----------
+    rows, columns : int
+        Those of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
+    polarisations : int
+        2 for a dual-polarised array: beams of the first polarisation come first.
+
+    Returns
+    -------
+    (polarisations * rows * columns, polarisations * rows * columns) complex128 array
+        One beam of unit power in each row.
+
+    Raises
+    ------
+    SettingsError
+        For numbers that are none of an array.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.dft_codebook(8, 8).shape
+    (64, 64)
+    """
+    for name, value in (("rows", rows), ("columns", columns)):
+        require_whole(name, value, 1, MAX_ANTENNAS)
+    require_whole("polarisations", polarisations, 1, 2)
+    count = polarisations * rows * columns
+    require(count <= MAX_ANTENNAS, "rows, columns", (rows, columns), f"give {MAX_ANTENNAS} antennas at most.")
+    vertical, horizontal = (np.fft.fft(np.eye(size)) / np.sqrt(size) for size in (rows, columns))
+    return np.kron(np.eye(polarisations), np.kron(horizontal, vertical)).astype(np.complex128)
+
+
+def beam_gains(
+    paths: "ChannelPaths",
+    codebook: ArrayLike,
+    rx_codebook: ArrayLike | None = None,
+    *,
+    memory_gb: float = MEMORY_GB,
+    **antennas: Any,
+) -> xr.Dataset:
+    """Gains of pairs of beams (`TracedLinks.beam_gains`)."""
+    arrays = ArrayPaths.of(paths, **antennas)
+    at_tx = _weights("codebook", codebook, arrays.tx)
+    at_rx = _weights("rx_codebook", np.eye(len(arrays.rx)) if rx_codebook is None else rx_codebook, arrays.rx).conj()
+    pairs = len(at_rx) * len(at_tx)
+    require_memory(arrays, 4 * pairs, f"{pairs} pairs of beams", memory_gb)
+    gain_db = np.full((arrays.links, len(at_rx), len(at_tx)), GAIN_FLOOR_DB, np.float32)
+    best, margin_db = np.full((arrays.links, 2), -1), np.full(arrays.links, np.nan)
+    for links, rows, first in arrays.spans(PATHS_AT_ONCE):
+        received, sent = _factors(arrays, rows, at_rx, at_tx)
+        for link, (low, high) in enumerate(itertools.pairwise(first), links.start):
+            if low == high:
+                continue
+            each = received[low:high].reshape(-1, len(at_rx)).T @ sent[low:high].reshape(-1, len(at_tx))
+            power = np.maximum(each.astype(np.float64), 0.0)  # rounding
+            gain_db[link], best[link] = path_gain_db(power), np.unravel_index(power.argmax(), power.shape)
+            if pairs > 1:
+                second, strongest = np.partition(path_gain_db(power.ravel()), -2)[-2:]
+                margin_db[link] = strongest - second
+    number = {"long_name": "number of the best beam, -1 for none", "units": "1"}
+    variables = {
+        "gain_db": (
+            ("link", "rx_beam", "tx_beam"),
+            gain_db,
+            {"long_name": "path gain between beams", "units": "dB"},
+        ),
+        "best_rx_beam": ("link", best[:, 0], number),
+        "best_tx_beam": ("link", best[:, 1], number),
+        "margin_db": ("link", margin_db, {"long_name": "gain of the best pair over the next", "units": "dB"}),
+    }
+    return labelled(arrays, variables)
+
+
+def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.complex64]:
+    """Weights (beams, patterns, positions) of a codebook (beams, antennas)."""
+    count = len(antennas)
+    remedy = f"give (beams, {count}) weights, one for each antenna, such as those of dft_codebook."
+    weights = real_array(name, codebook, SettingsError, remedy, kinds="iufc")
+    fits = weights.ndim == 2 and weights.shape[1:] == (count,) and len(weights) and np.isfinite(weights).all()
+    require(bool(fits), name, f"array of shape {weights.shape}", remedy)
+    return weights.reshape(len(weights), len(antennas.patterns), -1).astype(np.complex64)
+
+
+def _factors(
+    arrays: ArrayPaths, rows: slice, at_rx: NDArray[np.complex64], at_tx: NDArray[np.complex64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Numbers of receive beams (P, M, B) and of transmit beams (P, M, C) whose products, over M, are powers of paths.
+
+    A path excites a beam by u_k at the receiver and v_k at the transmitter, for each pattern k of the receiver. The
+    power |sum_k u_k v_k|^2 has the terms |u_k|^2 |v_k|^2, and for two patterns 2 Re(u_1 u_2* v_1 v_2*).
+    """
+    gains, rx, tx = arrays.plane_waves(rows)
+    received = np.stack([rx @ each.T for each in at_rx.swapaxes(0, 1)], axis=1)
+    sent = gains @ np.stack([tx @ each.T for each in at_tx.swapaxes(0, 1)], axis=1)
+    if received.shape[1] == 1:
+        return np.abs(received) ** 2, np.abs(sent) ** 2
+    cross = [math.sqrt(2.0) * each[:, 0] * each[:, 1].conj() for each in (received, sent)]
+    return (
+        np.concatenate([np.abs(received) ** 2, np.stack([cross[0].real, -cross[0].imag], axis=1)], axis=1),
+        np.concatenate([np.abs(sent) ** 2, np.stack([cross[1].real, cross[1].imag], axis=1)], axis=1),
+    )

@@ -1,0 +1,222 @@
+"""Channels to files and back: NetCDF, HDF5 and Zarr, in the layouts that link simulators read."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+import dask
+import dask.array as da
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sionna_partial.channels.responses import ArrayPaths
+from sionna_partial.checks import Progress, require, require_choice
+from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.files import atomic_files, atomic_path, open_regular, output_path
+from sionna_partial.progress import reporting
+
+if TYPE_CHECKING:
+    from sionna_partial.tracing.links import ChannelPaths
+
+Layout = Literal["sionna", "deepmimo"]
+"""Names and axes of the arrays in a file."""
+
+SUFFIXES = (".zarr", ".nc", ".h5")
+
+CHUNK_BYTES = 50_000_000
+"""Size of the coefficients that are written together, which bounds the memory."""
+
+MAX_BYTES = 2**44
+"""Largest file that is opened [bytes]; it is read as far as it is used."""
+
+
+def save_channels(
+    channels: "ChannelPaths | xr.Dataset",
+    path: str | os.PathLike[str],
+    *,
+    layout: Layout = "sionna",
+    progress: Progress | bool | None = None,
+    **options: Any,
+) -> None:
+    """Write channels of links to a file, some links at a time.
+
+    ============ =================================================================================================
+    `"sionna"`   `a` (rx, rx_ant, tx, tx_ant, path, time) and `tau` (rx, tx, path) [s], or with the antennas as `a`, -1
+                 where there is no path: what a generator of Sionna's `CIRDataset` yields. Responses have `h` (rx,
+                 rx_ant, tx, tx_ant, time, frequency or tap).
+    `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
+                 no path, of one transmitter.
+    ============ =================================================================================================
+
+    Positions of both ends are there too. A `.nc` or `.h5` file is NetCDF 4, which any HDF5 library reads.
+
+    Parameters
+    ----------
+    channels : TracedLinks or xarray.Dataset
+        Links, whose impulse responses are computed while they are written, or what `cir`, `cfr` or `taps` returned.
+    path : path-like
+        A `.zarr` folder, which must not be there yet, or a `.nc` or `.h5` file.
+    layout : {"sionna", "deepmimo"}
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``.
+    **options
+        Arguments of `TracedLinks.cir`, for links.
+
+    Raises
+    ------
+    SettingsError
+        As `TracedLinks.cir`, for a Dataset of another kind, or several transmitters in the layout of DeepMIMO.
+    OutputError
+        For another suffix, a folder that is there, or if writing fails; nothing half written is left behind.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
+    >>> sp.save_channels(links, "channels.nc", normalize_delays=False)
+    """
+    target = checked_target(path, layout)
+    with reporting(progress) as report, dask.config.set(scheduler="synchronous"):
+        if isinstance(channels, xr.Dataset):
+            table = _unstacked(channels, options)
+        else:
+            arrays = ArrayPaths.of(channels, **options)
+            require(arrays.most > 0, "channels", f"{arrays.links} links", "none has a path: there is nothing to save.")
+            table = _computed_later(arrays, report)
+        table = _laid_out(table, layout)
+        if target.suffix == ".zarr":
+            with atomic_files(target) as folder:
+                table.to_zarr(folder, mode="w", consolidated=False)
+        else:
+            of_receiver = {name: (1, *each.shape[1:]) for name, each in table.items() if each.ndim > 3}
+            packed: dict[Any, Any] = {
+                name: {"zlib": True, "complevel": 1, "chunksizes": sizes} for name, sizes in of_receiver.items()
+            }
+            with atomic_path(target) as file:
+                table.to_netcdf(file, engine="h5netcdf", encoding=packed)
+        report(1.0, f"wrote {target.name}")
+
+
+def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
+    """Return where channels can be written in a layout."""
+    require_choice("layout", layout, get_args(Layout))
+    target = output_path(path)
+    if target.suffix not in SUFFIXES:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(SUFFIXES)}.")
+    if target.suffix == ".zarr" and os.path.lexists(target):
+        raise OutputError(f"path = '{target}' is there already: remove it, or choose another name.")
+    return target
+
+
+def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
+    """Open channels that `save_channels` wrote. They are read where they are used.
+
+    Parameters
+    ----------
+    path : path-like
+        A `.zarr` folder, or a `.nc` or `.h5` file. Open only files of people whom you trust.
+
+    Returns
+    -------
+    xarray.Dataset
+        With the arrays of its layout, which is an attribute.
+
+    Raises
+    ------
+    SettingsError
+        If it cannot be read, or holds something else.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> channels = sp.load_channels("channels.nc")  # that save_channels wrote
+    >>> channels.a.dims
+    ('rx', 'rx_ant', 'tx', 'tx_ant', 'path', 'time')
+    """
+    source, remedy = Path(path), "give a file of save_channels."
+    require(source.suffix in SUFFIXES, "path", str(path), remedy)
+    try:
+        if source.suffix == ".zarr":
+            table = xr.open_zarr(source, chunks=None, consolidated=False)
+        else:
+            open_regular(source, "path", SettingsError, MAX_BYTES).close()
+            table = xr.open_dataset(source, engine="h5netcdf")
+    except SettingsError:
+        raise
+    except Exception as error:
+        raise SettingsError(f"path = '{path}' cannot be read ({error}): {remedy}") from error
+    require(table.attrs.get("layout") in get_args(Layout), "path", str(path), f"it holds no channels; {remedy}")
+    return table
+
+
+def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
+    """Return impulse responses (tx, rx, rx_ant, tx_ant, path), computed when they are written, by some receivers."""
+    each, receivers = arrays.paths, len(arrays.paths.rx)
+    path_bytes = 8 * len(arrays.rx) * len(arrays.tx) * (1 if arrays.synthetic_array else 2)
+    at_once = max(1, CHUNK_BYTES // max(1, arrays.most * path_bytes))
+
+    def computed(start: int, stop: int) -> tuple[NDArray[Any], NDArray[Any]]:
+        report(start / max(1, arrays.links), "writing channels")
+        rows = slice(int(arrays.first[start]), int(arrays.first[stop]))
+        a, delay_s = arrays.empty(stop - start)
+        arrays.block(slice(start, stop), rows, arrays.first[start : stop + 1] - rows.start).fill(a, delay_s)
+        return np.moveaxis(a, 1, 3), delay_s if delay_s.ndim == 2 else np.moveaxis(delay_s, 1, 3)
+
+    kinds = [array.dtype for array in computed(0, 0)]
+    shapes = [array.shape[1:] for array in computed(0, 0)]
+    of_tx: list[list[Any]] = [[], []]
+    for first in range(0, arrays.links, max(1, receivers)):
+        starts = range(first, first + receivers, at_once)
+        parts = [(start, min(start + at_once, first + receivers)) for start in starts]
+        made = [dask.delayed(computed, pure=False, nout=2)(*part) for part in parts]
+        for which, (kind, shape) in enumerate(zip(kinds, shapes, strict=True)):
+            blocks = [
+                da.from_delayed(both[which], (stop - start, *shape), kind)
+                for both, (start, stop) in zip(made, parts, strict=True)
+            ]
+            of_tx[which].append(da.concatenate(blocks))
+    every = ("tx", "rx", "rx_ant", "tx_ant", "path")
+    delays = ("tx", "rx", "path") if arrays.synthetic_array else every
+    paths = np.diff(arrays.first).reshape(-1, receivers)
+    return xr.Dataset(
+        {"a": (every, da.stack(of_tx[0])), "delay_s": (delays, da.stack(of_tx[1])), "paths": (("tx", "rx"), paths)},
+        attrs={"frequency_hz": each.settings.frequency_hz},
+    ).assign(tx_m=(("tx", "axis"), each.tx.reshape(-1, 3)), rx_m=(("rx", "axis"), each.rx))
+
+
+def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
+    """Return what `cir`, `cfr` or `taps` returned, with transmitters and receivers on axes of their own."""
+    require(not options, "options", ", ".join(options), "these channels are computed: give them to cir, cfr or taps.")
+    needed = {"transmitters", "receivers"} <= channels.attrs.keys() and bool({"a", "h"} & {*channels.data_vars})
+    require(needed, "channels", channels.attrs, "give links, or what their cir, cfr or taps returned.")
+    shape = channels.attrs["transmitters"], channels.attrs["receivers"]
+    found: dict[str, Any] = {}
+    for name, each in channels.reset_coords(["tx", "rx"], drop=True).data_vars.items():
+        values = each.to_numpy().reshape(*shape, *each.shape[1:])
+        if str(name) in ("tx_m", "rx_m"):
+            found[str(name)] = (str(name)[:2], "axis"), values[:, 0] if name == "tx_m" else values[0]
+        else:
+            found[str(name)] = ("tx", "rx", *map(str, each.dims[1:])), values
+    along = {name: each for name, each in channels.coords.items() if name in ("frequency", "tap")}
+    return xr.Dataset(found, coords=along, attrs=channels.attrs)
+
+
+def _laid_out(table: xr.Dataset, layout: Layout) -> xr.Dataset:
+    """Name and order the arrays as a layout has them."""
+    table = table.assign_attrs(layout=layout)
+    last = next(name for name in ("path", "frequency", "tap") if name in table.dims)
+    if layout == "deepmimo":
+        remedy = "this layout has one: save the links of each transmitter to a file of their own."
+        require(table.sizes["tx"] == 1, "transmitters", table.sizes["tx"], remedy)
+        names = {"a": "channel", "h": "channel", "delay_s": "delay"}
+        table = table.rename({name: new for name, new in names.items() if name in table})
+        return table.assign(tx_m=("axis", table.tx_m.to_numpy()[0])).squeeze("tx")
+    ends = ("rx", "rx_ant", "tx", "tx_ant")
+    if last != "path":
+        return table.assign(h=table.h.expand_dims("time").transpose(*ends, "time", last))
+    tau = table.delay_s.fillna(-1.0)
+    return table.drop_vars("delay_s").assign(
+        a=table.a.expand_dims("time").transpose(*ends, "path", "time"),
+        tau=tau.transpose(*(name for name in (*ends, "path") if name in tau.dims)),
+    )

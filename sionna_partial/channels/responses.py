@@ -1,0 +1,394 @@
+"""Channel responses of links with antenna arrays: paths + arrays -> impulse responses, frequency responses, taps."""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.checks import real_array, require, require_number, require_whole
+from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
+from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.tracing.antennas import Antennas
+from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION
+
+if TYPE_CHECKING:
+    from sionna_partial.tracing.links import ChannelPaths
+
+BLOCK_BYTES = 25_000_000
+"""Size of the coefficients that are computed together, which bounds the memory."""
+
+UPRIGHT = 1e-3
+"""A diffraction is at a vertical edge if it changes the vertical part of the direction by less than this."""
+
+FIRST_TAP, MORE_TAPS = -6, 6
+"""First tap, and how many follow the longest path, where none are given: the sinc filter is 5 % at the sixth tap."""
+
+
+@dataclass(frozen=True)
+class ArrayPaths:
+    """The paths of all links between antenna arrays."""
+
+    paths: "ChannelPaths"
+    tx: Antennas
+    rx: Antennas
+    synthetic_array: bool
+    normalize_delays: bool
+
+    @classmethod
+    def of(
+        cls,
+        paths: "ChannelPaths",
+        *,
+        tx_array: Any = None,
+        rx_array: Any = None,
+        tx_orientation_rad: ArrayLike | None = None,
+        rx_orientation_rad: ArrayLike | None = None,
+        synthetic_array: bool = True,
+        normalize_delays: bool = True,
+    ) -> "ArrayPaths":
+        """Check arguments, which are those of `TracedLinks.cir`."""
+        for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
+            require(isinstance(value, bool), name, value, "give True or False.")
+        require(
+            paths.transfer.shape[1:] == (2, 2),
+            "transfer",
+            paths.transfer.shape,
+            "these paths were traced for one polarisation; trace the links with trace_links.",
+        )
+        frequency_hz = paths.settings.frequency_hz
+        tx_count, rx_count = len(paths.tx.reshape(-1, 3)), len(paths.rx)
+        tx = Antennas.of("tx", tx_array, tx_orientation_rad, count=tx_count, frequency_hz=frequency_hz)
+        rx = Antennas.of("rx", rx_array, rx_orientation_rad, count=rx_count, frequency_hz=frequency_hz)
+        return cls(paths, tx, rx, synthetic_array, normalize_delays)
+
+    @property
+    def links(self) -> int:
+        """The number of links, T N."""
+        return len(self.paths.tx.reshape(-1, 3)) * len(self.paths.rx)
+
+    @property
+    def antennas(self) -> str:
+        """How many there are, for messages."""
+        return f"{len(self.rx)} x {len(self.tx)} antennas"
+
+    @cached_property
+    def first(self) -> NDArray[np.intp]:
+        """Where the paths of each link begin, and the number of all paths: (links + 1,)."""
+        link = self.paths.path_tx.astype(np.int64) * len(self.paths.rx) + self.paths.path_rx
+        return np.searchsorted(link, np.arange(self.links + 1))
+
+    @property
+    def most(self) -> int:
+        """The largest number of paths of a link."""
+        return int(np.diff(self.first).max(initial=0))
+
+    def empty(self, links: int) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+        """Return arrays for `Block.fill`: 0 and NaN."""
+        shape = links, self.most, len(self.rx), len(self.tx)
+        return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
+
+    def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, NDArray[np.intp]]]:
+        """Yield links, their paths, and where those of each link begin and end among them, some at a time."""
+        start = 0
+        while start < self.links:
+            stop = int(np.searchsorted(self.first, self.first[start] + paths_at_once, side="right")) - 1
+            stop = min(max(stop, start + 1), self.links)
+            rows = slice(int(self.first[start]), int(self.first[stop]))
+            yield slice(start, stop), rows, self.first[start : stop + 1] - rows.start
+            start = stop
+
+    def blocks(self) -> Iterator["Block"]:
+        """Compute the coefficients, the paths of some links at a time."""
+        for span in self.spans(max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))):
+            yield self.block(*span)
+
+    def block(self, links: slice, rows: slice, first: NDArray[np.intp]) -> "Block":
+        """Compute the coefficients of one of the `spans`."""
+        delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
+        if self.synthetic_array:
+            delay_s = _after_shortest(delay_s, first) if self.normalize_delays else delay_s
+            gains, at_rx, at_tx = self.plane_waves(rows)
+            left = (gains * self._carrier(delay_s.astype(np.float32)))[:, :, None, :] * at_rx[:, None, :, None]
+            a = left[..., None] * at_tx[:, None, None, None, :]
+        else:
+            gains, longer_m = self._gains(rows)[:, :, None, :, None], self._longer_m(rows)
+            spread = (1.0 / (1.0 + longer_m / (SPEED_OF_LIGHT_M_S * delay_s))).astype(np.complex64)
+            delay_s = delay_s + longer_m / SPEED_OF_LIGHT_M_S
+            delay_s = _after_shortest(delay_s, first) if self.normalize_delays else delay_s
+            a = gains * (spread * self._carrier(delay_s))[:, None, :, None, :]
+            delay_s = np.tile(delay_s, (1, gains.shape[1], gains.shape[3]))
+        return Block(links, first, a.reshape(len(a), len(self.rx), len(self.tx)), delay_s)
+
+    def _carrier(self, delay_s: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
+        """Return exp(-j 2 pi f delay); with delays of single precision it is rounded as in Sionna RT."""
+        per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.paths.settings.frequency_hz)
+        return phasors(per_second * delay_s)
+
+    def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
+        """Gains of paths from pattern to pattern (P, K_rx, K_tx), and phases at each position of both arrays."""
+        radians = 2.0 * np.pi * self.paths.settings.frequency_hz / SPEED_OF_LIGHT_M_S
+        at_rx, at_tx = (phasors(radians * each) for each in self._advances_m(rows))
+        return self._gains(rows), at_rx, at_tx
+
+    def _gains(self, rows: slice) -> NDArray[np.complex64]:
+        each = self.paths
+        at_rx = self.rx.fields(np.asarray(each.arrival_rad[rows]), each.path_rx[rows])
+        at_tx = self.tx.fields(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
+        gains: NDArray[np.complex128] = at_rx.conj() @ each.transfer[rows] @ at_tx.transpose(0, 2, 1)
+        return gains.astype(np.complex64)
+
+    def _advances_m(self, rows: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        each = self.paths
+        at_rx_m = self.rx.advance_m(np.asarray(each.arrival_rad[rows]), each.path_rx[rows])
+        return at_rx_m, self.tx.advance_m(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
+
+    def _longer_m(self, rows: slice) -> NDArray[np.float64]:
+        """By how much paths between antenna positions (P, A_rx, A_tx) are longer than between the centres [m].
+
+        A path of reflections is a straight line from the image of the transmitter, which moves by M dt if the
+        transmitter moves by dt. At a vertical edge the point of diffraction follows both ends: around it the path is a
+        straight line too, in the unfolded half planes of both ends. At other edges and diffuse reflections it stays.
+        """
+        unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self.paths, rows), self._advances_m(rows)
+        rotations = self.rx.rotations(self.paths.path_rx[rows]), self.tx.rotations(self.paths.path_tx[rows])
+        length_m = SPEED_OF_LIGHT_M_S * np.asarray(self.paths.delay_s[rows])[:, None, None]
+        between = rotations[0].transpose(0, 2, 1) @ unfolded.before @ rotations[1]
+        square = np.sum(self.rx.positions_m**2, axis=1)[:, None] + np.sum(self.tx.positions_m**2, axis=1)
+        square = square - 2.0 * length_m * (at_rx_m[:, :, None] + at_tx_m[:, None, :])
+        square -= 2.0 * (self.rx.positions_m @ between @ self.tx.positions_m.T)
+        longer_m: NDArray[np.float64] = np.sqrt(length_m**2 + square) - length_m
+        split = np.flatnonzero(unfolded.split)
+        if len(split):
+            moved = [
+                each[split if len(each) > 1 else slice(None)] @ antennas.positions_m.T
+                for each, antennas in zip(rotations, (self.rx, self.tx), strict=True)
+            ]
+            longer_m[split] = unfolded.longer_at_edges_m(split, *moved)
+        return longer_m
+
+
+def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
+    """Return exp(j angle) of angles [rad], which are reduced to a turn in the precision that they have."""
+    turn = angle.dtype.type(2.0 * np.pi)
+    angle = (angle - turn * np.floor(angle * (angle.dtype.type(1.0) / turn))).astype(np.float32)
+    found = np.empty(angle.shape, np.complex64)
+    found.real, found.imag = np.cos(angle), np.sin(angle)
+    return found
+
+
+def _after_shortest(delay_s: NDArray[np.float64], first: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return delays (P, ., .) after the shortest of each link."""
+    reached, count = np.flatnonzero(np.diff(first)), np.diff(first)
+    if not len(reached):
+        return delay_s
+    shortest = np.minimum.reduceat(delay_s.min(axis=(1, 2)), first[reached])
+    return delay_s - np.repeat(shortest, count[reached])[:, None, None]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Coefficients (P, antennas of rx, of tx) and delays, likewise or (P, 1, 1), of the paths of some links.
+
+    Paths of the i-th link are those from `first[i]` up to `first[i + 1]`.
+    """
+
+    links: slice
+    first: NDArray[np.intp]
+    a: NDArray[np.complex64]
+    delay_s: NDArray[np.float64]
+
+    def fill(self, a: NDArray[np.complex64], delay_s: NDArray[np.float64]) -> None:
+        """Put them into arrays (links, paths, antennas of rx, of tx), the delays likewise or (links, paths)."""
+        count = np.diff(self.first)
+        link = np.repeat(np.arange(len(count)), count)
+        number = np.arange(len(link)) - np.repeat(self.first[:-1], count)
+        a[link, number] = self.a
+        delay_s[link, number] = self.delay_s[:, 0, 0] if delay_s.ndim == 2 else self.delay_s
+
+
+@dataclass(frozen=True)
+class Unfolded:
+    """How the ends of P paths move when the reflections are unfolded.
+
+    `before` (P, 3, 3) maps displacements of the transmitter through all reflections, or to the last that lies before
+    the point where a path is `split` (P,): diffracted or scattered. From there, `to_tx_m` and `to_rx_m` (P, 3) lead to
+    the images of both ends; `after` maps displacements of the receiver; `upright` (P,) is an edge.
+    """
+
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    to_tx_m: NDArray[np.float64]
+    to_rx_m: NDArray[np.float64]
+    split: NDArray[np.bool_]
+    upright: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, paths: "ChannelPaths", rows: slice) -> "Unfolded":
+        """Walk along paths from the transmitter."""
+        kinds, vertices_m = np.asarray(paths.interactions[rows]), np.asarray(paths.vertices_m[rows])
+        rx_m = paths.rx[paths.path_rx[rows]]
+        here_m, (count, depth) = paths.tx.reshape(-1, 3)[paths.path_tx[rows]], kinds.shape
+        points_m = np.concatenate([vertices_m, rx_m[:, None]], axis=1)
+        points_m = np.where(np.isnan(points_m), rx_m[:, None], points_m)
+        mirrored, length_m = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count)
+        before, to_tx_m = mirrored.copy(), np.zeros((count, 3))
+        split, upright, leaving = np.zeros(count, bool), np.zeros(count, bool), np.zeros((count, 3))
+        for step in range(depth):
+            along = points_m[:, step] - here_m
+            leg_m = np.linalg.norm(along, axis=1)
+            arriving = along / np.maximum(leg_m, 1e-9)[:, None]
+            following = points_m[:, step + 1] - points_m[:, step]
+            following /= np.maximum(np.linalg.norm(following, axis=1), 1e-9)[:, None]
+            length_m += leg_m
+            normal = following - arriving
+            normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
+            reflected = kinds[:, step] == REFLECTION
+            mirrored[reflected] -= 2.0 * (normal[reflected, :, None] * (normal[reflected, None] @ mirrored[reflected]))
+            new = np.isin(kinds[:, step], (DIFFRACTION, DIFFUSE))
+            fresh = new & ~split
+            before[fresh], to_tx_m[fresh] = mirrored[fresh], -(length_m[:, None] * arriving)[fresh]
+            upright |= fresh & (kinds[:, step] == DIFFRACTION) & (np.abs(following - arriving)[:, 2] < UPRIGHT)
+            upright &= ~(new & split)
+            split |= new
+            mirrored[new], length_m[new], leaving[new] = np.eye(3), 0.0, following[new]
+            here_m = points_m[:, step]
+        length_m += np.linalg.norm(rx_m - here_m, axis=1)
+        before[~split] = mirrored[~split]
+        return cls(before, mirrored.transpose(0, 2, 1), to_tx_m, length_m[:, None] * leaving, split, upright)
+
+    def longer_at_edges_m(
+        self, split: NDArray[np.intp], rx_moved_m: NDArray[np.float64], tx_moved_m: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """By how much paths with numbers `split` are longer for displaced ends (P or 1, 3, A): (P, A_rx, A_tx) [m]."""
+
+        def from_edge(to_m: NDArray[np.float64], moved_m: NDArray[np.float64]) -> tuple[Any, Any]:
+            x, y, z = np.moveaxis(to_m[split, :, None] + moved_m, 1, 0)
+            upright = self.upright[split, None]
+            return np.hypot(np.hypot(x, y), np.where(upright, 0.0, z)), np.where(upright, z, 0.0)
+
+        def length_m(rx_moved_m: NDArray[np.float64], tx_moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
+            rx_away, rx_z = from_edge(self.to_rx_m, self.after[split] @ rx_moved_m)
+            tx_away, tx_z = from_edge(self.to_tx_m, self.before[split] @ tx_moved_m)
+            return np.hypot(rx_away[:, :, None] + tx_away[:, None, :], rx_z[:, :, None] - tx_z[:, None, :])
+
+        still = np.zeros((1, 3, 1))
+        return length_m(rx_moved_m, tx_moved_m) - length_m(still, still)
+
+
+def cir(paths: "ChannelPaths", *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
+    """Impulse responses (`TracedLinks.cir`)."""
+    arrays = ArrayPaths.of(paths, **options)
+    pairs = len(arrays.rx) * len(arrays.tx)
+    path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
+    require_memory(arrays, arrays.most * path_bytes, f"{arrays.antennas} x {arrays.most} paths", memory_gb)
+    a, delay_s = arrays.empty(arrays.links)
+    for block in arrays.blocks():
+        block.fill(a[block.links], delay_s[block.links])
+    every = ("link", "rx_ant", "tx_ant", "path")
+    delay = ("link", "path") if arrays.synthetic_array else every
+    variables = {
+        "a": (every, np.moveaxis(a, 1, 3), _A),
+        "delay_s": (delay, delay_s if arrays.synthetic_array else np.moveaxis(delay_s, 1, 3), _DELAY),
+        "paths": ("link", np.diff(arrays.first), {"long_name": "number of paths", "units": "1"}),
+    }
+    return labelled(arrays, variables)
+
+
+_A = {"long_name": "complex baseband gain of the path", "units": "1"}
+_DELAY = {"long_name": "propagation delay, NaN where there is no path", "units": "s"}
+
+
+def cfr(
+    paths: "ChannelPaths", frequencies_hz: ArrayLike, *, memory_gb: float = MEMORY_GB, **options: Any
+) -> xr.Dataset:
+    """Frequency responses (`TracedLinks.cfr`)."""
+    arrays = ArrayPaths.of(paths, **options)
+    remedy = "give frequencies relative to the carrier [Hz], such as those of subcarriers: (F,) numbers."
+    offsets_hz = real_array("frequencies_hz", frequencies_hz, SettingsError, remedy).astype(np.float64)
+    carrier_hz = paths.settings.frequency_hz
+    inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
+    require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")
+
+    def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
+        return phasors(-2.0 * np.pi * delay_s[..., None] * offsets_hz)
+
+    h = _filtered(arrays, kernel, len(offsets_hz), "frequencies", memory_gb)
+    variables = {"h": (("link", "rx_ant", "tx_ant", "frequency"), h, {"long_name": "frequency response", "units": "1"})}
+    attributes = {"long_name": "frequency relative to the carrier", "units": "Hz"}
+    return labelled(arrays, variables).assign_coords(frequency=("frequency", offsets_hz, attributes))
+
+
+def taps(
+    paths: "ChannelPaths",
+    bandwidth_hz: float,
+    l_min: int = FIRST_TAP,
+    l_max: int | None = None,
+    *,
+    memory_gb: float = MEMORY_GB,
+    **options: Any,
+) -> xr.Dataset:
+    """Taps (`TracedLinks.taps`)."""
+    require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
+    arrays = ArrayPaths.of(paths, **options)
+    if l_max is None:
+        delay_s = np.asarray(paths.delay_s)[:, None, None]
+        counted_s = _after_shortest(delay_s, arrays.first) if arrays.normalize_delays else delay_s
+        l_max = MORE_TAPS + math.ceil(bandwidth_hz * counted_s.max(initial=0.0))
+    require_whole("l_min", l_min, -1_000_000, 1_000_000)
+    require_whole("l_max", l_max, l_min, 1_000_000_000)
+
+    def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
+        tap = np.arange(l_min, l_max + 1)
+        return np.sinc(tap - bandwidth_hz * delay_s[..., None]).astype(np.complex64)
+
+    h = _filtered(arrays, kernel, l_max - l_min + 1, "taps", memory_gb)
+    attributes = {"long_name": "channel tap", "units": "1"}
+    table = labelled(arrays, {"h": (("link", "rx_ant", "tx_ant", "tap"), h, attributes)})
+    return table.assign_coords(tap=np.arange(l_min, l_max + 1)).assign_attrs(bandwidth_hz=float(bandwidth_hz))
+
+
+def _filtered(
+    arrays: ArrayPaths, kernel: Callable[[NDArray[np.float64]], NDArray[Any]], size: int, what: str, memory_gb: float
+) -> NDArray[np.complex64]:
+    """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size)."""
+    link_bytes = 8 * len(arrays.rx) * len(arrays.tx) * size
+    require_memory(arrays, link_bytes, f"{arrays.antennas} x {size} {what}", memory_gb)
+    h = np.zeros((arrays.links, len(arrays.rx), len(arrays.tx), size), np.complex64)
+    for block in arrays.blocks():
+        for link, (low, high) in enumerate(zip(block.first[:-1], block.first[1:], strict=True), block.links.start):
+            if arrays.synthetic_array:
+                h[link] = np.moveaxis(block.a[low:high], 0, 2) @ kernel(block.delay_s[low:high, 0, 0])
+                continue
+            for a, delay_s in zip(block.a[low:high], block.delay_s[low:high], strict=True):
+                h[link] += a[..., None] * kernel(delay_s)
+    return h
+
+
+def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
+    """Return variables of links with their transmitters and receivers, and what they were computed for."""
+    each, count = arrays.paths, len(arrays.paths.rx)
+    tx, rx = np.divmod(np.arange(arrays.links), max(1, count))
+    tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
+    positions = {"tx_m": (("link", "axis"), tx_m[tx], metre), "rx_m": (("link", "axis"), each.rx[rx], metre)}
+    attributes = {
+        **{"frequency_hz": each.settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
+        **{"synthetic_array": int(arrays.synthetic_array), "normalize_delays": int(arrays.normalize_delays)},
+    }
+    coordinates = {"tx": ("link", tx), "rx": ("link", rx), "axis": ["x", "y", "z"]}
+    return xr.Dataset({**variables, **positions}, coords=coordinates, attrs=attributes)
+
+
+def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float) -> None:
+    """Raise a MemoryLimitError if all links would take more than `memory_gb`."""
+    require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
+    size_gb = arrays.links * link_bytes / 1e9
+    if size_gb > memory_gb:
+        raise MemoryLimitError(
+            f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {what}, which take {size_gb:,.1f} "
+            "GB: give fewer of them, more memory_gb, or use save_channels, which needs memory for some links only."
+        )

@@ -1,0 +1,138 @@
+"""Subcommand from a map to the channels of links: channels."""
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import sionna_partial as sp
+import sionna_partial.cli.options as opt
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.errors import PositionError
+from sionna_partial.files import read_bytes, require_writable
+from sionna_partial.progress import reporting
+
+MAX_BYTES = 100_000_000
+"""Largest file of receivers that is read [bytes]."""
+
+COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
+"""Columns of positions, by any of these names."""
+
+ROWS_BY_COLUMNS = "ROWSxCOLUMNS"
+
+
+def channels(
+    map_path: opt.Map,
+    tx: Annotated[
+        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="A .nc or .h5 file, or a new .zarr folder.", show_default=False)],
+    rx: Annotated[
+        str, typer.Option(metavar="grid|CSV", help="Receivers: all free space, or a file with columns x,y,z [m].")
+    ] = "grid",
+    spacing: Annotated[float, typer.Option(help="Distance between receivers of the grid [m].")] = 0.5,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
+    array: Annotated[str, typer.Option(metavar=ROWS_BY_COLUMNS, help="Antennas of the transmitter.")] = "1x1",
+    rx_array: Annotated[str, typer.Option(metavar=ROWS_BY_COLUMNS, help="Antennas of the receivers.")] = "1x1",
+    pattern: Annotated[
+        str, typer.Option(metavar="NAME", help="Pattern of the transmitter's: iso, dipole, hw_dipole, tr38901.")
+    ] = "iso",
+    polarization: Annotated[str, typer.Option(metavar="V|H|VH|cross", help="Polarisation of all antennas.")] = "V",
+    orientation: Annotated[
+        tuple[float, float, float], typer.Option(metavar="A B C", help="Of the transmitter, about z, y, x [rad].")
+    ] = (0.0, 0.0, 0.0),
+    layout: Annotated[str, typer.Option(metavar="sionna|deepmimo", help="Axes of the arrays.")] = "sionna",
+    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
+    material: opt.MaterialText = "",
+    max_depth: opt.MaxDepth = 6,
+    diffraction: opt.Diffraction = True,
+    strict: opt.Strict = False,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
+    wall_height: opt.WallHeight = None,
+    memory: opt.Memory = MEMORY_GB,
+) -> None:
+    """Trace a map, and write the channel impulse responses between antenna arrays."""
+    position = (*opt.parse_position(tx), DEFAULT_HEIGHT_M)[:3]
+    shapes = [_parse_shape(name, text) for name, text in (("array", array), ("rx-array", rx_array))]
+    scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
+    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    require_writable(out.parent)
+    with reporting(None, command=True) as report:
+        report(0.0, "loading Sionna RT")
+        from sionna_partial.channels.files import checked_target
+        from sionna_partial.tracing.antennas import planar_array
+        from sionna_partial.tracing.trace import valid_links
+
+        checked_target(out, layout)
+        arrays = [
+            planar_array(*shape, pattern=each, polarization=polarization)
+            for shape, each in zip(shapes, (pattern, "iso"), strict=True)
+        ]
+        if rx == "grid":
+            grid_m = _free_grid(partial, spacing, rx_height)
+            receivers_m = grid_m[valid_links(partial, position, grid_m, frequency)[2][0]]
+        else:
+            receivers_m = _read_positions(Path(rx))
+        links = sp.trace_links(
+            partial,
+            position,
+            receivers_m,
+            trace_settings=trace_settings,
+            scene_settings=scene_settings,
+            memory_gb=memory,
+            progress=lambda fraction, message: report(0.5 * fraction, message),
+        )
+        sp.save_channels(
+            links,
+            out,
+            layout=layout,  # type: ignore[arg-type]
+            progress=lambda fraction, message: report(0.5 + 0.5 * fraction, message),
+            tx_array=arrays[0],
+            rx_array=arrays[1],
+            tx_orientation_rad=orientation,
+        )
+    typer.echo(f"{len(receivers_m)} receivers, {len(links.a)} paths")
+    opt.print_files(out.parent, [out.name])
+
+
+def _parse_shape(name: str, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if not found:
+        raise typer.BadParameter(f"--{name} {text!r} is no array: give rows and columns, such as 8x8.")
+    return int(found[1]), int(found[2])
+
+
+def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
+    """Return positions (N, 3) in free cells [m]."""
+    import numpy as np
+
+    low_x, low_y, high_x, high_y = partial.bounds_m
+    if not spacing_m >= partial.resolution_m / 10.0:
+        raise typer.BadParameter(f"--spacing {spacing_m:g} is too small: give {partial.resolution_m / 10.0:g} or more.")
+    x, y = np.meshgrid(
+        np.arange(low_x + spacing_m / 2.0, high_x, spacing_m), np.arange(low_y + spacing_m / 2.0, high_y, spacing_m)
+    )
+    grid_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height_m)])
+    return grid_m[partial.state_at(grid_m) == CellState.FREE]
+
+
+def _read_positions(path: Path) -> list[list[float]]:
+    """Read positions [m] from a CSV."""
+    remedy = "give a CSV with the columns x,y,z in metres."
+    text = read_bytes(path, "--rx", PositionError, MAX_BYTES).decode("utf-8-sig", errors="replace")
+    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    header = [name.strip() for name in next(rows, [])]
+    names = next((names for names in COLUMNS if set(names) <= {*header}), None)
+    if names is None:
+        raise PositionError(f"--rx '{path}' has the columns {', '.join(header)[:80] or 'none'}: {remedy}")
+    columns, found = [header.index(name) for name in names], list[list[float]]()
+    for row in filter(None, rows):
+        try:
+            found.append([float(row[column]) for column in columns])
+        except (ValueError, IndexError) as error:
+            raise PositionError(f"--rx '{path}', line {rows.line_num} is no position ({error}): {remedy}") from error
+    return found

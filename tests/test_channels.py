@@ -1,0 +1,548 @@
+"""Channel responses: against stock Sionna RT on the same paths, and against traces from antenna to antenna."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import h5py
+import numpy as np
+import pytest
+import xarray as xr
+from test_trace import NO_FLOOR, WAVELENGTH_M, _room, _slab_reflection
+
+import sionna_partial as sp
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
+from sionna_partial.scene.scene import export_scene
+from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.tracing.paths import DIFFRACTION
+
+TX = np.array([1.03, 2.93, 1.4])
+RX = np.array([[2.21, 1.12, 1.2], [5.02, 2.03, 1.5], [1.9, 3.1, 1.9]])
+TX_RAD, RX_RAD = (0.4, -0.3, 0.2), ((0.0, 0.0, 0.0), (1.0, 0.2, -0.5), (2.1, -0.7, 0.3))
+ORIENTATIONS = {"tx_orientation_rad": TX_RAD, "rx_orientation_rad": RX_RAD}
+
+
+def array_of(rows: int, columns: int, pattern: str = "iso", polarization: str = "V", spacing: float = 0.5) -> Any:
+    rt = load_sionna()
+    shape = {"num_rows": rows, "num_cols": columns, "vertical_spacing": spacing, "horizontal_spacing": spacing}
+    if pattern != "complex":
+        return rt.PlanarArray(**shape, pattern=pattern, polarization=polarization)
+    import mitsuba as mi
+
+    array = rt.PlanarArray(**shape, pattern="iso", polarization=polarization)
+    iso = array.antenna_pattern.patterns
+    turned = mi.Complex2f(0.6, 0.8)
+    array.antenna_pattern.patterns = [
+        lambda theta, phi, each=each: (each(theta, phi)[0] * turned, each(theta, phi)[1]) for each in iso
+    ]
+    return array
+
+
+def links_of(depth: int, *, diffraction: bool = False, frequency_hz: float = 28e9) -> sp.TracedLinks:
+    settings = sp.TraceSettings(frequency_hz, depth, power_tolerance_db=0.0, diffraction=diffraction, open_ends=True)
+    return sp.trace_links(_room(), TX, RX, trace_settings=settings)
+
+
+@pytest.fixture(scope="module")
+def room_xml(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export_scene(_room(), tmp_path_factory.mktemp("room") / "scene") / "scene.xml"
+
+
+def stock_paths(xml: Path, depth: int, arrays: dict[str, Any], *, synthetic: bool, diffraction: bool = False) -> Any:
+    """Paths of the public solver between the same ends."""
+    rt = load_sionna()
+    import mitsuba as mi
+
+    scene = rt.load_scene(str(xml), merge_shapes=False)
+    scene.frequency = 28e9
+    scene.tx_array, scene.rx_array = arrays["tx_array"], arrays["rx_array"]
+
+    def at(values: Any) -> Any:
+        return mi.Point3f(*map(float, values))
+
+    scene.add(rt.Transmitter("tx", position=at(TX), orientation=at(TX_RAD)))
+    for number, each in enumerate(zip(RX, RX_RAD, strict=True)):
+        scene.add(rt.Receiver(f"rx{number}", position=at(each[0]), orientation=at(each[1])))
+    return rt.PathSolver(deterministic=True)(
+        scene,
+        max_depth=depth,
+        refraction=False,
+        diffraction=diffraction,
+        edge_diffraction=diffraction,
+        synthetic_array=synthetic,
+        samples_per_src=100_000,
+        max_num_paths_per_src=1_000_000,
+    )
+
+
+def matches(links: sp.TracedLinks, paths: Any) -> list[tuple[int, int, int]]:
+    """Receiver, number among its paths, and number in stock's, of paths with the same interactions and points."""
+    depth = links.interactions.shape[1]
+    kinds = np.moveaxis(paths.interactions.numpy()[:, :, 0], 0, 2)
+    points_m = np.moveaxis(paths.vertices.numpy()[:, :, 0], 0, 2)
+    valid, found = paths.valid.numpy()[:, 0], []
+    for rx in range(len(RX)):
+        ours = np.flatnonzero(links.path_rx == rx)
+        for number, path in enumerate(ours):
+            same = valid[rx] & (kinds[rx][:, :depth] == links.interactions[path][: kinds.shape[2]]).all(axis=1)
+            there = links.interactions[path] > 0
+            apart = np.abs(points_m[rx][:, : there.sum()] - links.vertices_m[path][there]).max(axis=(1, 2), initial=0.0)
+            found += [(rx, number, int(each)) for each in np.flatnonzero(same & (apart < 1e-3))[:1]]
+    return found
+
+
+class TestTransfer:
+    def test_reflection_at_a_wall(self) -> None:
+        """Vertical antennas see the TE coefficient of the slab, horizontal ones the TM coefficient."""
+        state = np.zeros((60, 100), dtype=np.uint8)
+        state[50, :] = sp.CellState.WALL
+        settings = sp.TraceSettings(power_tolerance_db=0.0, diffraction=False)
+        tx, rx, wall_y = np.array([1.0, 2.0, 1.5]), np.array([[5.0, 3.0, 1.5]]), 5.05
+        links = sp.trace_links(sp.PartialMap(state, 0.1), tx, rx, trace_settings=settings, scene_settings=NO_FLOOR)
+        lengths_m = np.array([np.hypot(4.0, 1.0), np.hypot(4.0, 2 * wall_y - 5.0)])
+        cosine = (2 * wall_y - 5.0) / lengths_m[1]
+        te, tm = (_slab_reflection(cosine, sp.Material(), each) for each in ("te", "tm"))
+        expected = WAVELENGTH_M / (4 * np.pi * lengths_m) * [[1.0, abs(te)], [1.0, abs(tm)]]
+        np.testing.assert_allclose(np.abs(links.transfer[:, [0, 1], [0, 1]].T), expected, rtol=1e-3)
+        np.testing.assert_allclose(links.transfer[:, [0, 1], [1, 0]], 0.0, atol=1e-9)
+        assert links.to_xarray().transfer.sel(at_rx="theta", at_tx="theta").values.tolist() == links.a.tolist()
+
+    def test_reflections_are_reciprocal(self) -> None:
+        settings = sp.TraceSettings(power_tolerance_db=0.0, diffraction=False, max_depth=2)
+        ends = (TX, RX[2]), (RX[2], TX)
+        there, back = (sp.trace_links(_room(), a, b[None], trace_settings=settings) for a, b in ends)
+        assert len(there.a) == len(back.a) > 15
+        for path in range(len(there.a)):
+            apart = np.abs(back.departure_rad - there.arrival_rad[path]).max(axis=1)
+            apart += np.abs(back.arrival_rad - there.departure_rad[path]).max(axis=1)
+            expected, scale = back.transfer[apart.argmin()].T, 2e-3 * np.abs(there.transfer[path]).max()
+            np.testing.assert_allclose(there.transfer[path], expected, atol=scale)
+
+    def test_paths_of_rays(self) -> None:
+        """Sionna RT's public solver gives the same matrices."""
+        exact = links_of(1)
+        settings = replace(exact.settings, refraction=True, samples_per_tx=20_000)
+        shot = sp.trace_links(_room(), TX, RX, trace_settings=settings)
+        found = 0
+        for path in range(len(exact.a)):
+            same = (shot.path_rx == exact.path_rx[path]) & (np.abs(shot.delay_s - exact.delay_s[path]) < 1e-13)
+            same &= (shot.interactions == exact.interactions[path]).all(axis=1)
+            if same.any():
+                found += 1
+                scale = 1e-3 * np.abs(exact.a[path])
+                np.testing.assert_allclose(shot.transfer[same.argmax()], exact.transfer[path], atol=scale)
+        assert found > 10
+
+    def test_paths_on_disk(self, several: sp.TracedLinks, tmp_path: Path) -> None:
+        stored = sp.trace_links(
+            _room(), several.tx, several.rx, trace_settings=several.settings, invalid="nan", folder=tmp_path / "paths"
+        )
+        assert isinstance(stored.transfer, np.memmap)
+        for synthetic_array in (True, False):
+            found, expected = (each.cir(synthetic_array=synthetic_array) for each in (stored, several))
+            xr.testing.assert_equal(found, expected)
+
+
+CASES = [
+    (0, ("iso", "V"), ("iso", "V")),
+    (1, ("iso", "VH"), ("dipole", "cross")),
+    (2, ("tr38901", "VH"), ("hw_dipole", "V")),
+    (3, ("tr38901", "cross"), ("complex", "VH")),
+]
+
+
+class TestAgainstStock:
+    """Sionna RT rounds delays, and with them phases at 28 GHz, to single precision: so do we."""
+
+    @pytest.mark.parametrize("normalize_delays", [True, False])
+    @pytest.mark.parametrize(("depth", "tx", "rx"), CASES)
+    def test_every_response(
+        self, room_xml: Path, depth: int, tx: tuple[str, str], rx: tuple[str, str], normalize_delays: bool
+    ) -> None:
+        arrays = {"tx_array": array_of(4, 4, *tx), "rx_array": array_of(2, 1, *rx)}
+        links, paths = links_of(depth), stock_paths(room_xml, depth, arrays, synthetic=True)
+        options = {**arrays, **ORIENTATIONS, "normalize_delays": normalize_delays}
+        a, delay_s = paths.cir(normalize_delays=normalize_delays, out_type="numpy")
+        same = matches(links, paths)
+        assert len(same) == len(links.a) == (delay_s >= 0).sum()
+        channels = links.cir(**options)
+        scale = np.abs(a).max(axis=(1, 2, 3, 4, 5))
+        for receiver, ours, theirs in same:
+            found = channels.a[receiver, :, :, ours].to_numpy()
+            np.testing.assert_allclose(found, a[receiver, :, 0, :, theirs, 0], atol=1e-4 * scale[receiver])
+            assert channels.delay_s[receiver, ours].item() == pytest.approx(delay_s[receiver, 0, theirs], abs=1e-14)
+        offsets_hz = np.linspace(-2e8, 2e8, 17)
+        stock_options = {"normalize_delays": normalize_delays, "out_type": "numpy"}
+        found = links.cfr(offsets_hz, **options).h, links.taps(4e8, -6, 20, **options).h
+        stock = paths.cfr(offsets_hz.tolist(), **stock_options), paths.taps(4e8, -6, 20, **stock_options)
+        for ours, theirs in zip(found, stock, strict=True):
+            for receiver in range(3):
+                expected = theirs[receiver, :, 0, :, 0]
+                np.testing.assert_allclose(ours[receiver], expected, atol=1e-4 * np.abs(expected).max())
+
+    def test_diffraction(self, room_xml: Path) -> None:
+        arrays = {"tx_array": array_of(2, 2, "tr38901", "VH"), "rx_array": array_of(1, 2, "iso", "cross")}
+        links = links_of(2, diffraction=True)
+        paths = stock_paths(room_xml, 2, arrays, synthetic=True, diffraction=True)
+        a, _ = paths.cir(normalize_delays=False, out_type="numpy")
+        channels = links.cir(**arrays, **ORIENTATIONS, normalize_delays=False)
+        diffracted = (links.interactions == DIFFRACTION).any(axis=1)
+        errors = []
+        for receiver, ours, stock in matches(links, paths):
+            if diffracted[np.flatnonzero(links.path_rx == receiver)[ours]]:
+                found, expected = channels.a[receiver, :, :, ours].to_numpy(), a[receiver, :, 0, :, stock, 0]
+                errors.append(np.abs(found - expected).max() / np.abs(expected).max())
+        assert len(errors) > 20
+        assert np.max(errors) < 1e-4
+
+    def test_per_antenna(self, room_xml: Path) -> None:
+        """Stock traces between all antennas: patterns and coefficients of reflection differ between them as well."""
+        arrays = {"tx_array": array_of(4, 4), "rx_array": array_of(2, 1)}
+        links, paths = links_of(1), stock_paths(room_xml, 1, arrays, synthetic=False)
+        expected = paths.cfr([-1e8, 1e8], normalize_delays=False, out_type="numpy")[:, :, 0, :, 0]
+        options = {**arrays, **ORIENTATIONS, "normalize_delays": False}
+        exact, plane = (links.cfr([-1e8, 1e8], synthetic_array=each, **options).h for each in (False, True))
+        for receiver, most in enumerate((0.004, 0.004, 0.015)):
+            error, of_plane = (np.abs(h[receiver] - expected[receiver]).max().item() for h in (exact, plane))
+            assert error < most * np.abs(expected[receiver]).max()
+            assert error < 0.5 * of_plane
+
+
+class TestPerAntenna:
+    """The length of a path from antenna to antenna is that of a trace between them."""
+
+    @pytest.mark.parametrize("depth", [0, 3])
+    def test_lengths(self, depth: int) -> None:
+        tx_array, rx_array = array_of(2, 2, spacing=6.0), array_of(2, 1, spacing=9.0)
+        links = links_of(depth, diffraction=depth > 0)
+        options = {"tx_array": tx_array, "rx_array": rx_array, **ORIENTATIONS, "normalize_delays": False}
+        exact = links.cir(synthetic_array=False, **options)
+        wavelength_m = SPEED_OF_LIGHT_M_S / 28e9
+        checked, kinds = 0, set()
+        for receiver in range(len(RX)):
+            ends = []
+            for array, position_m, angles in (
+                (tx_array, TX, TX_RAD),
+                (rx_array, RX[receiver], RX_RAD[receiver]),
+            ):
+                import mitsuba as mi
+
+                ends.append(position_m + np.array(array.rotate(wavelength_m, mi.Point3f(*map(float, angles)))).T)
+            between = sp.trace_links(_room(), *ends, trace_settings=links.settings)
+            for number, path in enumerate(np.flatnonzero(links.path_rx == receiver)):
+                there = links.interactions[path] > 0
+                near = (between.interactions == links.interactions[path]).all(axis=1)
+                apart = np.abs(between.vertices_m[:, there] - links.vertices_m[path][there]).max(axis=(1, 2), initial=0)
+                same = np.flatnonzero(near & (apart < 0.15))
+                if len({*zip(between.path_tx[same], between.path_rx[same], strict=True)}) != len(same) or len(same) < 8:
+                    continue  # not seen by all, or mixed up with another
+                found = exact.delay_s.to_numpy()[receiver, between.path_rx[same], between.path_tx[same], number]
+                np.testing.assert_allclose(found, between.delay_s[same], atol=3e-14, rtol=0)
+                checked += 1
+                kinds |= {*links.interactions[path].tolist()}
+        assert checked > (2 if depth == 0 else 40)
+        assert kinds == ({0} if depth == 0 else {0, 1, DIFFRACTION})
+
+
+def some_links() -> sp.TracedLinks:
+    """Two transmitters, three receivers; one of them is reached by no path."""
+    rx = [[2.0, 1.0, 1.5], [5.0, 3.0, 1.2], [7.0, 1.0, 1.5]]
+    settings = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
+    return sp.trace_links(_room(), [(1.0, 1.0, 1.5), (4.5, 1.2, 1.4)], rx, trace_settings=settings, invalid="nan")
+
+
+@pytest.fixture(scope="module")
+def several() -> sp.TracedLinks:
+    return some_links()
+
+
+class TestResponses:
+    def test_links_are_numbered_by_transmitter_and_receiver(self, several: sp.TracedLinks) -> None:
+        channels = several.cir(normalize_delays=False)
+        assert channels.tx.values.tolist() == [0, 0, 0, 1, 1, 1]
+        assert channels.rx_m.sel(axis="y").values.tolist() == [1.0, 3.0, 1.0] * 2
+        assert channels.paths.values.reshape(2, 3)[:, 2].tolist() == [0, 0]
+        power = (np.abs(channels.a) ** 2).sum(["rx_ant", "tx_ant", "path"]).values.reshape(2, 3)
+        np.testing.assert_allclose(10 * np.log10(power[:, :2]), several.gain_db[:, :2], atol=1e-4)
+        later = several.path_tx == 1
+        found = channels.delay_s.values[3][: (several.path_rx[later] == 0).sum()]
+        np.testing.assert_array_equal(found, several.delay_s[later][several.path_rx[later] == 0])
+        assert np.isnan(channels.delay_s.values[2]).all()
+        assert not channels.a.values[5].any()
+
+    def test_blocks_change_nothing(self, several: sp.TracedLinks, monkeypatch: pytest.MonkeyPatch) -> None:
+        arrays = {"tx_array": array_of(2, 2), "rx_array": array_of(1, 2, "dipole", "VH")}
+        whole = [several.cir(synthetic_array=each, **arrays) for each in (True, False)]
+        monkeypatch.setattr("sionna_partial.channels.responses.BLOCK_BYTES", 16 * 16 * 5)
+        for each, synthetic_array in zip(whole, (True, False), strict=True):
+            np.testing.assert_array_equal(several.cir(synthetic_array=synthetic_array, **arrays).a, each.a)
+
+    @pytest.mark.parametrize("synthetic_array", [True, False])
+    def test_sums_over_paths(self, several: sp.TracedLinks, synthetic_array: bool) -> None:
+        options = {"tx_array": array_of(2, 2), "synthetic_array": synthetic_array}
+        channels, offsets_hz = several.cir(**options), np.array([-3e8, 0.0, 1e8])
+        delay_s = channels.delay_s.fillna(0.0)
+        for name, found, weight in (
+            ("frequency", several.cfr(offsets_hz, **options), lambda x: np.exp(-2j * np.pi * offsets_hz[x] * delay_s)),
+            ("tap", several.taps(2e8, **options), lambda x: xr.apply_ufunc(np.sinc, x - 6 - 2e8 * delay_s)),
+        ):
+            for number in range(found.sizes[name]):
+                expected = (channels.a * weight(number)).sum("path")
+                np.testing.assert_allclose(found.h[..., number], expected.transpose(*found.h.dims[:-1]), atol=1e-9)
+        assert found.tap.values[-1] == 6 + np.ceil(2e8 * several.cir().delay_s.max())
+
+    def test_no_links(self) -> None:
+        links = sp.trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)))
+        assert links.cir().a.shape == (0, 1, 1, 0)
+        assert links.cfr([0.0]).h.shape == (0, 1, 1, 1)
+        assert links.beam_gains(np.eye(1)).gain_db.shape == (0, 1, 1)
+
+    def test_memory_is_asked_for_first(self, several: sp.TracedLinks) -> None:
+        many = replace(several, rx=np.broadcast_to(several.rx[:1], (1_000_000, 3)))
+        arrays = {"tx_array": array_of(8, 8), "rx_array": array_of(8, 8)}
+        message = (
+            r"memory_gb = 2 is too little for 2,000,000 links x 64 x 64 antennas x \d+ paths, which take [\d,.]+ GB"
+        )
+        with pytest.raises(MemoryLimitError, match=message):
+            many.cir(**arrays)
+        with pytest.raises(MemoryLimitError, match=r"x 8 frequencies, which take 524\.3 GB: give fewer"):
+            many.cfr(np.arange(8), **arrays)
+        with pytest.raises(MemoryLimitError, match=r"2,000,000 links x 4096 pairs of beams, which take 32\.8 GB"):
+            many.beam_gains(np.eye(64), **arrays)
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda links: links.cir(tx_array="8x8"), "tx_array = '8x8' is not allowed: give a sionna.rt.PlanarArray"),
+            (lambda links: links.cir(rx_orientation_rad=(0, 0)), "rx_orientation_rad = .* or .N, 3. for the 3 ends"),
+            (lambda links: links.cir(tx_orientation_rad=(0, np.nan, 0)), "tx_orientation_rad = .* give three angles"),
+            (lambda links: links.cir(synthetic_array=1), "synthetic_array = 1 is not allowed: give True or False"),
+            (lambda links: links.cir(memory_gb=0), "memory_gb = 0 is not allowed"),
+            (lambda links: links.cfr([28e9]), "frequencies_hz = .* below the carrier of 2.8e.10 Hz"),
+            (lambda links: links.cfr([]), "frequencies_hz = .* relative to the carrier"),
+            (lambda links: links.taps(0.0), r"bandwidth_hz = 0.0 is not allowed: give a number in \(0, 1e\+12\]"),
+            (lambda links: links.taps(1e6, 5, 4), r"l_max = 4 is not allowed: give a whole number in \[5"),
+            (lambda links: links.taps(1e6, 0.5), "l_min = 0.5 is not allowed"),
+            (lambda links: links.beam_gains(np.ones((2, 3))), r"codebook = .*\(2, 3\).* give \(beams, 1\) weights"),
+            (lambda links: links.beam_gains([[np.nan]]), "codebook = .* such as those of dft_codebook"),
+            (lambda links: links.beam_gains([[1]], "x"), "rx_codebook = 'x' is not numeric"),
+            (lambda links: sp.dft_codebook(0, 8), "rows = 0 is not allowed"),
+            (lambda links: sp.dft_codebook(80, 80), r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas"),
+            (lambda links: sp.dft_codebook(8, 8, 3), "polarisations = 3 is not allowed"),
+            (
+                lambda links: replace(links, transfer=links.transfer[:, :1, :1]).cir(),
+                "transfer = .* traced for one polarisation; trace the links with trace_links",
+            ),
+        ],
+    )
+    def test_refused(self, several: sp.TracedLinks, call: Callable[[Any], object], message: str) -> None:
+        with pytest.raises(SettingsError, match=message):
+            call(several)
+
+
+class TestBeams:
+    @pytest.mark.parametrize("polarization", ["V", "VH"])
+    def test_gain_is_that_of_all_antennas(self, several: sp.TracedLinks, polarization: str) -> None:
+        arrays = {"tx_array": array_of(4, 2, "tr38901", "VH"), "rx_array": array_of(1, 2, "dipole", polarization)}
+        options = {**arrays, "tx_orientation_rad": (0.3, 0.1, 0.0), "rx_orientation_rad": np.ones((3, 3))}
+        rng, count = np.random.default_rng(0), 2 * len(polarization)
+        at_tx = sp.dft_codebook(4, 2, 2)
+        at_rx = rng.normal(size=(3, count)) + 1j * rng.normal(size=(3, count))
+        beams = several.beam_gains(at_tx, at_rx, **options)
+        a = several.cir(**options).a.values
+        power = (np.abs(np.einsum("br,lrtp,ct->lbcp", at_rx.conj(), a, at_tx)) ** 2).sum(axis=-1)
+        np.testing.assert_allclose(beams.gain_db, 10 * np.log10(power.clip(1e-15)), atol=1e-3)
+        flat = np.sort(power.reshape(6, -1), axis=1)
+        np.testing.assert_allclose(beams.margin_db[:2], 10 * np.log10(flat[:2, -1] / flat[:2, -2]), atol=1e-3)
+        best = power.reshape(6, -1).argmax(axis=1)
+        assert (beams.best_rx_beam * len(at_tx) + beams.best_tx_beam)[[0, 1, 3, 4]].values.tolist() == best[
+            [0, 1, 3, 4]
+        ].tolist()
+        assert beams.best_tx_beam[[2, 5]].values.tolist() == [-1, -1]
+        assert np.isnan(beams.margin_db[[2, 5]]).all()
+
+    def test_codebook_is_orthonormal_and_points(self) -> None:
+        beams = sp.dft_codebook(4, 8, 2)
+        np.testing.assert_allclose(beams @ beams.conj().T, np.eye(64), atol=1e-12)
+        field = sp.PartialMap(np.zeros((60, 60), dtype=np.uint8), 0.1)
+        y = 4.0 * np.tan(np.arcsin(2 * np.arange(4) / 8))  # sin(azimuth) = 2 k / columns: the k-th beam across
+        rx = np.column_stack([np.full(4, 5.0), 1.0 + y, np.full(4, 1.5)])[:3]
+        links = sp.trace_links(field, (1.0, 1.0, 1.5), rx, scene_settings=sp.SceneSettings(floor_extent="none"))
+        found = links.beam_gains(sp.dft_codebook(4, 8), tx_array=array_of(4, 8))
+        assert found.best_tx_beam.values.tolist() == [0, 4, 8]
+        gain_db = found.gain_db.max(["rx_beam", "tx_beam"]).values - links.gain_db
+        np.testing.assert_allclose(gain_db, 10 * np.log10(32), atol=1e-2)
+
+
+def made_links(*paths: tuple[float, float, float, int]) -> sp.TracedLinks:
+    """One link with paths (power, delay [ns], azimuth of departure [rad], interaction)."""
+    power, delay_ns, azimuth, kind = np.array(paths, dtype=float).reshape(-1, 4).T
+    count = len(power)
+    transfer = np.zeros((count, 2, 2), complex)
+    transfer[:, 0, 0] = np.sqrt(power)
+    gain_db = 10 * np.log10(power.sum()) if count else -150.0
+    return sp.TracedLinks(
+        tx=np.zeros(3),
+        rx=np.ones((1, 3)),
+        link_state=np.ones(1, np.uint8),
+        gain_db=np.array([gain_db]),
+        path_tx=np.zeros(count, np.int32),
+        path_rx=np.zeros(count, np.int32),
+        transfer=transfer,
+        delay_s=1e-9 * delay_ns,
+        departure_rad=np.stack([np.full(count, np.pi / 2), azimuth], axis=1),
+        arrival_rad=np.stack([azimuth / 2, np.full(count, 3.0)], axis=1),
+        interactions=kind.astype(np.uint8)[:, None],
+        vertices_m=np.full((count, 1, 3), np.nan),
+        settings=sp.TraceSettings(),
+        scene_settings=sp.SceneSettings(),
+    )
+
+
+class TestSpreads:
+    """Cases by hand, with the definitions of TR 38.901."""
+
+    def test_two_paths(self) -> None:
+        found = made_links((3e-8, 10.0, np.pi - 0.1, 0), (1e-8, 50.0, 0.1 - np.pi, 1)).spreads()
+        assert found.delay_spread_s.values == pytest.approx([40e-9 * np.sqrt(0.75 * 0.25)])
+        assert found.k_factor_db.values == pytest.approx([10 * np.log10(3.0)])
+        assert found.path_loss_db.values == pytest.approx([-10 * np.log10(4e-8)])
+        length = np.hypot(np.cos(0.1), 0.5 * np.sin(0.1))  # across the end of the range of azimuth
+        assert found.azimuth_departure_spread_rad.values == pytest.approx([np.sqrt(-2 * np.log(length))])
+        assert found.zenith_departure_spread_rad.values == pytest.approx([0.0], abs=1e-7)
+        assert found.azimuth_arrival_spread_rad.values == pytest.approx([0.0], abs=1e-7)
+        assert found.zenith_arrival_spread_rad.units == "rad"
+        assert found.path_loss_db.dims == ("rx",)
+
+    def test_line_of_sight_alone(self) -> None:
+        found = made_links((1e-8, 10.0, 0.3, 0)).spreads()
+        assert found.k_factor_db.values.tolist() == [np.inf]
+        assert found.delay_spread_s.values.tolist() == [0.0]
+
+    def test_no_line_of_sight(self) -> None:
+        assert np.isnan(made_links((1e-8, 10.0, 0.3, 1)).spreads().k_factor_db).all()
+
+    def test_no_paths(self) -> None:
+        assert np.isnan(made_links().spreads().to_array()).all()
+
+    def test_several_transmitters(self, several: sp.TracedLinks) -> None:
+        assert several.spreads().delay_spread_s.dims == ("tx", "rx")
+
+
+class TestFiles:
+    ARRAYS: ClassVar = {"tx_array": (2, 2, "iso", "VH"), "rx_array": (1, 2)}
+
+    @pytest.fixture
+    def options(self) -> dict[str, Any]:
+        return {name: array_of(*shape) for name, shape in self.ARRAYS.items()}
+
+    @pytest.mark.parametrize("synthetic_array", [True, False])
+    @pytest.mark.parametrize("suffix", [".nc", ".h5", ".zarr"])
+    def test_links_as_sionna_has_them(
+        self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any], suffix: str, synthetic_array: bool
+    ) -> None:
+        options["synthetic_array"] = synthetic_array
+        whole, path = several.cir(**options), tmp_path / f"channels{suffix}"
+        sp.save_channels(several, path, **options)
+        found = sp.load_channels(path)
+        assert found.a.dims == ("rx", "rx_ant", "tx", "tx_ant", "path", "time")
+        assert found.a.shape == (3, 2, 2, 8, whole.sizes["path"], 1)
+        assert found.tau.dims == (("rx", "tx", "path") if synthetic_array else found.a.dims[:-1])
+        for tx, rx in np.ndindex(2, 3):
+            link = whole.isel(link=3 * tx + rx)
+            np.testing.assert_array_equal(found.a[rx, :, tx, ..., 0], link.a)
+            np.testing.assert_array_equal(found.tau.isel(rx=rx, tx=tx), link.delay_s.fillna(-1.0))
+        np.testing.assert_array_equal(found.rx_m, several.rx)
+        assert found.tx_m.shape == (2, 3)
+        assert [each.name for each in tmp_path.iterdir()] == [path.name]
+        if suffix == ".h5":
+            with h5py.File(path) as file:
+                np.testing.assert_array_equal(file["a"], found.a)
+
+    def test_computed_channels(self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any]) -> None:
+        channels, response = several.cir(**options), several.cfr([0.0, 1e6], **options)
+        sp.save_channels(channels, tmp_path / "whole.nc")
+        sp.save_channels(several, tmp_path / "links.nc", **options)
+        xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "links.nc"))
+        sp.save_channels(response, tmp_path / "h.nc")
+        found = sp.load_channels(tmp_path / "h.nc")
+        assert found.h.dims == ("rx", "rx_ant", "tx", "tx_ant", "time", "frequency")
+        np.testing.assert_array_equal(found.h[1, :, 1, :, 0], response.h[4])
+        assert found.frequency.values.tolist() == [0.0, 1e6]
+
+    def test_as_deepmimo_has_them(self, tmp_path: Path) -> None:
+        links = links_of(1)
+        sp.save_channels(links, tmp_path / "one.h5", layout="deepmimo", tx_array=array_of(2, 2))
+        found, whole = sp.load_channels(tmp_path / "one.h5"), links.cir(tx_array=array_of(2, 2))
+        assert found.channel.dims == ("rx", "rx_ant", "tx_ant", "path")
+        np.testing.assert_array_equal(found.channel, whole.a)
+        np.testing.assert_array_equal(found.delay, whole.delay_s)
+        sp.save_channels(links.cfr([0.0, 1e6]), tmp_path / "h.h5", layout="deepmimo")
+        assert sp.load_channels(tmp_path / "h.h5").channel.dims == ("rx", "rx_ant", "tx_ant", "frequency")
+
+    def test_a_generator_yields_what_sionna_takes(self, several: sp.TracedLinks, tmp_path: Path) -> None:
+        """`CIRDataset` takes a generator of a [rx, rx_ant, tx, tx_ant, path, time] and tau [rx, tx, path]."""
+        sp.save_channels(several, tmp_path / "channels.zarr", tx_array=array_of(2, 2))
+        found = sp.load_channels(tmp_path / "channels.zarr")
+        for rx in range(3):
+            a, tau = (found[name].isel(rx=[rx]).to_numpy() for name in ("a", "tau"))
+            assert a.shape == (1, 1, 2, 4, found.sizes["path"], 1)
+            assert tau.shape == (1, 2, found.sizes["path"])
+            assert a.dtype == np.complex64
+
+    def test_blocks_and_progress(
+        self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        fractions: list[float] = []
+        sp.save_channels(several, tmp_path / "whole.nc")
+        monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
+        sp.save_channels(several, tmp_path / "parts.nc", progress=lambda fraction, _: fractions.append(fraction))
+        xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "parts.nc"))
+        assert fractions[-1] == 1.0
+        assert len({*fractions}) == 7
+
+    @pytest.mark.parametrize(
+        ("name", "error", "message"),
+        [
+            ("channels.mat", OutputError, r"has the suffix '.mat': choose one of .zarr, .nc, .h5"),
+            ("there.zarr", OutputError, "is there already: remove it, or choose another name"),
+            ("folder.nc", OutputError, "this path is a folder"),
+        ],
+    )
+    def test_paths_that_are_refused(
+        self, several: sp.TracedLinks, tmp_path: Path, name: str, error: type[Exception], message: str
+    ) -> None:
+        (tmp_path / "there.zarr").mkdir()
+        (tmp_path / "folder.nc").mkdir()
+        with pytest.raises(error, match=message):
+            sp.save_channels(several, tmp_path / name)
+        assert len([*tmp_path.iterdir()]) == 2
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda path, links: sp.save_channels(links, path, layout="matlab"), "layout = 'matlab' is not allowed"),  # type: ignore[arg-type]
+            (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
+            (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels = .* give links, or what their cir"),
+            (lambda path, links: sp.save_channels(links.cir(), path, rx_array=None), "options = 'rx_array' is not"),
+            (lambda path, links: sp.save_channels(made_links(), path), "channels = '1 links' .* none has a path"),
+            (lambda path, links: sp.load_channels(path), "channels.nc' cannot be read"),
+            (lambda path, links: sp.load_channels(path.with_suffix(".zarr")), "channels.zarr' cannot be read"),
+            (lambda path, links: sp.load_channels(path.with_suffix(".mat")), "path = .*mat' is not allowed: give a"),
+            (
+                lambda path, links: sp.load_channels(path.with_name("text.nc")),
+                "text.nc' cannot be read .*save_channels",
+            ),
+            (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
+        ],
+    )
+    def test_refused(
+        self, several: sp.TracedLinks, tmp_path: Path, call: Callable[[Path, Any], object], message: str
+    ) -> None:
+        (tmp_path / "text.nc").write_text("no NetCDF")
+        xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+        with pytest.raises(SettingsError, match=message):
+            call(tmp_path / "channels.nc", several)
+        assert not (tmp_path / "channels.nc").exists()
