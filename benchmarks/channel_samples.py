@@ -5,14 +5,16 @@ robot has seen. Scores of the draws of each link, by ends in observed cells: ene
 azimuth spreads (in units of 10 dB, 5 ns and 20 degrees; no paths count -150 dB and 0), continuous ranked probability
 score (CRPS) of each, and how often the 90 % interval holds the truth. Opponents: the trace of the partial map alone,
 and draws of TR 38.901 InH-office (table 7.5-6, 28 GHz) at the distance of the link, with link states as predicted, or
-(with an advantage that no user has) LOS as it is. The joint part compares draws with independent ones: the probability
-that all transmitters fail, and the fraction of receivers in outage. Run
+(with an advantage that no user has) LOS as it is. The best of 64 x 16 pairs of beams (DFT codebooks of 8 x 8 and 4 x 4
+antennas) is looked for among the 1, 3, 6 and 16 that are most often the best of a draw. The joint part compares draws
+with independent ones: the probability that all transmitters fail, and the fraction of links in outage. Run
 
     python benchmarks/channel_samples.py ../shared/gibson/*/map.yaml
     python benchmarks/channel_samples.py --made 12
 """
 
 import argparse
+import dataclasses
 from collections import defaultdict
 from pathlib import Path
 
@@ -21,9 +23,12 @@ from measurements import FIRST_SEED, points
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.tracing.antennas import planar_array
 
 STEPS, TRANSMITTERS, RECEIVERS, DRAWS, NEAREST_M = (0, 50, 100, 200), 3, 40, 100, 0.15
 UNITS = np.array([10.0, 5.0, 20.0, 20.0])
+NUMBERS = (1, 3, 6, 16)
+"""Numbers of likeliest pairs of beams among which the best one is looked for."""
 COLUMNS = ("gain [dB]", "delay spread [ns]", "ASD [deg]", "ASA [deg]")
 METHODS = ("draws", "partial trace", "38.901, predicted states", "38.901, true LOS")
 Floats = NDArray[np.float64]
@@ -47,7 +52,7 @@ def main() -> None:
             rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > NEAREST_M]
             joint.append(score_map(home, partial, tx_m, rx_m, seed, of_home))
         for key, values in of_home.items():
-            scores[key].append(np.concatenate(values).mean(axis=0))
+            scores[key].append(np.nanmean(np.concatenate(values), axis=0))
         print(f"{name} done", flush=True)
     print_links(scores)
     print_joint(np.array(joint))
@@ -73,8 +78,20 @@ def score_map(
     seen = [partial.state_at(end_m) == sp.CellState.FREE for end_m in (tx_m, rx_m)]
     both = seen[0][:, None] + 2 * seen[1][None]
     groups = np.array(["no end seen", "transmitter seen", "receiver seen", "both seen"])[both.ravel()]
+    best, heard = best_pairs(true)[0], true.link_state.ravel() != sp.LinkState.OUTAGE
+    clusters = indoor_office_paths(samples, standard[0], rng)
+    pairs = {
+        METHODS[0]: best_pairs(samples.drawn, DRAWS),
+        METHODS[1]: ranked_pairs(known),
+        METHODS[2]: best_pairs(clusters, DRAWS),
+    }
     for method, draws in zip(METHODS, (drawn, trace[None], *standard), strict=True):
-        rows = np.array([score(draws[:, link], truth[link]) for link in range(len(truth))])
+        hits = (
+            among_likeliest(pairs[method], best, heard)
+            if method in pairs
+            else np.full((len(truth), len(NUMBERS)), np.nan)
+        )
+        rows = np.array([[*score(draws[:, link], truth[link]), *hits[link]] for link in range(len(truth))])
         for group in ("all links", *np.unique(groups)):
             scores[group, method].append(rows[(groups == group) | (group == "all links")])
     return joint_scores(samples.link_state, true.link_state)
@@ -123,6 +140,69 @@ def indoor_office(distance_m: Floats, states: NDArray[np.uint8], rng: np.random.
     return drawn
 
 
+def indoor_office_paths(samples: sp.ChannelSamples, drawn: Floats, rng: np.random.Generator) -> sp.TracedLinks:
+    """Make paths of these draws (n, L, 4): 20 clusters about the direct line, and a K-factor in LOS."""
+    links, clusters = samples.drawn, 20
+    states = links.link_state.ravel()
+    link = np.repeat(np.flatnonzero(states != sp.LinkState.OUTAGE), clusters)
+    tx, rx = np.divmod(link, len(links.rx))
+    along_m = links.rx[rx] - links.tx[tx]
+    direct = np.arange(len(link)) % clusters == 0
+    power = rng.exponential(1.0, len(link)) * 10.0 ** (-0.3 * rng.standard_normal(len(link)))
+    k_factor = 10.0 ** ((7.0 + 4.0 * rng.standard_normal(len(states))) / 10.0)[link]
+    is_los = states[link] == sp.LinkState.LOS
+    total = np.bincount(link, power, minlength=len(states))[link]
+    power = np.where(direct & is_los, k_factor * total, power)
+    power *= 10.0 ** (drawn.reshape(-1, 4)[link, 0] / 10.0) / np.bincount(link, power, minlength=len(states))[link]
+    azimuth_rad = np.arctan2(along_m[:, 1], along_m[:, 0])
+    angles = []
+    for column, turn, zenith_std in ((2, 0.0, 0.2), (3, np.pi, 0.2)):
+        off = np.radians(drawn.reshape(-1, 4)[link, column]) * rng.standard_normal(len(link)) * ~(direct & is_los)
+        zenith = np.pi / 2 + zenith_std * rng.standard_normal(len(link)) * ~(direct & is_los)
+        angles.append(np.stack([zenith, azimuth_rad + turn + off], axis=1))
+    phase = np.exp(2j * np.pi * rng.random(len(link)))
+    return dataclasses.replace(
+        links,
+        path_tx=tx.astype(np.int32),
+        path_rx=rx.astype(np.int32),
+        transfer=(np.sqrt(power) * phase)[:, None, None] * np.diag([1.0, -1.0]),
+        delay_s=np.linalg.norm(along_m, axis=1) / 3e8,
+        departure_rad=angles[0],
+        arrival_rad=angles[1],
+        interactions=np.ones((len(link), 1), np.uint8),
+        vertices_m=np.full((len(link), 1, 3), np.nan),
+    )
+
+
+def beams(links: sp.TracedLinks) -> Floats:
+    """Gain (L, 16 x 64) of all pairs of beams."""
+    arrays = {"tx_array": planar_array(8, 8), "rx_array": planar_array(4, 4)}
+    found = links.beam_gains(sp.dft_codebook(8, 8), sp.dft_codebook(4, 4), memory_gb=8.0, **arrays)
+    return found.gain_db.to_numpy().reshape(links.gain_db.size, -1)
+
+
+def best_pairs(links: sp.TracedLinks, draws: int = 1) -> NDArray[np.intp]:
+    """Return the number of the best pair (draws, L), -1 in an outage."""
+    gain_db = beams(links)
+    return np.where(gain_db.max(axis=1) > -150.0, gain_db.argmax(axis=1), -1).reshape(draws, -1)
+
+
+def ranked_pairs(links: sp.TracedLinks) -> NDArray[np.intp]:
+    """Pairs (16, L) in order of their gain; each counts less than the one before."""
+    order = np.argsort(-beams(links), axis=1, kind="stable")[:, : max(NUMBERS)]
+    return np.concatenate([np.repeat(order[:, [rank]].T, max(NUMBERS) - rank, axis=0) for rank in range(max(NUMBERS))])
+
+
+def among_likeliest(drawn: NDArray[np.intp], best: NDArray[np.intp], heard: NDArray[np.bool_]) -> Floats:
+    """Whether the best pair of each link (L,) is among the k most frequent ones (L, 4); NaN in an outage."""
+    hits = np.full((len(best), len(NUMBERS)), np.nan)
+    for link in np.flatnonzero(heard):
+        pairs, count = np.unique(drawn[drawn[:, link] >= 0, link], return_counts=True)
+        likeliest = pairs[np.argsort(-count, kind="stable")]
+        hits[link] = [best[link] in likeliest[:number] for number in NUMBERS]
+    return hits
+
+
 def score(draws: Floats, truth: Floats) -> Floats:
     """Energy score, CRPS of each column, and whether the 90 % intervals hold the truth, of draws (n, 4)."""
     first, second = draws / UNITS, np.roll(draws, 1, axis=0) / UNITS
@@ -154,19 +234,17 @@ def print_links(scores: dict[tuple[str, str], list[Floats]]) -> None:
     """Print a table for each group, means over homes, and the paired lead in energy score over the opponents."""
     for group in dict.fromkeys(key[0] for key in scores):
         print(f"\n{group} ({len(scores[group, METHODS[0]])} homes)\n")
-        print(
-            "| | energy score | " + " | ".join(f"CRPS {each}" for each in COLUMNS) + " | 90 % intervals hold | lead |"
-        )
-        print("|---|---|---|---|---|---|---|---|")
+        columns = ["energy score", *(f"CRPS {each}" for each in COLUMNS), "90 % intervals hold", "best beams", "lead"]
+        print(f"| | {' | '.join(columns)} |\n|{'---|' * (len(columns) + 1)}")
         ours = np.array(scores[group, METHODS[0]])
         for method in METHODS:
             rows = np.array(scores[group, method])
-            mean, lead = rows.mean(axis=0), rows[:, 0] - ours[:, 0]
-            held = "/".join(f"{each:.2f}" for each in mean[5:]) if method != METHODS[1] else ""
+            mean, lead = np.nanmean(rows, axis=0), rows[:, 0] - ours[:, 0]
+            held = "/".join(f"{each:.2f}" for each in mean[5:9]) if method != METHODS[1] else ""
             ahead = f"{lead.mean():.2f} +- {lead.std(ddof=1) / np.sqrt(len(lead)):.2f}" if lead.any() else ""
-            print(
-                f"| {method} | {mean[0]:.3f} | {' | '.join(f'{each:.2f}' for each in mean[1:5])} | {held} | {ahead} |"
-            )
+            found = "" if np.isnan(mean[9:]).all() else "/".join(f"{each:.2f}" for each in mean[9:])
+            crps = " | ".join(f"{each:.2f}" for each in mean[1:5])
+            print(f"| {method} | {mean[0]:.3f} | {crps} | {held} | {found} | {ahead} |")
 
 
 def print_joint(rows: Floats) -> None:

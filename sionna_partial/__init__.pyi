@@ -5,6 +5,8 @@ from sionna_partial.calibration.calibration import calibrate_materials as calibr
 from sionna_partial.channels.beams import dft_codebook as dft_codebook
 from sionna_partial.channels.files import load_channels as load_channels
 from sionna_partial.channels.files import save_channels as save_channels
+from sionna_partial.channels.samples import ChannelSamples as ChannelSamples
+from sionna_partial.channels.samples import sample_channels as sample_channels
 from sionna_partial.constants import CellState as CellState
 from sionna_partial.constants import LinkState as LinkState
 from sionna_partial.coverage import predict_map as predict_map
@@ -28,6 +30,7 @@ from sionna_partial.maps.partial_map import PartialMap as PartialMap
 from sionna_partial.measurements.measurements import Measurements as Measurements
 from sionna_partial.measurements.recordings import measurements_from_bag as measurements_from_bag
 from sionna_partial.measurements.recordings import poses_from_bag as poses_from_bag
+from sionna_partial.network import network_map as network_map
 from sionna_partial.placement.placement import TransmitterPlacement as TransmitterPlacement
 from sionna_partial.placement.placement import place_transmitter as place_transmitter
 from sionna_partial.plots.coverage_plot import plot_coverage as plot_coverage

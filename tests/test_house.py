@@ -37,13 +37,16 @@ ROOMS = {
         "path_set",
         "antennas",
     ),
-    "channels": ("responses", "beams", "spreads", "files"),
     "prediction": (
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "measurements": ("measurements", "recordings", "assimilation"),
-    "coverage": ("coverage",),
+    "channels": (
+        *("responses", "beams", "spreads", "files"),
+        *("joint", "path_model", "path_training", "samples"),
+    ),
+    "coverage": ("coverage", "network"),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement"),

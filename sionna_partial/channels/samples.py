@@ -90,19 +90,19 @@ class ChannelSamples(Shown):
 
     def cir(self, **options: Any) -> "xr.Dataset":
         """Return channel impulse responses as `TracedLinks.cir` does, along a first dimension "draw"."""
-        return self._labelled(self.drawn.cir(**self._tiled(options)))
+        return self._by_draw(self.drawn.cir(**self._tiled(options)))
 
-    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> Any:
+    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> "xr.Dataset":
         """Return channel frequency responses as `TracedLinks.cfr` does, along a first dimension "draw"."""
-        return self._labelled(self.drawn.cfr(frequencies_hz, **self._tiled(options)))
+        return self._by_draw(self.drawn.cfr(frequencies_hz, **self._tiled(options)))
 
-    def beam_gains(self, *arguments: Any, **options: Any) -> Any:
-        """Return gains of beam pairs as `TracedLinks.beam_gains` does, along a first dimension "draw"."""
-        return self._labelled(self.drawn.beam_gains(*arguments, **self._tiled(options)))
+    def beam_gains(self, codebook: ArrayLike, rx_codebook: ArrayLike | None = None, **options: Any) -> "xr.Dataset":
+        """Return gains of pairs of beams as `TracedLinks.beam_gains` does, along a first dimension "draw"."""
+        return self._by_draw(self.drawn.beam_gains(codebook, rx_codebook, **self._tiled(options)))
 
     def spreads(self) -> "xr.Dataset":
         """Return delay and angular spreads as `TracedLinks.spreads` does, along a first dimension "draw"."""
-        return self._labelled(self.drawn.spreads())
+        return self._by_draw(self.drawn.spreads())
 
     def _tiled(self, options: dict[str, Any]) -> dict[str, Any]:
         """Repeat orientations of the transmitters for each draw."""
@@ -111,10 +111,15 @@ class ChannelSamples(Shown):
             return options
         return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
 
-    def _labelled(self, found: Any) -> Any:
-        if self.link_state.ndim == 2:
-            return found.rename(tx="draw")
-        return found.coarsen(tx=self.link_state.shape[1]).construct(tx=("draw", "tx"))
+    def _by_draw(self, found: "xr.Dataset") -> "xr.Dataset":
+        """Fold links, or transmitters, into draws and those of each draw."""
+        along = "link" if "link" in found.dims else "tx"
+        folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
+        if along == "link":
+            first = folded.isel(draw=0)
+            positions = {name: first[name] for name in ("tx_m", "rx_m")}
+            return folded.assign_coords(tx=first.tx, rx=first.rx).assign(positions)
+        return folded.isel(tx=0) if self.link_state.ndim == 2 else folded
 
 
 def sample_channels(
