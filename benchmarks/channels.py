@@ -3,8 +3,8 @@
     python benchmarks/channels.py speed
 
 compares impulse responses of 3,000 receivers (8 x 8 by 2 x 2 antennas), and the gains of 64 x 16 beams, with the trace
-of the same links in the same process, on one core, the median of several runs after a warm-up; and writes the channels
-of 25,000 receivers in a process of its own.
+of the same links in the same process, the median of several runs after a warm-up; and writes the channels of 25,000
+receivers in processes of their own. Times are those of the processor, of which one core is used.
 """
 
 import argparse
@@ -41,7 +41,7 @@ def main() -> None:
 def speed(receivers: int, streamed: int, runs: int) -> None:
     """Print the times as ratios to the trace, and what streaming takes."""
     seconds = isolated(times, receivers, runs)
-    print(f"{receivers} receivers of the {HOME}, one core, median of {runs} runs")
+    print(f"{receivers} receivers of the {HOME}, one core, processor time, median of {runs} runs")
     for name, value in seconds.items():
         print(f"{name:34}{value:8.3f} s{value / seconds['trace']:8.2f} of the trace")
     print(f"\n{streamed} receivers, 8 x 8 by 2 x 2 antennas, written some at a time")
@@ -89,9 +89,9 @@ def stream(receivers: int, suffix: str) -> dict[str, float]:
 
 
 def _seconds(step: Callable[[], object]) -> float:
-    start = time.perf_counter()
+    start = time.process_time()
     step()
-    return time.perf_counter() - start
+    return time.process_time() - start
 
 
 def _arrays() -> dict[str, object]:
