@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.checks import Progress, no_progress, require, require_number, settings_or_default
-from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -32,6 +32,10 @@ Fewer than 6 starts would miss the best room of a small home."""
 
 STEPS_M = (0.6, 0.25)
 """Distances at which the refinement tries neighbours, in turn [m]."""
+
+OUTAGE = {column.name: GAIN_FLOOR_DB if column.name.endswith("mean_db") else 0.0 for column in fields(LinkPrediction)}
+OUTAGE["p_outage"] = 1.0
+"""Prediction of an outage that is certain."""
 
 _DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
@@ -171,24 +175,14 @@ def place_transmitter(
     """
     settings = PlacementSettings(**options)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
-    scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
-    trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
-    low_m, high_m = partial.height_range_m
-    for name in ("tx_height_m", "rx_height_m"):
-        height_m = getattr(settings, name)
-        require_number(name, height_m, low_m, high_m, open_low=True)
-        require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
-    model = None
-    if not partial.is_complete:
-        model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
-    area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
+    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
+    area, model = search.area, search.model
     thinned = area.thinned(RECEIVERS)
     with reporting(progress) as report, temporary_folder() as folder:
         report(0.0, "building the scene")
-        objective = _Objective(Tracer(partial, folder, trace_settings, scene_settings), model, settings)
+        objective = _Objective(search, Tracer(partial, folder, search.trace_settings, search.scene_settings))
         report(0.1, "comparing positions")
-        starts_m = _starts(thinned, settings, trace_settings.frequency_hz)
+        starts_m = search.starts(thinned, _per_area(thinned, *STARTS))
         start_scores = objective.scores(starts_m, thinned)
         routes = _refined(objective, thinned, starts_m, start_scores, report)
         report(0.9, "evaluating the best positions")
@@ -212,10 +206,80 @@ def place_transmitter(
         provenance={
             "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
             "predictor_sha256": "" if model is None else model.fingerprint,
-            "scene_settings": asdict(scene_settings),
-            "trace_settings": asdict(trace_settings),
+            "scene_settings": asdict(search.scene_settings),
+            "trace_settings": asdict(search.trace_settings),
         },
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What a search for transmitters needs: checked settings, predictor (None on a complete map) and area."""
+
+    settings: PlacementSettings
+    scene_settings: SceneSettings
+    trace_settings: TraceSettings
+    model: Predictor | None
+    area: PlacementArea
+
+    @classmethod
+    def on(
+        cls,
+        partial: PartialMap,
+        settings: PlacementSettings,
+        predictor: Predictor | str | Path | None,
+        scene_settings: SceneSettings | None,
+        trace_settings: TraceSettings | None,
+    ) -> "Search":
+        """Check the settings against a map."""
+        trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
+        scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
+        trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
+        low_m, high_m = partial.height_range_m
+        for name in ("tx_height_m", "rx_height_m"):
+            height_m = getattr(settings, name)
+            require_number(name, height_m, low_m, high_m, open_low=True)
+            require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
+        model = None
+        if not partial.is_complete:
+            model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+        area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
+        return cls(settings, scene_settings, trace_settings, model, area)
+
+    def starts(self, area: PlacementArea, count: int) -> NDArray[np.float64]:
+        """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
+        positions_m, range_m = area.positions(int(self.settings.seed)), math.inf
+        if self.settings.objective == "coverage":  # by Friis' formula
+            loss = 10.0 ** (-self.settings.threshold_db / 20.0)
+            range_m = SPEED_OF_LIGHT_M_S / self.trace_settings.frequency_hz / (4.0 * math.pi) * loss
+        seen = area.visibility(positions_m, range_m)
+        scores = np.array([placement_score(values, area.weight, self.settings) for values in seen])
+        fraction = area.weight / area.weight.sum()
+        chosen, similarity = [int(np.argmax(scores))], np.zeros(len(scores))
+        while len(chosen) < min(count, len(scores)):
+            similarity = np.maximum(similarity, 1.0 - np.abs(seen - seen[chosen[-1]]) @ fraction)
+            left = scores - SIMILARITY_PENALTY * similarity
+            left[chosen] = -math.inf
+            chosen.append(int(np.argmax(left)))
+        return positions_m[chosen]
+
+    def links(
+        self, tracer: Tracer, positions_m: NDArray[np.float64], area: PlacementArea
+    ) -> tuple[LinkPrediction, NDArray[np.bool_]]:
+        """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
+        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.trace_settings.frequency_hz)
+        features = []
+        for tx_m, kept in zip(positions_m, far, strict=True):
+            paths = tracer.paths(tx_m, area.rx_m[kept], no_progress)
+            phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
+            features.append(phi)
+        phi = LinkFeatures.concatenate(features)
+        found = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+        columns = {}
+        for column in fields(LinkPrediction):
+            columns[column.name] = np.full(far.shape, OUTAGE[column.name])
+            columns[column.name][far] = getattr(found, column.name)
+        return LinkPrediction(**columns), far
 
 
 def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDArray[np.float64]:
@@ -246,47 +310,20 @@ def _counted(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
 class _Objective:
     """The objective at transmitter positions: links are traced and predicted."""
 
+    search: Search
     tracer: Tracer
-    model: Predictor | None
-    settings: PlacementSettings
 
     def values(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
         """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
-        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.tracer.settings.frequency_hz)
-        values = np.full(far.shape, 1.0 if self.settings.objective == "coverage" else 0.0)
-        if not far.any():
-            return values
-        features = []
-        for tx_m, kept in zip(positions_m, far, strict=True):
-            paths = self.tracer.paths(tx_m, area.rx_m[kept], no_progress)
-            phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
-            features.append(phi)
-        phi = LinkFeatures.concatenate(features)
-        prediction = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
-        values[far] = link_values(prediction, self.settings)
-        return values
+        settings = self.search.settings
+        links, far = self.search.links(self.tracer, positions_m, area)
+        return np.where(far, link_values(links, settings), 1.0 if settings.objective == "coverage" else 0.0)
 
     def scores(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
         """Scores (P,) of positions (P, 3) [m]."""
-        return np.array([placement_score(each, area.weight, self.settings) for each in self.values(positions_m, area)])
-
-
-def _starts(area: PlacementArea, settings: PlacementSettings, frequency_hz: float) -> NDArray[np.float64]:
-    """Choose positions (S, 3) [m] by visibility: a score is lowered by what the position sees of what others see."""
-    positions_m, range_m = area.positions(int(settings.seed)), math.inf
-    if settings.objective == "coverage":  # by Friis' formula
-        loss = 10.0 ** (-settings.threshold_db / 20.0)
-        range_m = SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi) * loss
-    seen = area.visibility(positions_m, range_m)
-    scores = np.array([placement_score(values, area.weight, settings) for values in seen])
-    fraction = area.weight / area.weight.sum()
-    chosen, similarity = [int(np.argmax(scores))], np.zeros(len(scores))
-    while len(chosen) < min(_per_area(area, *STARTS), len(scores)):
-        similarity = np.maximum(similarity, 1.0 - np.abs(seen - seen[chosen[-1]]) @ fraction)
-        left = scores - SIMILARITY_PENALTY * similarity
-        left[chosen] = -math.inf
-        chosen.append(int(np.argmax(left)))
-    return positions_m[chosen]
+        return np.array(
+            [placement_score(each, area.weight, self.search.settings) for each in self.values(positions_m, area)]
+        )
 
 
 def _refined(

@@ -1,0 +1,197 @@
+"""Where to put several transmitters: candidates drawn together, chosen greedily, then swapped."""
+
+import itertools
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.channels.joint import JointLatents
+from sionna_partial.checks import Progress, require, require_whole
+from sionna_partial.display import Pictured
+from sionna_partial.files import temporary_folder
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.placement.area import PlacementArea
+from sionna_partial.placement.placement import RECEIVERS, Search
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.progress import reporting
+from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.tracing.trace import Tracer
+
+MOST_TRANSMITTERS = 16
+
+CANDIDATES = 24
+"""Number of positions from which the transmitters are chosen; twice as many as transmitters, if that is more."""
+
+DRAWS = 100
+_SWAPS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkPlacement(Pictured, plot="plots.network_plot:plot_network_placement"):
+    """Positions for several transmitters, and the search that found them.
+
+    Parameters
+    ----------
+    positions_m : (K, 3) float64 array
+        The transmitters [m], in the order in which they were chosen.
+    score : float
+        Mean over the receivers of the probability that at least one path gain exceeds the threshold, in [0, 1].
+    scores : (K,) float64 array
+        The same of the first, of the first two and so on, as chosen greedily, before any swap.
+    candidates_m : (C, 3) float64 array
+        Positions from which they were chosen [m].
+    rx_m : (N, 3) float64 array
+        Receivers [m].
+    weight : (N,) float64 array
+        Their weights: 1 in free cells, the probability of being indoors in unknown ones.
+    values : (N,) float64 array
+        Probability that at least one gain exceeds the threshold.
+    spacing_m : float
+        Distance between receivers [m].
+    partial : PartialMap
+    settings : PlacementSettings
+    """
+
+    positions_m: NDArray[np.float64]
+    score: float
+    scores: NDArray[np.float64]
+    candidates_m: NDArray[np.float64]
+    rx_m: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    values: NDArray[np.float64]
+    spacing_m: float
+    partial: PartialMap
+    settings: PlacementSettings
+
+
+def place_transmitters(
+    scene: PartialMap | str | Path,
+    count: int = 2,
+    *,
+    rx: ArrayLike | None = None,
+    predictor: Predictor | str | Path | None = None,
+    scene_settings: SceneSettings | None = None,
+    trace_settings: TraceSettings | None = None,
+    progress: Progress | bool | None = None,
+    **options: Any,
+) -> NetworkPlacement:
+    """Find positions for several transmitters that together cover a partly known building best.
+
+    Candidates are positions all over the free cells that see different receivers. Their links are drawn together
+    (`JointLatents`), so that two transmitters behind one unseen wall do not count as two chances. The transmitters are
+    chosen one after the other, each where it adds most, and then swapped for other candidates while that helps.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        The map, or whatever `load_map` reads.
+    count : int
+        Number of transmitters K, up to 16.
+    rx : (N, 3) array-like, optional
+        Receivers that count [m], all alike. By default those of `place_transmitter`.
+    predictor, scene_settings, trace_settings, progress
+        As for `place_transmitter`.
+    **options
+        Fields of `sionna_partial.settings.PlacementSettings`: `threshold_db` (-100 dB), `tx_height_m` and
+        `rx_height_m` (1.5 m), and `seed` (0); the objective is "coverage".
+
+    Returns
+    -------
+    NetworkPlacement
+
+    Raises
+    ------
+    MapError, PositionError, SettingsError, PredictorError, BackendError
+        As `place_transmitter`.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> home = sp.make_home(7)
+    >>> found = sp.place_transmitters(home, count=2, threshold_db=-90.0)
+    >>> found.positions_m.shape, bool(found.scores[1] >= found.scores[0])
+    ((2, 3), True)
+    """
+    require_whole("count", count, 1, MOST_TRANSMITTERS)
+    settings = PlacementSettings(**options)
+    require(settings.objective == "coverage", "objective", settings.objective, "several are placed for 'coverage'.")
+    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
+    area = search.area
+    if rx is not None:
+        rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
+        area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
+    area = area.thinned(4 * RECEIVERS)
+    with reporting(progress) as report, temporary_folder() as folder:
+        report(0.0, "building the scene")
+        tracer = Tracer(partial, folder, search.trace_settings, search.scene_settings)
+        candidates_m = search.starts(area, max(CANDIDATES, 2 * count))
+        report(0.2, "predicting candidates")
+        covered = _covered(search, tracer, area, candidates_m)
+        report(0.9, "choosing")
+        weight = area.weight / area.weight.sum()
+        chosen, scores = _greedy(covered, weight, count)
+        chosen = _swapped(covered, weight, chosen)
+        report(1.0, "done")
+    values = covered[:, chosen].any(axis=1).mean(axis=0)
+    return NetworkPlacement(
+        positions_m=candidates_m[chosen],
+        score=float(values @ weight),
+        scores=np.array(scores),
+        candidates_m=candidates_m,
+        rx_m=area.rx_m,
+        weight=area.weight,
+        values=values,
+        spacing_m=area.spacing_m,
+        partial=partial,
+        settings=settings,
+    )
+
+
+def _covered(
+    search: Search, tracer: Tracer, area: PlacementArea, candidates_m: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
+    links, far = search.links(tracer, candidates_m, area)
+    latents = JointLatents(area.partial)
+    gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [int(search.settings.seed)])[1]
+    return (gain_db > search.settings.threshold_db) | ~far
+
+
+def _score(covered: NDArray[np.bool_], weight: NDArray[np.float64], chosen: list[int]) -> float:
+    return float(covered[:, chosen].any(axis=1).mean(axis=0) @ weight)
+
+
+def _greedy(covered: NDArray[np.bool_], weight: NDArray[np.float64], count: int) -> tuple[list[int], list[float]]:
+    """Choose candidates one after the other, each that adds most."""
+    chosen: list[int] = []
+    scores = []
+    for _ in range(min(count, covered.shape[1])):
+        added = [
+            -math.inf if number in chosen else _score(covered, weight, [*chosen, number])
+            for number in range(covered.shape[1])
+        ]
+        chosen.append(int(np.argmax(added)))
+        scores.append(max(added))
+    return chosen, scores
+
+
+def _swapped(covered: NDArray[np.bool_], weight: NDArray[np.float64], chosen: list[int]) -> list[int]:
+    """Replace one transmitter by another candidate while the score rises."""
+    best = _score(covered, weight, chosen)
+    for _ in range(_SWAPS):
+        others = [
+            [*chosen[:place], number, *chosen[place + 1 :]]
+            for place, number in itertools.product(range(len(chosen)), range(covered.shape[1]))
+            if number not in chosen
+        ]
+        scores = [_score(covered, weight, each) for each in others]
+        if not scores or max(scores) <= best + 1e-12:
+            break
+        best, chosen = max(scores), others[int(np.argmax(scores))]
+    return chosen
