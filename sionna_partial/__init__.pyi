@@ -17,6 +17,7 @@ from sionna_partial.errors import SionnaPartialError as SionnaPartialError
 from sionna_partial.evaluation.evaluate import evaluate as evaluate
 from sionna_partial.export import load_coverage as load_coverage
 from sionna_partial.export import save_coverage as save_coverage
+from sionna_partial.export import save_network as save_network
 from sionna_partial.maps.bags import map_from_bag as map_from_bag
 from sionna_partial.maps.bags import map_from_occupancy as map_from_occupancy
 from sionna_partial.maps.drawings import map_from_drawing as map_from_drawing

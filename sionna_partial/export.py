@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,10 @@ from sionna_partial.coverage import ATTRIBUTES, require_coverage
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
+from sionna_partial.network import VARIABLES
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.coverage_viewer import coverage_page
+from sionna_partial.plots.network_plot import plot_network
 from sionna_partial.plots.style import figure_png
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
@@ -124,6 +126,46 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
     return coverage
 
 
+def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
+    """Write a network map as `.nc` (everything), `.tif`, `.csv` (both without `p_best`) or `.png`.
+
+    Parameters
+    ----------
+    network : xarray.Dataset
+        From `network_map`.
+    path : path-like
+        Where the file shall be. A file that is there is replaced.
+
+    Raises
+    ------
+    SettingsError
+        For a Dataset that is no network map.
+    OutputError
+        For another suffix, or if writing fails; nothing half written is left behind.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> home = sp.make_home(7)
+    >>> coverage = sp.predict_map(home, [(3.0, 4.0, 2.2), (6.0, 3.0, 1.0)], spacing_m=0.5)
+    >>> sp.save_network(sp.network_map(coverage), "network.nc")
+    """
+    picture = plot_network(network)
+    names = [name for name in VARIABLES if network[name].dims == ("y", "x")]
+    encoders: dict[str, Callable[[], bytes]] = {
+        ".nc": lambda: _encode_netcdf(network),
+        ".tif": lambda: _encode_geotiff(network, names),
+        ".csv": lambda: _encode_table(network[names].to_dataframe(dim_order=["y", "x"]).reset_index()),
+        ".png": lambda: figure_png(picture),
+    }
+    target = output_path(path)
+    if target.suffix.lower() not in encoders:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(encoders)}.")
+    content = encoders[target.suffix.lower()]()
+    with atomic_write(target) as stream:
+        stream.write(content)
+
+
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:
     # to_netcdf would do the same, but lets HDF5 stamp the root group with the time of day
     creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
@@ -140,13 +182,13 @@ def _encode_netcdf(coverage: xr.Dataset) -> bytes:
         return bytes(memory.id.get_file_image())
 
 
-def _encode_geotiff(coverage: xr.Dataset) -> bytes:
+def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES) -> bytes:
     step = float(coverage.attrs["spacing_m"])
     left, top = float(coverage["x"][0]) - step / 2, float(coverage["y"][-1]) + step / 2
     profile = {
         "driver": "GTiff",
         "dtype": "float32",
-        "count": len(TABLE_VARIABLES),
+        "count": len(names),
         "height": coverage.sizes["y"],
         "width": coverage.sizes["x"],
         "nodata": np.nan,
@@ -157,7 +199,7 @@ def _encode_geotiff(coverage: xr.Dataset) -> bytes:
     with MemoryFile() as memory:
         with memory.open(**profile) as image:
             image.update_tags(units="m", **{name: str(value) for name, value in coverage.attrs.items()})
-            for band, name in enumerate(TABLE_VARIABLES, start=1):
+            for band, name in enumerate(names, start=1):
                 image.write(np.flipud(_float_layer(coverage, name)), band)
                 image.set_band_description(band, name)
                 image.set_band_unit(band, coverage[name].attrs.get("units", ""))
@@ -179,6 +221,10 @@ def _encode_csv(coverage: xr.Dataset) -> bytes:
         table[name] = table[name].astype("UInt8").where(table["valid"])
     for name in ("observed", "valid"):
         table[name] = table[name].astype(np.uint8)
+    return _encode_table(table)
+
+
+def _encode_table(table: Any) -> bytes:
     for name in ("x", "y"):
         table.insert(0 if name == "x" else 1, f"{name}_m", table.pop(name).round(6))
     return bytes(table.to_csv(index=False, lineterminator="\n"), "utf-8")

@@ -58,7 +58,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "network_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("options", "prediction", "channels", "learning", "planning", "app"),
+    "cli": ("options", "prediction", "channels", "network", "learning", "planning", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
@@ -194,7 +194,7 @@ class TestLightImports:
         "command",
         [
             *("", "predict", "export-scene", "explore", "dataset", "train", "evaluate"),
-            *("calibrate", "place", "channels", "demo", "info"),
+            *("calibrate", "place", "channels", "network", "demo", "info"),
         ],
     )
     def test_help(self, command: str) -> None:

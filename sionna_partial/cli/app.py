@@ -13,6 +13,7 @@ from typer.core import TyperGroup
 from sionna_partial import __version__
 from sionna_partial.cli.channels import channels
 from sionna_partial.cli.learning import dataset, evaluate, train
+from sionna_partial.cli.network import network
 from sionna_partial.cli.options import TransmitterCommand
 from sionna_partial.cli.planning import calibrate, place
 from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
@@ -96,5 +97,6 @@ def _prepare(
 
 app.command(cls=TransmitterCommand)(predict)
 app.command(cls=TransmitterCommand)(channels)
+app.command(cls=TransmitterCommand)(network)
 for _command in (export_scene, explore, dataset, train, evaluate, calibrate, place, demo, info):
     app.command()(_command)

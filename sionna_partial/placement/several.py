@@ -42,7 +42,7 @@ class NetworkPlacement(Pictured, plot="plots.network_plot:plot_network_placement
     score : float
         Mean over the receivers of the probability that at least one path gain exceeds the threshold, in [0, 1].
     scores : (K,) float64 array
-        The same of the first, of the first two and so on, as chosen greedily, before any swap.
+        The same of the first, of the first two and so on, as chosen greedily before any swap, at some of the receivers.
     candidates_m : (C, 3) float64 array
         Positions from which they were chosen [m].
     rx_m : (N, 3) float64 array
@@ -126,22 +126,22 @@ def place_transmitters(
     if rx is not None:
         rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
         area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
-    area = area.thinned(4 * RECEIVERS)
+    some = area.thinned(2 * RECEIVERS)
     with reporting(progress) as report, temporary_folder() as folder:
         report(0.0, "building the scene")
         tracer = Tracer(partial, folder, search.trace_settings, search.scene_settings)
-        candidates_m = search.starts(area, max(CANDIDATES, 2 * count))
+        candidates_m = _candidates(search, some, max(CANDIDATES, 2 * count))
         report(0.2, "predicting candidates")
-        covered = _covered(search, tracer, area, candidates_m)
-        report(0.9, "choosing")
-        weight = area.weight / area.weight.sum()
+        covered = _covered(search, tracer, some, candidates_m)
+        weight = some.weight / some.weight.sum()
         chosen, scores = _greedy(covered, weight, count)
         chosen = _swapped(covered, weight, chosen)
+        report(0.9, "evaluating the best positions")
+        values = _covered(search, tracer, area, candidates_m[chosen]).any(axis=1).mean(axis=0)
         report(1.0, "done")
-    values = covered[:, chosen].any(axis=1).mean(axis=0)
     return NetworkPlacement(
         positions_m=candidates_m[chosen],
-        score=float(values @ weight),
+        score=float(values @ area.weight / area.weight.sum()),
         scores=np.array(scores),
         candidates_m=candidates_m,
         rx_m=area.rx_m,
@@ -151,6 +151,17 @@ def place_transmitters(
         partial=partial,
         settings=settings,
     )
+
+
+def _candidates(search: Search, area: PlacementArea, count: int) -> NDArray[np.float64]:
+    """Positions (C, 3) [m]: half of them good alone, the others each as far as possible from those before."""
+    chosen_m, positions_m = search.starts(area, count // 2), area.positions(int(search.settings.seed))
+    apart_m = np.linalg.norm(positions_m[:, None] - chosen_m, axis=2).min(axis=1)
+    while len(chosen_m) < count and apart_m.max() > 0.0:
+        farthest_m = positions_m[apart_m.argmax()]
+        chosen_m = np.vstack([chosen_m, farthest_m])
+        apart_m = np.minimum(apart_m, np.linalg.norm(positions_m - farthest_m, axis=1))
+    return chosen_m
 
 
 def _covered(

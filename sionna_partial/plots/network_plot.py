@@ -7,7 +7,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import PatchCollection
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Rectangle
 from matplotlib.ticker import PercentFormatter
 from numpy.typing import NDArray
 
@@ -58,6 +58,9 @@ def plot_network(network: xr.Dataset) -> Figure:
     best = network["best_server"].to_numpy()
     _draw(axes[0, 0], network, np.where(best >= 0, best, np.nan), servers, Normalize(-0.5, len(names) - 0.5))
     axes[0, 0].set_title("likeliest best server")
+    norm = Normalize(-0.5, len(names) - 0.5)
+    bar = figure.colorbar(ScalarMappable(norm, servers), ax=axes[0, 0], ticks=range(len(names)))
+    bar.ax.set_yticklabels(names)
     threshold_db = float(network.attrs["sinr_threshold_db"])
     top_bit_s = float(np.nanmax(network["rate_bit_s"])) / 1e6 if np.isfinite(network["rate_bit_s"]).any() else 1.0
     layers = (
@@ -71,8 +74,8 @@ def plot_network(network: xr.Dataset) -> Figure:
         axis.set_title(title)
     for axis in axes.flat:
         axis.label_outer()
-    handles: list[Line2D | Patch] = [Patch(color=_colour(number), label=name) for number, name in enumerate(names)]
-    legend_below(figure, [*handles, Line2D([], [], label="transmitter", markersize=12, **STAR)], columns=6)
+    seen = Line2D([], [], color="0.7", label="border of the observed part")
+    legend_below(figure, [Line2D([], [], label="transmitter", markersize=12, **STAR), seen])
     bandwidth_mhz = float(network.attrs["bandwidth_hz"]) / 1e6
     figure.suptitle(f"Network of {len(names)} transmitters, {bandwidth_mhz:g} MHz, load {network.attrs['load']:g}")
     return figure
@@ -115,7 +118,7 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=axis, label=label, shrink=0.8)
     bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
     candidate = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
-    handles: list[Line2D | Patch] = [
+    handles = [
         Line2D([], [], label="transmitter", markersize=12, **STAR),
         Line2D([], [], label="candidate", **candidate),  # type: ignore[arg-type]
     ]
@@ -139,7 +142,7 @@ def _draw(
     axis.imshow(shown, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)
     axis.imshow(shade(wall_cells(network)), extent=extent, origin="lower", zorder=3)
     unseen = ~network["observed"].to_numpy().astype(bool)
-    axis.contour(network["x"], network["y"], unseen, levels=[0.5], colors="white", linewidths=0.8)
+    axis.contour(network["x"], network["y"], unseen, levels=[0.5], colors="0.7", linewidths=0.8)
     x, y, _ = (network[name].to_numpy() for name in TX_COORDINATES)
     axis.plot(x, y, zorder=4, **STAR | {"markersize": 12})
     axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")

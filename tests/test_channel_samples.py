@@ -1,0 +1,116 @@
+"""Draws of channels: exact where all is known, as predicted where not, and alike in space."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import sionna_partial as sp
+from sionna_partial.channels.path_training import example, fit_path_model
+from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.resources import scenes_folder
+from sionna_partial.tracing.antennas import planar_array
+
+TX = (7.0, 9.8, 1.5)
+
+
+@pytest.fixture(scope="module")
+def home() -> sp.PartialMap:
+    return sp.load_map(scenes_folder() / "apartment" / "complete" / "map.yaml")
+
+
+@pytest.fixture(scope="module")
+def receivers(home: sp.PartialMap) -> np.ndarray[Any, Any]:
+    cells = np.random.default_rng(0).permutation(np.argwhere(home.state == sp.CellState.FREE))[:40]
+    rx_m = np.insert((cells[:, ::-1] + 0.5) * home.resolution_m + home.origin_m, 2, 1.5, axis=1)
+    return rx_m[home.radios_can_stand(rx_m) & (np.linalg.norm(rx_m - TX, axis=1) > 0.2)]
+
+
+@pytest.fixture(scope="module")
+def partial() -> sp.PartialMap:
+    return sp.load_map(scenes_folder() / "apartment" / "step100" / "map.yaml")
+
+
+@pytest.fixture(scope="module")
+def samples(partial: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> sp.ChannelSamples:
+    return sp.sample_channels(partial, TX, receivers, n=100)
+
+
+def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+    links = sp.trace_links(home, TX, receivers)
+    samples = sp.sample_channels(home, TX, receivers, n=3)
+    assert len(links.a) > 20
+    for draw in range(3):
+        drawn = samples.links(draw)
+        for name in ("transfer", "delay_s", "departure_rad", "arrival_rad", "path_rx", "gain_db", "link_state"):
+            np.testing.assert_array_equal(getattr(drawn, name), getattr(links, name))
+
+
+def test_draws_agree_with_the_prediction_and_with_themselves(
+    partial: sp.PartialMap, receivers: np.ndarray[Any, Any], samples: sp.ChannelSamples
+) -> None:
+    prediction = sp.Predictor.load().predict(sp.link_features(partial, sp.trace_links(partial, TX, receivers)))
+    for state, probability in zip(sp.LinkState, prediction.by_state[0], strict=True):
+        assert np.abs((samples.link_state == state).mean(axis=0) - probability).max() < 0.02
+    assert np.abs(samples.gain_db.mean(axis=0) - prediction.gain_mean_db).mean() < 1.0
+    for draw in range(0, 100, 20):
+        links = samples.links(draw)
+        power = np.bincount(links.path_rx, np.abs(links.a) ** 2, len(receivers))
+        heard = links.link_state != sp.LinkState.OUTAGE
+        np.testing.assert_allclose(10 * np.log10(power[heard]), links.gain_db[heard], atol=1e-6)
+        assert (power[~heard] == 0.0).all()
+        direct = np.bincount(links.path_rx[(links.interactions == 0).all(axis=1)], minlength=len(receivers))
+        np.testing.assert_array_equal(direct > 0, links.link_state == sp.LinkState.LOS)
+    assert np.ptp(samples.gain_db, axis=0).max() > 20.0
+
+
+def test_equal_seeds_give_equal_draws(
+    partial: sp.PartialMap, receivers: np.ndarray[Any, Any], samples: sp.ChannelSamples
+) -> None:
+    again = sp.sample_channels(partial, TX, receivers, n=100)
+    np.testing.assert_array_equal(again.drawn.transfer, samples.drawn.transfer)
+    other = sp.sample_channels(partial, TX, receivers, n=100, seed=1)
+    assert not np.array_equal(other.gain_db, samples.gain_db)
+
+
+def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+    arrays = {"tx_array": planar_array(2, 2)}
+    cfr = samples.cfr(np.arange(4) * 1e6, **arrays)
+    assert cfr.h.sizes == {"draw": 100, "link": len(receivers), "rx_ant": 1, "tx_ant": 4, "frequency": 4}
+    np.testing.assert_allclose(cfr.h[7], samples.links(7).cfr(np.arange(4) * 1e6, **arrays).h, atol=1e-8)
+    beams = samples.beam_gains(sp.dft_codebook(2, 2), **arrays)
+    assert beams.gain_db.sizes["draw"] == 100
+    assert samples.spreads().delay_spread_s.sizes == {"draw": 100, "rx": len(receivers)}
+    two = sp.sample_channels(partial, [TX, (7.0, 10.5, 1.5)], receivers[:5], n=4)
+    assert two.gain_db.shape == (4, 2, 5)
+    assert two.spreads().delay_spread_s.sizes == {"draw": 4, "tx": 2, "rx": 5}
+    assert two.cir(tx_orientation_rad=np.zeros((2, 3))).sizes["draw"] == 4
+    np.testing.assert_array_equal(two.links(3).gain_db, two.gain_db[3])
+
+
+def test_a_path_model_learns_what_survives(home: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+    maps = [*sp.explore(home, (20, 60), 0), home]
+    examples = [example(each, home, np.array([TX]), receivers) for each in maps]
+    assert examples[-1].exists.all()  # on the whole of the home every path is there
+    model = fit_path_model(examples)
+    inputs = np.concatenate([each.inputs for each in examples])
+    exists = np.concatenate([each.exists for each in examples])
+    los = inputs[:, -1] == 1.0
+    found = np.where(los, *(model.survival(inputs[:, :-1], state) for state in (sp.LinkState.LOS, sp.LinkState.NLOS)))
+    assert found[exists].mean() > found[~exists].mean() + 0.1
+    assert (np.diff(model.first) <= 24).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"n": 0}, SettingsError, "n = 0"),
+        ({"seed": -1}, SettingsError, "seed"),
+        ({"n": 10_000, "memory_gb": 0.1}, MemoryLimitError, r"10,000 draws of \d+ links take up to .* fewer draws"),
+    ],
+)
+def test_bad_input(
+    partial: sp.PartialMap, receivers: np.ndarray[Any, Any], options: dict[str, Any], error: type[Exception], match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        sp.sample_channels(partial, TX, receivers, **options)

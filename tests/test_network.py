@@ -1,0 +1,136 @@
+"""Several transmitters: their maps, networks, and where to put them."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+
+import sionna_partial as sp
+from sionna_partial.channels.joint import JointLatents
+from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.placement.several import _greedy, _score, _swapped
+
+TX = {"west": (1.0, 1.0, 1.5), "east": (4.5, 2.5, 1.5)}
+
+
+@pytest.fixture(scope="module")
+def half_seen() -> sp.PartialMap:
+    """A room of 6 x 3 m, open to the unknown in the east."""
+    state = np.pad(np.zeros((30, 55), np.uint8), ((1, 1), (1, 0)), constant_values=1)
+    return sp.PartialMap(np.pad(state, ((0, 0), (0, 15)), constant_values=2), 0.1)
+
+
+@pytest.fixture(scope="module")
+def coverage(half_seen: sp.PartialMap) -> xr.Dataset:
+    return sp.predict_map(half_seen, TX, spacing_m=0.4)
+
+
+def test_the_map_of_each_transmitter_is_that_of_a_call_of_its_own(
+    half_seen: sp.PartialMap, coverage: xr.Dataset, tmp_path: Path
+) -> None:
+    alone = sp.predict_map(half_seen, TX["east"], spacing_m=0.4)
+    for name, values in alone.data_vars.items():
+        np.testing.assert_array_equal(coverage.sel(tx="east")[name], values)
+    assert repr(coverage.sel(tx="east").radio) == repr(alone.radio)
+    sp.save_coverage(coverage, tmp_path / "two.nc")
+    assert sp.load_coverage(tmp_path / "two.nc").identical(coverage)
+    with pytest.raises(SettingsError, match=r"transmitters west, east: choose one, as by coverage.isel\(tx=0\)"):
+        sp.save_coverage(coverage, tmp_path / "two.png")
+
+
+def test_powers_of_a_complete_map_give_sinr_and_rate_by_hand() -> None:
+    room = sp.PartialMap(np.pad(np.zeros((30, 40), np.uint8), 1, constant_values=1), 0.1)
+    coverage = sp.predict_map(room, [TX["west"], (3.5, 2.5, 1.5)], spacing_m=0.5)
+    network = sp.network_map(coverage, tx_power_dbm=[10.0, 13.0], noise_figure_db=5.0, bandwidth_hz=1e8, load=0.5)
+    gain_db = coverage["gain_mean_db"].to_numpy()
+    power_mw = 10 ** ((gain_db + np.array([10.0, 13.0])[:, None, None]) / 10)
+    noise_mw = 10 ** ((-174.0 + 80.0 + 5.0) / 10)
+    sinr = power_mw.max(axis=0) / (noise_mw + 0.5 * power_mw.min(axis=0))
+    valid = coverage["valid"].all("tx").to_numpy()
+    np.testing.assert_allclose(network["sinr_mean_db"].to_numpy()[valid], 10 * np.log10(sinr[valid]), atol=1e-3)
+    np.testing.assert_allclose(network["rate_bit_s"].to_numpy()[valid], 1e8 * np.log2(1 + sinr[valid]), rtol=1e-4)
+    np.testing.assert_array_equal(network["best_server"].to_numpy()[valid], power_mw.argmax(axis=0)[valid])
+    margin_db = 10 * np.log10(power_mw.max(axis=0) / power_mw.min(axis=0))
+    np.testing.assert_allclose(network["handover_margin_db"].to_numpy()[valid], margin_db[valid], atol=1e-3)
+    assert np.isnan(network["sinr_mean_db"].to_numpy()[~valid]).all()
+
+
+def test_probabilities_agree_with_the_maps(coverage: xr.Dataset) -> None:
+    network = sp.network_map(coverage, n=200)
+    outage, valid = coverage["p_outage"], coverage["valid"].all("tx")
+    low, high = outage.prod("tx"), outage.min("tx")
+    all_out = network["p_all_outage"]
+    assert bool(((all_out <= high + 0.02) | ~valid).all())
+    assert bool(((all_out >= np.minimum(low, high) - 0.1) | ~valid).all())
+    total = network["p_best"].sum("tx") + all_out
+    np.testing.assert_allclose(total.to_numpy()[valid], 1.0, atol=1e-5)
+    again = sp.network_map(coverage, n=200)
+    assert network.identical(again)
+
+
+def test_links_through_the_same_unknown_cells_are_alike() -> None:
+    partial = sp.PartialMap(np.full((60, 60), 2, np.uint8), 0.1)
+    tx_m = np.array([[1.0, 1.0, 1.5]] * 3)
+    rx_m = np.array([[5.0, 5.0, 1.5], [5.0, 4.8, 1.5], [1.0, 5.0, 1.5]])
+    correlation = JointLatents(partial).correlation(tx_m, rx_m)
+    assert correlation[0, 1] > 0.7 > 0.5 > correlation[0, 2]
+    quantiles = JointLatents(partial).quantiles(tx_m, rx_m, 100, [0])
+    assert (np.sort(quantiles, axis=0) * 100 // 1 == np.arange(100)[:, None]).all()  # evenly spread
+
+
+def test_several_are_placed_as_well_as_by_exhaustive_search(half_seen: sp.PartialMap) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        covered = rng.random((20, 9, 40)) < rng.random((1, 9, 40)) ** 3
+        weight = np.full(40, 1 / 40)
+        found = _score(covered, weight, _swapped(covered, weight, _greedy(covered, weight, 2)[0]))
+        best = max(_score(covered, weight, [*pair]) for pair in itertools.combinations(range(9), 2))
+        assert found >= 0.99 * best
+    placed = sp.place_transmitters(half_seen, 2, threshold_db=-75.0)
+    assert (half_seen.state_at(placed.positions_m) == sp.CellState.FREE).all()
+    assert placed.scores[1] >= placed.scores[0]
+    own = sp.place_transmitters(half_seen, 1, rx=[(1.0, 1.0, 1.5)], threshold_db=-75.0)
+    assert own.score == 1.0
+    assert own.rx_m.shape == (1, 3)
+    assert len(sp.plot_network_placement(placed).axes) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"tx_power_dbm": [1.0, 2.0, 3.0]}, "one for each of the 2 transmitters"),
+        ({"tx_power_dbm": "much"}, "tx_power_dbm"),
+        ({"bandwidth_hz": 0.0}, "bandwidth_hz"),
+        ({"noise_figure_db": -1.0}, "noise_figure_db"),
+        ({"load": 1.5}, "load"),
+        ({"n": 1}, "n = 1"),
+        ({"seed": -1}, "seed"),
+        ({"sinr_threshold_db": float("nan")}, "sinr_threshold_db"),
+    ],
+)
+def test_bad_settings_of_a_network(coverage: xr.Dataset, options: dict[str, Any], match: str) -> None:
+    with pytest.raises(SettingsError, match=match):
+        sp.network_map(coverage, **options)
+
+
+def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
+    network = sp.network_map(coverage)
+    for suffix in (".nc", ".tif", ".csv", ".png"):
+        sp.save_network(network, tmp_path / f"network{suffix}")
+        assert (tmp_path / f"network{suffix}").stat().st_size > 1000
+    assert xr.load_dataset(tmp_path / "network.nc").sizes["tx"] == 2
+    with pytest.raises(OutputError, match=r"\.txt"):
+        sp.save_network(network, tmp_path / "network.txt")
+    with pytest.raises(SettingsError, match="no dimension tx"):
+        sp.network_map(coverage.isel(tx=0))
+    with pytest.raises(SettingsError, match="network_map"):
+        sp.plot_network(coverage)
+    with pytest.raises(SettingsError, match="place_transmitters"):
+        sp.plot_network_placement(network)  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match="count"):
+        sp.place_transmitters(sp.make_home(7), 0)
+    with pytest.raises(SettingsError, match="coverage"):
+        sp.place_transmitters(sp.make_home(7), 2, objective="percentile")
