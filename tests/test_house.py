@@ -99,6 +99,7 @@ NOT_IMPORTED = {
     "dask": "what distributed is the scheduler of; the cluster's commands are `dask scheduler` and `dask worker`",
     "karellen-llvm-core": "a shared library, which sionna_partial.llvm finds and loads",
     "tensorflow-cpu": "the backend that keras imports",
+    "zarr": "what xarray writes and reads .zarr with",
 }
 """Declared dependencies that no module imports, and why they are needed."""
 
