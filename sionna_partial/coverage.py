@@ -4,7 +4,7 @@ import itertools
 import json
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from sionna_partial.checks import (
     Progress,
@@ -34,6 +35,7 @@ from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.localisation import TransmitterPosterior, likely_region, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
@@ -71,6 +73,12 @@ LARGE_OFFSET_DB = 15.0
 
 MOST_MEASUREMENTS = 20_000
 """Number of measurements that are held against predictions."""
+
+POSITIONS = 8
+"""Number of positions of an unknown transmitter over which coverage is averaged."""
+
+_LOCATING = 0.3
+"""Fraction of the progress that finding a transmitter takes."""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
 
@@ -129,7 +137,7 @@ class _Receivers:
 
 def predict_map(
     scene: PartialMap | str | Path,
-    tx: ArrayLike,
+    tx: ArrayLike | None = None,
     *,
     rx_height_m: float = DEFAULT_HEIGHT_M,
     spacing_m: float = 0.15,
@@ -154,12 +162,16 @@ def predict_map(
     distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
     variables are NaN and link states 255.
 
+    Without `tx`, the position of the transmitter is found from measurements: `p_transmitter` is its posterior, and
+    probabilities and gains are averaged over 8 positions drawn from it.
+
     Parameters
     ----------
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
-    tx : (3,) or (2,) array-like
-        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space.
+    tx : (3,) or (2,) array-like, or None
+        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. None if it is not known:
+        then `measurements` are of one transmitter, 1.5 m high unless they have its z.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
@@ -184,6 +196,9 @@ def predict_map(
     -------
     xarray.Dataset
         On (y, x), in metres: the variables of `ATTRIBUTES`, and the settings, versions and predictor in attributes.
+        Without `tx` also `p_transmitter` on (tx_y, tx_x), the probability of each cell; the attribute `transmitter_m`
+        is then the position from which the expected distance is smallest, `transmitter_std_m` the root mean square
+        distance from it, and features are those of the drawn position next to it.
 
     Raises
     ------
@@ -219,49 +234,43 @@ def predict_map(
         settings_or_default("scene_settings", scene_settings, SceneSettings),
     )
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    tx_m = _transmitter(partial, tx)
+    unknown = tx is None and measurements is not None
+    tx_m = np.empty((0, 3)) if unknown else _position(partial, tx)[None]
     grid = _receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
     at_once = _receivers_at_once(partial, grid, memory_gb)
-    complete = bool(is_enclosed(partial, tx_m[None], tx_m[None])[0])
+    complete = partial.is_complete and bool(is_enclosed(partial, tx_m, tx_m).all())
     model = None
     if predictor is not None or not complete:
         loaded = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    columns: list[dict[str, NDArray[Any]]] = []
     measured = None if measurements is None else _measured(partial, tx_m, measurements, trace_settings.frequency_hz)
     with reporting(progress) as report, temporary_folder() as work:
         report(0.0, "building the scene")
-        links = _Links(partial, tx_m, Tracer(partial, work, trace_settings, scene_settings), model)
-        told = None if measured is None else _assimilated(links, measured, at_once)
-        for start in range(0, len(grid.rx_m), at_once):
-
-            def within(fraction: float, message: str, start: int = start) -> None:
-                report(min(0.99, (start + fraction * at_once) / len(grid.rx_m)), message)
-
-            rx_m = grid.rx_m[start : start + at_once]
-            phi, prediction = links.predict(rx_m, within)
-            if told is not None:
-                prediction = told.update(rx_m, prediction)
-            columns.append(_columns(phi, prediction, links.p_indoor(rx_m, phi), anywhere=receivers == "anywhere"))
+        links = _Links(partial, Tracer(partial, work, trace_settings, scene_settings), model, at_once)
+        posterior = _located(links, measured, report) if unknown and measured is not None else None
+        source = _transmitter_of(links, posterior or tx_m[0], measured)
+        if posterior is not None:
+            grid = _receivers(partial, source.tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
+        columns = [
+            _columns(*block, anywhere=receivers == "anywhere")
+            for block in _predictions(links, source, grid.rx_m, report)
+        ]
         report(1.0, "done")
     variables = _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
     variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
     attributes = {
         **_provenance(partial, model, scene_settings, trace_settings),
-        "transmitter_m": tx_m,
+        "transmitter_m": source.position_m,
         "rx_height_m": float(rx_height_m),
         "spacing_m": float(spacing_m),
         "receivers": receivers,
     }
-    if measured is not None and told is not None:
-        attributes |= {
-            "measured_links": len(measured),
-            "measured_noise_db": told.noise_db,
-            "measured_offset_db": told.offset_db,
-        }
-    return _label(grid, variables, attributes)
+    if measured is not None:
+        attributes |= _of_measurements(measured, source)
+    coverage = _label(grid, variables, attributes)
+    return coverage if posterior is None else _with_posterior(coverage, posterior)
 
 
 def require_coverage(coverage: xr.Dataset) -> None:
@@ -352,8 +361,7 @@ class CoverageAccessor:
         rows, columns = self._coverage["valid"].shape
         attributes = self._coverage.attrs
         grid = f"{columns} x {rows} receivers, {attributes['spacing_m']:g} m apart"
-        tx = ", ".join(f"{each:.2f}" for each in attributes["transmitter_m"])
-        return f"<coverage: {grid}, transmitter at ({tx}) m, {attributes['frequency_hz'] / 1e9:g} GHz>"
+        return f"<coverage: {grid}, {transmitter_text(self._coverage)}, {attributes['frequency_hz'] / 1e9:g} GHz>"
 
     def _repr_html_(self) -> str:
         return picture_html(repr(self), _PLOT, self._coverage)
@@ -367,7 +375,9 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     return clear
 
 
-def _transmitter(partial: PartialMap, tx: ArrayLike) -> Floats:
+def _position(partial: PartialMap, tx: ArrayLike | None) -> Floats:
+    if tx is None:
+        raise PositionError("tx = None: give x, y and z in metres, or measurements that its position is found from.")
     tx = real_array("tx", tx, PositionError, "give x, y and z in metres.")
     tx_m = partial.require_positions("tx", np.append(tx, DEFAULT_HEIGHT_M) if tx.shape == (2,) else tx)
     if tx_m.ndim != 1:
@@ -395,7 +405,7 @@ def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_setti
 def _receivers(
     partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
 ) -> _Receivers:
-    """Return the receivers, those that are too near the transmitter or a wall masked."""
+    """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
     low_m, high_m = partial.height_range_m
     require_number("rx_height_m", rx_height_m, low_m, high_m, open_low=True)
     require(rx_height_m < high_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {high_m:g} m.")
@@ -403,7 +413,9 @@ def _receivers(
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
-    far = np.linalg.norm(points - tx_m, axis=-1) >= limit_m
+    far = np.ones(cell_state.shape, dtype=bool)
+    for each_m in tx_m:
+        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
     valid = far & clear_of_walls(partial, points)
     if not far.any() and limit_m > SHORTEST_M:
         raise PositionError(
@@ -449,20 +461,34 @@ def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: fl
 
 @dataclass(frozen=True)
 class _Links:
-    """Links of one transmitter, traced on the known part of the map and predicted."""
+    """Links that are traced on the known part of the map and predicted, so many at once."""
 
     partial: PartialMap
-    tx_m: Floats
     tracer: Tracer
     model: Predictor | None
+    at_once: int
 
-    def predict(self, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
+    @property
+    def nearest_m(self) -> float:
+        """Shortest distance of a link [m]."""
+        return nearest_m(self.tracer.settings.frequency_hz)
+
+    def predict(self, tx_m: Floats, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
         """Trace and predict the links to receivers (N, 3) [m] that are indoors; without a model the trace predicts."""
         context = self.model is not None and self.model.settings.networks != "paper"
-        phi = features_of_paths(
-            self.partial, self.tx_m, rx_m, self.tracer.paths(self.tx_m, rx_m, report), context=context
-        )
+        paths = self.tracer.paths(tx_m, rx_m, report)
+        phi = features_of_paths(self.partial, tx_m, rx_m, paths, context=context)
         return phi, LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+
+    def predict_all(self, tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:
+        """Predict the links to any number of receivers (N, 3) [m], and the probability that each is indoors."""
+        predictions, p_indoor = [], []
+        for start in range(0, len(rx_m), self.at_once):
+            block_m = rx_m[start : start + self.at_once]
+            phi, prediction = self.predict(tx_m, block_m, no_progress)
+            predictions.append(prediction)
+            p_indoor.append(self.p_indoor(block_m, phi))
+        return LinkPrediction.concatenate(predictions), np.concatenate(p_indoor)
 
     def p_indoor(self, rx_m: Floats, phi: LinkFeatures) -> Floats:
         """Probability that each receiver (N,) is indoors."""
@@ -470,25 +496,50 @@ class _Links:
         return np.where(free, 1.0, 0.0 if self.model is None else self.model.predict_indoor(phi))
 
 
+@dataclass(frozen=True)
+class _Transmitter:
+    """Positions (T, 3) [m] with weights (T,), what measurements tell of the links of each, and the best estimate."""
+
+    tx_m: Floats
+    weights: Floats
+    told: Sequence[Assimilation]
+    position_m: Floats
+
+
+def _predictions(
+    links: _Links, transmitter: _Transmitter, rx_m: Floats, report: Progress
+) -> Iterator[tuple[LinkFeatures, LinkPrediction, Floats]]:
+    """Yield features, prediction and P(indoor) of blocks of receivers (N, 3) [m], averaged over the positions."""
+    tx_m, begin = transmitter.tx_m, _LOCATING * (len(transmitter.tx_m) > 1)
+    nearest = int(np.linalg.norm(tx_m - transmitter.position_m, axis=1).argmin())
+    for start in range(0, len(rx_m), links.at_once):
+        block_m, found = rx_m[start : start + links.at_once], []
+        for index, each_m in enumerate(tx_m):
+
+            def within(fraction: float, message: str, start: int = start, index: int = index) -> None:
+                done = (start + (index + fraction) / len(tx_m) * links.at_once) / len(rx_m)
+                report(min(0.99, begin + (1.0 - begin) * done), message)
+
+            phi, prediction = links.predict(each_m, block_m, within)
+            if transmitter.told:
+                prediction = transmitter.told[index].update(block_m, prediction)
+            found.append((phi, prediction, links.p_indoor(block_m, phi)))
+        mixture = LinkPrediction.mixture([prediction for _, prediction, _ in found], transmitter.weights)
+        yield found[nearest][0], mixture, transmitter.weights @ [indoor for _, _, indoor in found]
+
+
 def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz: float) -> Measurements:
-    """Read the measurements of this transmitter whose receivers are at places where links can be predicted."""
+    """Read the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
     measured = measurements_of(measurements)
-    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
-    if not (apart_m <= SAME_TX_M).any():
-        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
-        raise MeasurementError(
-            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
-            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
-            "the transmitter that is predicted, in the frame of the map."
-        )
-    measured = measured.take(apart_m <= SAME_TX_M)
+    measured = _of_transmitter(measured, tx_m[0]) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
             f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
             "those that are near each other."
         )
-    usable = np.linalg.norm(measured.rx - tx_m, axis=1) >= nearest_m(frequency_hz)
-    usable &= clear_of_walls(partial, measured.rx)
+    usable = clear_of_walls(partial, measured.rx)
+    for each_m in tx_m:
+        usable &= np.linalg.norm(measured.rx - each_m, axis=1) >= nearest_m(frequency_hz)
     if not usable.any():
         raise MeasurementError(
             f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
@@ -502,19 +553,97 @@ def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz
     return measured
 
 
-def _assimilated(links: _Links, measured: Measurements, at_once: int) -> Assimilation:
-    """Hold what was measured against what is predicted there."""
-    blocks = [slice(start, start + at_once) for start in range(0, len(measured), at_once)]
-    predictions = [links.predict(measured.rx[block], no_progress)[1] for block in blocks]
-    prior, frequency_hz = LinkPrediction.concatenate(predictions), links.tracer.settings.frequency_hz
-    told = Assimilation(links.partial, links.tx_m, measured, prior, frequency_hz)
-    if abs(told.offset_db) > LARGE_OFFSET_DB:
+def _of_transmitter(measured: Measurements, tx_m: Floats) -> Measurements:
+    """Return the measurements of a transmitter (3,) [m]."""
+    measured.require_transmitters()
+    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
+    if not (apart_m <= SAME_TX_M).any():
+        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
+        raise MeasurementError(
+            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
+            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
+            "the transmitter that is predicted, in the frame of the map."
+        )
+    return measured.take(apart_m <= SAME_TX_M)
+
+
+def _of_unknown(measured: Measurements) -> Measurements:
+    """Return the measurements of a transmitter at an unknown position."""
+    known = measured.tx_known
+    if not known.all():
+        return measured.take(~known)
+    if len(measured) and np.linalg.norm(measured.tx - measured.tx[0], axis=1).max() > SAME_TX_M:
+        raise MeasurementError("tx = None, and measurements are of several transmitters: give those of one, or its tx.")
+    _log.warning("tx = None: the position of the transmitter in the measurements is not used")
+    return measured
+
+
+def _located(links: _Links, measured: Measurements, report: Progress) -> TransmitterPosterior:
+    """Find a transmitter from what was measured of it."""
+    places = cKDTree(measured.rx)
+
+    def allowed(points_m: Floats) -> Bools:
+        return clear_of_walls(links.partial, points_m) & (places.query(points_m)[0] >= links.nearest_m)
+
+    def within(fraction: float, message: str) -> None:
+        report(_LOCATING * fraction, message)
+
+    return locate_transmitter(links.partial, measured, allowed, links.predict_all, within)
+
+
+def _transmitter_of(links: _Links, where: Floats | TransmitterPosterior, measured: Measurements | None) -> _Transmitter:
+    """Hold what was measured against what is predicted there, for a position (3,) [m] or for several of a posterior."""
+    if isinstance(where, TransmitterPosterior):
+        (tx_m, weights), position_m = where.draw(POSITIONS), where.position_m
+    else:
+        tx_m, weights, position_m = where[None], np.ones(1), where
+    told = []
+    if measured is not None:
+        for each_m in tx_m:
+            prior, _ = links.predict_all(each_m, measured.rx)
+            told.append(Assimilation(links.partial, each_m, measured, prior, links.tracer.settings.frequency_hz))
+    return _Transmitter(tx_m, weights, told, position_m)
+
+
+def _of_measurements(measured: Measurements, source: _Transmitter) -> dict[str, Any]:
+    """Return attributes of the measurements; a large offset is logged."""
+    noise_db, offset_db = source.weights @ [(each.noise_db, each.offset_db) for each in source.told]
+    if abs(offset_db) > LARGE_OFFSET_DB:
         _log.warning(
             "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
-            abs(told.offset_db),
-            "above" if told.offset_db > 0 else "below",
+            abs(offset_db),
+            "above" if offset_db > 0 else "below",
         )
-    return told
+    return {
+        "measured_links": len(measured),
+        "measured_noise_db": float(noise_db),
+        "measured_offset_db": float(offset_db),
+    }
+
+
+def _with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
+    """Add where the transmitter may be."""
+    axes = {
+        f"tx_{name}": (f"tx_{name}", values, {"long_name": f"{name} of the transmitter", "units": "m"})
+        for name, values in (("x", posterior.x_m), ("y", posterior.y_m))
+    }
+    attributes = {"long_name": "probability of the transmitter's position", "units": "1"}
+    coverage = coverage.assign_coords(axes)
+    coverage["p_transmitter"] = ("tx_y", "tx_x"), posterior.probability, attributes
+    return coverage.assign_attrs(transmitter_std_m=posterior.std_m)
+
+
+def transmitter_region(coverage: xr.Dataset) -> Bools | None:
+    """Return the cells (tx_y, tx_x) with 90 % of an unknown transmitter's posterior; None if it is known."""
+    return likely_region(coverage["p_transmitter"].to_numpy()) if "p_transmitter" in coverage else None
+
+
+def transmitter_text(coverage: xr.Dataset) -> str:
+    """Say where the transmitter is."""
+    position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
+    if "p_transmitter" in coverage:
+        return f"transmitter near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"
+    return f"transmitter at ({position}) m"
 
 
 def _columns(

@@ -74,7 +74,7 @@ _LEAST_TOLD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class _Walks:
+class Walks:
     """Lengths of walks from P points to everywhere on a map: walls block them, unknown cells make them longer."""
 
     partial: PartialMap
@@ -163,7 +163,7 @@ class Assimilation:
         rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
         seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
         heard = gain_db > measured.sensitivity_db
-        first, place, count = _places(rx_m, heard)
+        first, place, count = places_of(rx_m, heard, MOST_POINTS)
         heard = heard[first]
 
         def averaged(values: Floats) -> Floats:
@@ -173,7 +173,7 @@ class Assimilation:
         residual = averaged(np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db) / scale_db
         shadow = averaged(prior.gain_mean_db - self._free_space_db(rx_m)) / scale_db
         longest_m = _REACHES * max(UNSEEN_REACH_M, *(kind.seen_reach_m for kind in KINDS))
-        self._walks = _Walks(partial, rx_m[first], longest_m)
+        self._walks = Walks(partial, rx_m[first], longest_m)
         noises = {noise: noise / np.sqrt(count) for noise in NOISES_DB}
         if std_db is not None:
             noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
@@ -238,16 +238,16 @@ class Assimilation:
         return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
-def _places(rx_m: Floats, heard: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def places_of(rx_m: Floats, heard: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """First measurement of each place, place of each measurement (M,), and number of measurements of each place.
 
-    Places are as small as leaves no more than `MOST_POINTS` of them.
+    Places are as small as leaves no more than `most` of them.
     """
     edge_m = 0.01
     while True:
         keys = np.column_stack([np.floor(rx_m / edge_m), heard])
         _, first, place, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
-        if len(first) <= MOST_POINTS:
+        if len(first) <= most:
             return first, place.ravel(), count
         edge_m *= 1.5
 

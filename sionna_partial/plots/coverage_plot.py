@@ -18,7 +18,12 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.checks import require, require_choice
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage
+from sionna_partial.coverage import (
+    WALL_PARTS,
+    probability_above,
+    require_coverage,
+    transmitter_text,
+)
 from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade, sheet_columns
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
@@ -172,8 +177,7 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 
 def headline(what: str, coverage: xr.Dataset) -> str:
     """Title that names the transmitter's position and the frequency."""
-    x, y, z = coverage.attrs["transmitter_m"]
-    return f"{what}: transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
+    return f"{what}: {transmitter_text(coverage)}, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:
