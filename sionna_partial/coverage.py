@@ -35,7 +35,7 @@ from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
-from sionna_partial.measurements.localisation import TransmitterPosterior, likely_region, locate_transmitter
+from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
@@ -631,11 +631,6 @@ def _with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr
     coverage = coverage.assign_coords(axes)
     coverage["p_transmitter"] = ("tx_y", "tx_x"), posterior.probability, attributes
     return coverage.assign_attrs(transmitter_std_m=posterior.std_m)
-
-
-def transmitter_region(coverage: xr.Dataset) -> Bools | None:
-    """Return the cells (tx_y, tx_x) with 90 % of an unknown transmitter's posterior; None if it is known."""
-    return likely_region(coverage["p_transmitter"].to_numpy()) if "p_transmitter" in coverage else None
 
 
 def transmitter_text(coverage: xr.Dataset) -> str:

@@ -40,7 +40,7 @@ ROOMS = {
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
-    "measurements": ("measurements", "recordings", "assimilation"),
+    "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("coverage",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),

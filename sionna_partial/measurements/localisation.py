@@ -21,20 +21,23 @@ Bools = NDArray[np.bool_]
 Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats]]
 """Links from a position (3,) to others (N, 3) [m] -> their prediction, and P(indoor) of the others (N,)."""
 
-MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 6.0
+MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 """Number of positions that are compared, least distance between them, and how far they go beyond free cells [m]."""
 
 MOST_PLACES = 25
 """Number of places with measurements from which links are traced."""
 
-REACH_M = 2.0
+REACH_M = 1.5
 """Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 %."""
 
-TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 2.0, 0.05, 90.0
+TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
 
 OFFSETS_DB, OFFSET_CHANCE, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 0.01, 40.0
 """Offsets that powers may have in common, how likely such an offset is, and its standard deviation [dB]."""
+
+OUTDOOR = 1e-6
+"""Weight of positions that are outdoors for certain."""
 
 REGION = 0.9
 """Probability of the region that `likely_region` returns."""
@@ -100,6 +103,8 @@ def locate_transmitter(
     heard = measured.gain_db > measured.sensitivity_db
     some = measured.take(places_of(measured.rx, heard, MOST_PLACES)[0])
     possible = np.flatnonzero(allowed(points_m))
+    if not len(possible):
+        raise PositionError("a transmitter can be nowhere: no position is away from walls and measured places.")
     partial.require_positions("tx", points_m[possible])
     log_chance = np.zeros((len(OFFSETS_DB), len(possible)))
     p_indoor = np.zeros(len(possible))
@@ -108,12 +113,9 @@ def locate_transmitter(
         prediction, indoor = predict(place_m, points_m[possible])
         p_indoor += indoor / len(some)
         log_chance += _log_likelihood(prediction, some.take(np.array([index])))
-    if not p_indoor.any():
-        raise PositionError("the transmitter can be nowhere on the map: give a map with more free cells.")
     walks_m = Walks(partial, some.rx, 10.0 * REACH_M).lengths_m(some.rx)
     log_chance *= len(some) / np.exp(-walks_m / REACH_M).sum()
-    with np.errstate(divide="ignore"):
-        log_chance = logsumexp(log_chance + _log_offset_chance()[:, None], axis=0) + np.log(p_indoor)
+    log_chance = logsumexp(log_chance + _log_offset_chance()[:, None], axis=0) + np.log(np.maximum(p_indoor, OUTDOOR))
     posterior.probability.ravel()[possible] = np.exp(log_chance - logsumexp(log_chance))
     return posterior
 
