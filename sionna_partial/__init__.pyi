@@ -28,6 +28,7 @@ from sionna_partial.maps.map_files import map_from_slam as map_from_slam
 from sionna_partial.maps.map_files import save_map as save_map
 from sionna_partial.maps.mesh.points import map_from_points as map_from_points
 from sionna_partial.maps.partial_map import PartialMap as PartialMap
+from sionna_partial.measurements.assimilation import Assimilation as Assimilation
 from sionna_partial.measurements.measurements import Measurements as Measurements
 from sionna_partial.measurements.recordings import measurements_from_bag as measurements_from_bag
 from sionna_partial.measurements.recordings import poses_from_bag as poses_from_bag

@@ -4,7 +4,7 @@ import itertools
 import json
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from sionna_partial.checks import (
     Progress,
@@ -34,6 +35,7 @@ from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
@@ -78,6 +80,12 @@ LARGE_OFFSET_DB = 15.0
 
 MOST_MEASUREMENTS = 20_000
 """Number of measurements that are held against predictions."""
+
+POSITIONS = 8
+"""Number of positions of an unknown transmitter over which coverage is averaged."""
+
+_LOCATING = 0.3
+"""Fraction of the progress that finding a transmitter takes."""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
 
@@ -136,7 +144,7 @@ class _Receivers:
 
 def predict_map(
     scene: PartialMap | str | Path,
-    tx: ArrayLike | Mapping[str, ArrayLike],
+    tx: ArrayLike | Mapping[str, ArrayLike] | None = None,
     *,
     rx_height_m: float = DEFAULT_HEIGHT_M,
     spacing_m: float = 0.15,
@@ -161,13 +169,17 @@ def predict_map(
     distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
     variables are NaN and link states 255.
 
+    Without `tx`, the position of the transmitter is found from measurements: `p_transmitter` is its posterior, and
+    probabilities and gains are averaged over 8 positions drawn from it.
+
     Parameters
     ----------
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
-    tx : (3,) or (2,) array-like, (T, 3) array-like, or mapping of names to positions
+    tx : (3,) or (2,) array-like, (T, 3) array-like, mapping of names to positions, or None
         Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx0",
-        "tx1" and so on, or as in the mapping.
+        "tx1" and so on, or as in the mapping. None if it is not known: then `measurements` are of one transmitter,
+        1.5 m high unless they have its z.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
@@ -193,6 +205,9 @@ def predict_map(
     xarray.Dataset
         On (y, x), in metres: the variables of `ATTRIBUTES`, and the settings, versions and predictor in attributes.
         With several transmitters what depends on them is on (tx, y, x); ``.sel(tx=name)`` is the map of one.
+        Without `tx` also `p_transmitter` on (tx_y, tx_x), the probability of each cell; the attribute `transmitter_m`
+        is then the position from which the expected distance is smallest, `transmitter_std_m` the root mean square
+        distance from it, and features are those of the drawn position next to it.
 
     Raises
     ------
@@ -228,43 +243,49 @@ def predict_map(
         settings_or_default("scene_settings", scene_settings, SceneSettings),
     )
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    names, positions_m = _transmitters(partial, tx)
-    grids = [_receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz) for tx_m in positions_m]
+    unknown = tx is None and measurements is not None
+    names, positions_m = (None, np.empty((0, 3))) if unknown else _transmitters(partial, tx)
+    sources_m = [positions_m] if unknown else [each[None] for each in positions_m]
+    grids = [_receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz) for tx_m in sources_m]
     at_once = _receivers_at_once(partial, grids[0], memory_gb)
-    complete = bool(is_enclosed(partial, positions_m[:1], positions_m[:1])[0])
+    complete = partial.is_complete and bool(is_enclosed(partial, positions_m, positions_m).all())
     model = None
     if predictor is not None or not complete:
         loaded = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    measured = _measured_of_each(partial, positions_m, measurements, trace_settings.frequency_hz)
+    measured = _measured_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
     provenance = _provenance(partial, model, scene_settings, trace_settings)
     maps = []
     with reporting(progress) as report, temporary_folder() as work:
         report(0.0, "building the scene")
-        tracer = Tracer(partial, work, trace_settings, scene_settings)
-        for number, (tx_m, grid) in enumerate(zip(positions_m, grids, strict=True)):
+        links = _Links(partial, Tracer(partial, work, trace_settings, scene_settings), model, at_once)
+        for number, (tx_m, grid, known) in enumerate(zip(sources_m, grids, measured, strict=True)):
             part = part_of(report, number / len(grids), (number + 1) / len(grids))
-            links = _Links(partial, tx_m, tracer, model)
-            known = measured[number]
-            told = None if known is None else _assimilated(links, known, at_once)
-            variables = _predicted(links, grid, at_once, told, part, anywhere=receivers == "anywhere")
+            posterior = _located(links, known, part) if unknown and known is not None else None
+            source = _transmitter_of(links, posterior or tx_m[0], known)
+            if posterior is not None:
+                grid = _receivers(partial, source.tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
+            columns = [
+                _columns(*block, anywhere=receivers == "anywhere")
+                for block in _predictions(links, source, grid.rx_m, part)
+            ]
+            variables = _variables(
+                grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
+            )
             variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
             attributes = {
                 **provenance,
-                "transmitter_m": tx_m,
+                "transmitter_m": source.position_m,
                 "rx_height_m": float(rx_height_m),
                 "spacing_m": float(spacing_m),
                 "receivers": receivers,
             }
-            if known is not None and told is not None:
-                attributes |= {
-                    "measured_links": len(known),
-                    "measured_noise_db": told.noise_db,
-                    "measured_offset_db": told.offset_db,
-                }
-            maps.append(_label(grid, variables, attributes))
+            if known is not None:
+                attributes |= _of_measurements(known, source)
+            coverage = _label(grid, variables, attributes)
+            maps.append(coverage if posterior is None else _with_posterior(coverage, posterior))
         report(1.0, "done")
     return maps[0] if names is None else _together(maps, names)
 
@@ -363,8 +384,7 @@ class CoverageAccessor:
         rows, columns = coverage["valid"].shape
         attributes = coverage.attrs
         grid = f"{columns} x {rows} receivers, {attributes['spacing_m']:g} m apart"
-        tx = ", ".join(f"{each:.2f}" for each in attributes["transmitter_m"])
-        return f"<coverage: {grid}, transmitter at ({tx}) m, {attributes['frequency_hz'] / 1e9:g} GHz>"
+        return f"<coverage: {grid}, {transmitter_text(coverage)}, {attributes['frequency_hz'] / 1e9:g} GHz>"
 
     def _repr_html_(self) -> str:
         return picture_html(repr(self), _PLOT, self._coverage)
@@ -378,8 +398,12 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     return clear
 
 
-def _transmitters(partial: PartialMap, tx: ArrayLike | Mapping[str, ArrayLike]) -> tuple[list[str] | None, Floats]:
+def _transmitters(
+    partial: PartialMap, tx: ArrayLike | Mapping[str, ArrayLike] | None
+) -> tuple[list[str] | None, Floats]:
     """Names of several transmitters, None for one, and positions (T, 3) [m]."""
+    if tx is None:
+        raise PositionError("tx = None: give x, y and z in metres, or measurements that its position is found from.")
     positions = list(tx.values()) if isinstance(tx, Mapping) else tx
     positions = real_array("tx", positions, PositionError, "give x, y and z in metres, the same for all transmitters.")
     if positions.shape[-1:] == (2,):
@@ -409,7 +433,7 @@ def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_setti
 def _receivers(
     partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
 ) -> _Receivers:
-    """Return the receivers, those that are too near the transmitter or a wall masked."""
+    """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
     low_m, high_m = partial.height_range_m
     require_number("rx_height_m", rx_height_m, low_m, high_m, open_low=True)
     require(rx_height_m < high_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {high_m:g} m.")
@@ -417,7 +441,9 @@ def _receivers(
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
-    far = np.linalg.norm(points - tx_m, axis=-1) >= limit_m
+    far = np.ones(cell_state.shape, dtype=bool)
+    for each_m in tx_m:
+        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
     valid = far & clear_of_walls(partial, points)
     if not far.any() and limit_m > SHORTEST_M:
         raise PositionError(
@@ -463,20 +489,34 @@ def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: fl
 
 @dataclass(frozen=True)
 class _Links:
-    """Links of one transmitter, traced on the known part of the map and predicted."""
+    """Links that are traced on the known part of the map and predicted, so many at once."""
 
     partial: PartialMap
-    tx_m: Floats
     tracer: Tracer
     model: Predictor | None
+    at_once: int
 
-    def predict(self, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
+    @property
+    def nearest_m(self) -> float:
+        """Shortest distance of a link [m]."""
+        return nearest_m(self.tracer.settings.frequency_hz)
+
+    def predict(self, tx_m: Floats, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
         """Trace and predict the links to receivers (N, 3) [m] that are indoors; without a model the trace predicts."""
         context = self.model is not None and self.model.settings.networks != "paper"
-        phi = features_of_paths(
-            self.partial, self.tx_m, rx_m, self.tracer.paths(self.tx_m, rx_m, report), context=context
-        )
+        paths = self.tracer.paths(tx_m, rx_m, report)
+        phi = features_of_paths(self.partial, tx_m, rx_m, paths, context=context)
         return phi, LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+
+    def predict_all(self, tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:
+        """Predict the links to any number of receivers (N, 3) [m], and the probability that each is indoors."""
+        predictions, p_indoor = [], []
+        for start in range(0, len(rx_m), self.at_once):
+            block_m = rx_m[start : start + self.at_once]
+            phi, prediction = self.predict(tx_m, block_m, no_progress)
+            predictions.append(prediction)
+            p_indoor.append(self.p_indoor(block_m, phi))
+        return LinkPrediction.concatenate(predictions), np.concatenate(p_indoor)
 
     def p_indoor(self, rx_m: Floats, phi: LinkFeatures) -> Floats:
         """Probability that each receiver (N,) is indoors."""
@@ -485,38 +525,68 @@ class _Links:
 
 
 def _measured_of_each(
-    partial: PartialMap, positions_m: Floats, measurements: Any, frequency_hz: float
+    partial: PartialMap, sources_m: Sequence[Floats], measurements: Any, frequency_hz: float
 ) -> list[Measurements | None]:
-    """Read the measurements of each transmitter; one at least has some."""
+    """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
     if measurements is None:
-        return [None] * len(positions_m)
+        return [None] * len(sources_m)
     measured = measurements_of(measurements)
-    near = [bool((np.linalg.norm(measured.tx - tx_m, axis=1) <= SAME_TX_M).any()) for tx_m in positions_m]
+    if len(sources_m) > 1:
+        apart_m = [np.linalg.norm(measured.tx - tx_m, axis=1) for tx_m in sources_m]
+        near = [bool((each <= SAME_TX_M).any()) for each in apart_m]
+    else:
+        near = [True]
     near[0] |= not any(near)
     return [
         _measured(partial, tx_m, measured, frequency_hz) if is_near else None
-        for tx_m, is_near in zip(positions_m, near, strict=True)
+        for tx_m, is_near in zip(sources_m, near, strict=True)
     ]
 
 
-def _measured(partial: PartialMap, tx_m: Floats, measured: Measurements, frequency_hz: float) -> Measurements:
-    """Take the measurements of this transmitter whose receivers are at places where links can be predicted."""
-    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
-    if not (apart_m <= SAME_TX_M).any():
-        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
-        raise MeasurementError(
-            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
-            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
-            "the transmitter that is predicted, in the frame of the map."
-        )
-    measured = measured.take(apart_m <= SAME_TX_M)
+@dataclass(frozen=True)
+class _Transmitter:
+    """Positions (T, 3) [m] with weights (T,), what measurements tell of the links of each, and the best estimate."""
+
+    tx_m: Floats
+    weights: Floats
+    told: Sequence[Assimilation]
+    position_m: Floats
+
+
+def _predictions(
+    links: _Links, transmitter: _Transmitter, rx_m: Floats, report: Progress
+) -> Iterator[tuple[LinkFeatures, LinkPrediction, Floats]]:
+    """Yield features, prediction and P(indoor) of blocks of receivers (N, 3) [m], averaged over the positions."""
+    tx_m, begin = transmitter.tx_m, _LOCATING * (len(transmitter.tx_m) > 1)
+    nearest = int(np.linalg.norm(tx_m - transmitter.position_m, axis=1).argmin())
+    for start in range(0, len(rx_m), links.at_once):
+        block_m, found = rx_m[start : start + links.at_once], []
+        for index, each_m in enumerate(tx_m):
+
+            def within(fraction: float, message: str, start: int = start, index: int = index) -> None:
+                done = (start + (index + fraction) / len(tx_m) * links.at_once) / len(rx_m)
+                report(min(0.99, begin + (1.0 - begin) * done), message)
+
+            phi, prediction = links.predict(each_m, block_m, within)
+            if transmitter.told:
+                prediction = transmitter.told[index].update(block_m, prediction)
+            found.append((phi, prediction, links.p_indoor(block_m, phi)))
+        mixture = LinkPrediction.mixture([prediction for _, prediction, _ in found], transmitter.weights)
+        yield found[nearest][0], mixture, transmitter.weights @ [indoor for _, _, indoor in found]
+
+
+def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz: float) -> Measurements:
+    """Read the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
+    measured = measurements_of(measurements)
+    measured = _of_transmitter(measured, tx_m[0]) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
             f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
             "those that are near each other."
         )
-    usable = np.linalg.norm(measured.rx - tx_m, axis=1) >= nearest_m(frequency_hz)
-    usable &= clear_of_walls(partial, measured.rx)
+    usable = clear_of_walls(partial, measured.rx)
+    for each_m in tx_m:
+        usable &= np.linalg.norm(measured.rx - each_m, axis=1) >= nearest_m(frequency_hz)
     if not usable.any():
         raise MeasurementError(
             f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
@@ -530,34 +600,92 @@ def _measured(partial: PartialMap, tx_m: Floats, measured: Measurements, frequen
     return measured
 
 
-def _assimilated(links: _Links, measured: Measurements, at_once: int) -> Assimilation:
-    """Hold what was measured against what is predicted there."""
-    blocks = [slice(start, start + at_once) for start in range(0, len(measured), at_once)]
-    predictions = [links.predict(measured.rx[block], no_progress)[1] for block in blocks]
-    prior, frequency_hz = LinkPrediction.concatenate(predictions), links.tracer.settings.frequency_hz
-    told = Assimilation(links.partial, links.tx_m, measured, prior, frequency_hz)
-    if abs(told.offset_db) > LARGE_OFFSET_DB:
+def _of_transmitter(measured: Measurements, tx_m: Floats) -> Measurements:
+    """Return the measurements of a transmitter (3,) [m]."""
+    measured.require_transmitters()
+    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
+    if not (apart_m <= SAME_TX_M).any():
+        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
+        raise MeasurementError(
+            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
+            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
+            "the transmitter that is predicted, in the frame of the map."
+        )
+    return measured.take(apart_m <= SAME_TX_M)
+
+
+def _of_unknown(measured: Measurements) -> Measurements:
+    """Return the measurements of a transmitter at an unknown position."""
+    known = measured.tx_known
+    if not known.all():
+        return measured.take(~known)
+    if len(measured) and np.linalg.norm(measured.tx - measured.tx[0], axis=1).max() > SAME_TX_M:
+        raise MeasurementError("tx = None, and measurements are of several transmitters: give those of one, or its tx.")
+    _log.warning("tx = None: the position of the transmitter in the measurements is not used")
+    return measured
+
+
+def _located(links: _Links, measured: Measurements, report: Progress) -> TransmitterPosterior:
+    """Find a transmitter from what was measured of it."""
+    places = cKDTree(measured.rx)
+
+    def allowed(points_m: Floats) -> Bools:
+        return clear_of_walls(links.partial, points_m) & (places.query(points_m)[0] >= links.nearest_m)
+
+    def within(fraction: float, message: str) -> None:
+        report(_LOCATING * fraction, message)
+
+    return locate_transmitter(links.partial, measured, allowed, links.predict_all, within)
+
+
+def _transmitter_of(links: _Links, where: Floats | TransmitterPosterior, measured: Measurements | None) -> _Transmitter:
+    """Hold what was measured against what is predicted there, for a position (3,) [m] or for several of a posterior."""
+    if isinstance(where, TransmitterPosterior):
+        (tx_m, weights), position_m = where.draw(POSITIONS), where.position_m
+    else:
+        tx_m, weights, position_m = where[None], np.ones(1), where
+    told = []
+    if measured is not None:
+        for each_m in tx_m:
+            prior, _ = links.predict_all(each_m, measured.rx)
+            told.append(Assimilation(links.partial, each_m, measured, prior, links.tracer.settings.frequency_hz))
+    return _Transmitter(tx_m, weights, told, position_m)
+
+
+def _of_measurements(measured: Measurements, source: _Transmitter) -> dict[str, Any]:
+    """Return attributes of the measurements; a large offset is logged."""
+    noise_db, offset_db = source.weights @ [(each.noise_db, each.offset_db) for each in source.told]
+    if abs(offset_db) > LARGE_OFFSET_DB:
         _log.warning(
             "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
-            abs(told.offset_db),
-            "above" if told.offset_db > 0 else "below",
+            abs(offset_db),
+            "above" if offset_db > 0 else "below",
         )
-    return told
+    return {
+        "measured_links": len(measured),
+        "measured_noise_db": float(noise_db),
+        "measured_offset_db": float(offset_db),
+    }
 
 
-def _predicted(
-    links: _Links, grid: _Receivers, at_once: int, told: Assimilation | None, report: Progress, *, anywhere: bool
-) -> dict[str, NDArray[Any]]:
-    """Predict all links of a transmitter, some at a time, and return the variables on the grid."""
-    columns: list[dict[str, NDArray[Any]]] = []
-    for start in range(0, len(grid.rx_m), at_once):
-        ends = (min(0.99, each / len(grid.rx_m)) for each in (start, start + at_once))
-        rx_m = grid.rx_m[start : start + at_once]
-        phi, prediction = links.predict(rx_m, part_of(report, *ends))
-        if told is not None:
-            prediction = told.update(rx_m, prediction)
-        columns.append(_columns(phi, prediction, links.p_indoor(rx_m, phi), anywhere=anywhere))
-    return _variables(grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
+def _with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
+    """Add where the transmitter may be."""
+    axes = {
+        f"tx_{name}": (f"tx_{name}", values, {"long_name": f"{name} of the transmitter", "units": "m"})
+        for name, values in (("x", posterior.x_m), ("y", posterior.y_m))
+    }
+    attributes = {"long_name": "probability of the transmitter's position", "units": "1"}
+    coverage = coverage.assign_coords(axes)
+    coverage["p_transmitter"] = ("tx_y", "tx_x"), posterior.probability, attributes
+    return coverage.assign_attrs(transmitter_std_m=posterior.std_m)
+
+
+def transmitter_text(coverage: xr.Dataset) -> str:
+    """Say where the transmitter is."""
+    position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
+    if "p_transmitter" in coverage:
+        return f"transmitter near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"
+    return f"transmitter at ({position}) m"
 
 
 def _columns(
@@ -655,7 +783,7 @@ def _together(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
         name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
     }
     joined = xr.concat([each.drop_vars(_OF_ALL) for each in maps], "tx", combine_attrs="drop_conflicts")
-    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords(tx=names, **coordinates)
+    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords({"tx": names, **coordinates})
 
 
 def _label(receivers: _Receivers, variables: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> xr.Dataset:

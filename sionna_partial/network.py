@@ -116,7 +116,7 @@ def network_map(
     require_whole("n", n, 2, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
     noise_dbm = NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(bandwidth_hz) + noise_figure_db
-    valid = coverage["valid"].to_numpy().all(axis=0)
+    valid: NDArray[np.bool_] = np.all(coverage["valid"].to_numpy(), axis=0)
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
     rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
     tx_m = np.stack([coverage[name].to_numpy() for name in TX_COORDINATES], axis=1)

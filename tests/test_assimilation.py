@@ -97,6 +97,11 @@ def test_a_certain_state_stays_and_its_gain_heeds_the_measurement():
     assert np.abs(after.gain_mean_db + 84.0).max() < 2.0
 
 
+def test_priors_are_of_the_measured_links():
+    with pytest.raises(MeasurementError, match="prior has 3 links, and measured 30: give the same links"):
+        Assimilation(HOUSE, UNSEEN, sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0)), prior(3))
+
+
 def test_what_measurements_have_in_common_is_an_offset():
     """Powers in dBm, with transmit power and antenna gains, tell as much as path gains do."""
     gains_db = np.where(LEFT[:, 0] > 2.5, -90.0, -98.0)

@@ -41,7 +41,7 @@ ROOMS = {
         *("unobserved", "windows", "link_context", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
-    "measurements": ("measurements", "recordings", "assimilation"),
+    "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "channels": (
         *("responses", "beams", "spreads", "files"),
         *("joint", "path_model", "path_training", "samples"),

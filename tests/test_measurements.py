@@ -143,7 +143,7 @@ class TestMeasurements:
 
 
 class TestWhatIsMissing:
-    @pytest.mark.parametrize("name", FIELDS)
+    @pytest.mark.parametrize("name", ["rx", "gain_db"])
     @pytest.mark.parametrize("kind", [dict, Frame])
     def test_field(self, kind: type, name: str) -> None:
         columns = {key: [*values] for key, values in FIELDS.items() if key != name}

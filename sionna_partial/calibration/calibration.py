@@ -215,6 +215,7 @@ def calibrate_materials(
     settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
+    measured.require_transmitters()
     require_places(partial, measured, settings.frequency_hz)
     links, link, variance = merged(measured)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))

@@ -1,5 +1,6 @@
 """Training of the `PathModel`: paths on partial maps held against those in the whole of a home."""
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -107,8 +108,8 @@ def _analogues(
     """Key and new paths of each link of one state."""
     power, count = np.abs(true.a) ** 2, len(geometry.distance_m)
     indirect = (true.interactions > 0).any(axis=1)
-    survivors_db = path_gain_db(np.bincount(link, weights=power * (~new & indirect), minlength=count))
-    keys = geometry.keys(state, true.gain_db.ravel(), survivors_db)
+    survivors = np.bincount(link, weights=power * (~new & indirect), minlength=count).astype(np.float64)
+    keys = geometry.keys(state, true.gain_db.ravel(), path_gain_db(survivors))
     excess_ns = 1e9 * (true.delay_s - geometry.distance_m[link] / SPEED_OF_LIGHT_M_S)
     turned = [true.departure_rad - geometry.departure_rad[link], true.arrival_rad - geometry.arrival_rad[link]]
     rows = np.column_stack([power, excess_ns, wrapped(np.hstack(turned))])
@@ -147,7 +148,8 @@ def fit_path_model(examples: Iterable[Example], seed: int = 0) -> PathModel:
 
 def _spread_ns(paths: Floats) -> float:
     fraction, delay_ns = paths[:, 0], paths[:, 1]
-    return float(np.sqrt(max(0.0, fraction @ delay_ns**2 - (fraction @ delay_ns) ** 2)))
+    variance = float(fraction @ delay_ns**2 - (fraction @ delay_ns) ** 2)
+    return math.sqrt(max(0.0, variance))
 
 
 def _fit_survival(inputs: Floats, exists: Bools, seed: int) -> tuple[Floats, ...]:

@@ -215,7 +215,7 @@ def sample_channels(
             prediction = model.predict(phi)
         report(0.5, "drawing")
         draws = _Draws(partial, traced, prediction, n, seed)
-        columns = draws.columns()
+        columns: dict[str, Any] = draws.columns()
         report(1.0, "done")
     shape = (n, *traced.gain_db.shape)
     drawn = replace(
@@ -249,7 +249,8 @@ class _Draws:
         self._certain = certain
         latents = JointLatents(partial)
         matrix = prediction.reshaped((len(tx_m), len(rx_m)))
-        state, gain_db = (each.reshape(count, -1) for each in latents.draw(matrix, tx_m, rx_m, count, [seed]))
+        state, gain_db = latents.draw(matrix, tx_m, rx_m, count, [seed])
+        state, gain_db = state.reshape(count, -1), gain_db.reshape(count, -1)
         self._quantiles = {
             each: latents.quantiles(tx_of, rx_of, count, [seed, each]) for each in (_SURVIVAL, _ANALOGUE)
         }

@@ -21,10 +21,10 @@ FRAMES = 50
 
 def predict(
     map_path: opt.Map,
-    tx: Annotated[
-        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z.", show_default=False)
-    ],
     out: Annotated[Path, typer.Option(help="Folder for the coverage files.", show_default=False)],
+    tx: Annotated[
+        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given.")
+    ] = "",
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
@@ -46,7 +46,7 @@ def predict(
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
-    position = opt.parse_position(tx)
+    position = opt.parse_position(tx) if tx else None
     suffixes = [_parse_format(name) for name in formats]
     scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)

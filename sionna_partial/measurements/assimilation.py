@@ -6,7 +6,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.planar import grid_edges
@@ -34,9 +35,6 @@ UNSEEN_REACH_M = 14.0
 
 LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
 """Fraction of the variance of residuals that is correlated over this walk only [m]."""
-
-TRACE_STD_DB = 3.0
-"""Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
 
 NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0, 0.4
 """Standard deviations of measurements that are tried where none is given, and the likeliest before, with the standard
@@ -61,8 +59,11 @@ class Kind(NamedTuple):
     seen_reach_m: float
     """Walk over which residuals stay correlated where the transmitter is in a cell that was seen [m]."""
 
+    trace_std_db: float
+    """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
 
-KINDS = (Kind(0.99, 0.9999, 1.0, 0.0, 0.8), Kind(0.01, 0.0001, 40.0, 0.5, 4.0))
+
+KINDS = (Kind(0.99, 0.9999, 2.0, 0.0, 0.8, 1.0), Kind(0.01, 0.0001, 40.0, 0.5, 4.0, 3.0))
 """Path gains as a trace has them, and powers that a real radio received."""
 
 MOST_POINTS = 500
@@ -74,7 +75,7 @@ _LEAST_TOLD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class _Walks:
+class Walks:
     """Lengths of walks from P points to everywhere on a map: walls block them, unknown cells make them longer."""
 
     partial: PartialMap
@@ -131,15 +132,36 @@ class Assimilation:
     common are those that make the measurements likeliest. Where that offset is large, so that a real radio is behind
     them, what is predicted below the gain in free space is scaled, too.
 
+    `predict_map` does this for a map; for single links, predict the measured links, and those that are wanted.
+
     Parameters
     ----------
     partial : PartialMap
-    tx_m : (3,) array
+    tx_m : (3,) array-like
         The transmitter [m].
     measured : Measurements
-        M links of this transmitter.
+        M links of this transmitter, at least one.
     prior : LinkPrediction
         Of these links, without the measurements.
+    frequency_hz : float
+
+    Raises
+    ------
+    MeasurementError
+        If `prior` has another number of links, or there are none.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 2, 1], [1, 0, 0, 0, 2, 1], [1, 1, 1, 1, 1, 1]]
+    >>> partial, tx = sp.map_from_array(cells, resolution_m=1.0), (4.5, 1.5, 1.5)  # in a cell that was not seen
+    >>> model = sp.Predictor.load()
+    >>> def predict(rx):
+    ...     return model.predict(sp.link_features(partial, sp.trace_links(partial, tx, rx)))
+    >>> measured = sp.Measurements(tx, [(1.5, 1.5, 1.5), (2.5, 2.5, 1.5)], [-81.0, -78.0])
+    >>> told, wanted = sp.Assimilation(partial, tx, measured, predict(measured.rx)), [(2.2, 1.8, 1.5)]
+    >>> bool(told.update(wanted, predict(wanted)).gain_mean_db < predict(wanted).gain_mean_db)
+    True
     """
 
     noise_db: float
@@ -154,62 +176,82 @@ class Assimilation:
     def __init__(
         self,
         partial: PartialMap,
-        tx_m: Floats,
+        tx_m: ArrayLike,
         measured: Measurements,
         prior: LinkPrediction,
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
     ) -> None:
+        if not 0 < len(measured) == len(prior.p_los):
+            raise MeasurementError(
+                f"prior has {len(prior.p_los)} links, and measured {len(measured)}: give the same links, at least one."
+            )
+        tx_m = np.asarray(tx_m, dtype=np.float64)
         self._tx_m, self._frequency_hz = tx_m, frequency_hz
         rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
         seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
         heard = gain_db > measured.sensitivity_db
-        first, place, count = _places(rx_m, heard)
+        first, place, count = places_of(rx_m, heard, MOST_POINTS)
         heard = heard[first]
 
         def averaged(values: Floats) -> Floats:
             return np.bincount(place, weights=values) / count
 
-        scale_db = averaged(np.hypot(prior.gain_std_db, TRACE_STD_DB))
-        residual = averaged(np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db) / scale_db
-        shadow = averaged(prior.gain_mean_db - self._free_space_db(rx_m)) / scale_db
+        above_db = np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db
+        below_db = prior.gain_mean_db - self._free_space_db(rx_m)
         longest_m = _REACHES * max(UNSEEN_REACH_M, *(kind.seen_reach_m for kind in KINDS))
-        self._walks = _Walks(partial, rx_m[first], longest_m)
+        self._walks = Walks(partial, rx_m[first], longest_m)
         noises = {noise: noise / np.sqrt(count) for noise in NOISES_DB}
         if std_db is not None:
             noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
         best = -math.inf
         for kind in KINDS:
             reach_m, chance = (kind.seen_reach_m, kind.chance) if seen else (UNSEEN_REACH_M, kind.unseen_chance)
-            common = np.stack([kind.offset_db / scale_db, kind.shadow * shadow])
+            scale_db = averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
+            residual = averaged(above_db) / scale_db
+            common = np.stack([np.full(len(first), kind.offset_db), kind.shadow * averaged(below_db)]) / scale_db
             covariance = _positive(self._correlation(rx_m[first], reach_m)) + common.T @ common
             for noise, noise_db in noises.items():
                 log_chance = math.log(chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
                 log_chance += _log_evidence(covariance, residual, noise_db / scale_db, heard)
+                log_chance -= np.log(scale_db[heard]).sum()
                 if log_chance > best:
-                    best, chosen = log_chance, (kind, reach_m, common, covariance, noise_db)
-        kind, self._reach_m, common, covariance, noise_db = chosen
+                    best, chosen = log_chance, (kind, reach_m, common, covariance, residual, noise_db, scale_db)
+        kind, self._reach_m, common, covariance, residual, noise_db, scale_db = chosen
+        self._trace_std_db = kind.trace_std_db
         self.noise_db = float(np.sqrt(np.mean(noise_db**2 * count)))
         self._weights, self._precision = _posterior(covariance, residual, heard, noise_db / scale_db)
         in_common = common @ self._weights
         self.offset_db = float(kind.offset_db * in_common[0])
         self.shadow_scale = float(1.0 + kind.shadow * in_common[1])
 
-    def update(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
-        """Return what is predicted of the links to receivers (N, 3) [m] given the measurements, from what was before.
+    def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
+        """Return what is predicted of the links to receivers given the measurements, from what was before.
 
-        What the process says of a residual is as good as a measurement of the gain with a noise of its own: it weighs
+        What the process predicts of a residual counts as a measurement of the gain with a noise of its own: it weighs
         the link states, and the distribution of the gain given each, by Bayes' rule.
+
+        Parameters
+        ----------
+        rx_m : (N, 3) array-like
+            Receivers [m].
+        prior : LinkPrediction
+            Of the links to them, without the measurements.
+
+        Returns
+        -------
+        LinkPrediction
         """
+        rx_m = np.asarray(rx_m, dtype=np.float64)
         prior = self._shadowed(rx_m, prior)
         across = self._correlation(rx_m, self._reach_m)
         told = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
         touched = told > _LEAST_TOLD
         told = np.where(touched, told, 1.0)
-        scale_db = np.hypot(prior.gain_std_db, TRACE_STD_DB)
+        scale_db = np.hypot(prior.gain_std_db, self._trace_std_db)
         gain_db = prior.gain_mean_db + scale_db * (self._weights @ across) / told
         noise_db2 = scale_db**2 * (1.0 - told) / told
         probabilities, means_db, stds_db = prior.by_state
-        variance = stds_db**2 + TRACE_STD_DB**2
+        variance = stds_db**2 + self._trace_std_db**2
         total = variance + noise_db2
         with np.errstate(divide="ignore"):
             logs = np.log(probabilities) - 0.5 * np.log(total) - 0.5 * (gain_db - means_db) ** 2 / total
@@ -238,16 +280,16 @@ class Assimilation:
         return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
-def _places(rx_m: Floats, heard: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def places_of(rx_m: Floats, heard: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """First measurement of each place, place of each measurement (M,), and number of measurements of each place.
 
-    Places are as small as leaves no more than `MOST_POINTS` of them.
+    Places are as small as leaves no more than `most` of them.
     """
     edge_m = 0.01
     while True:
         keys = np.column_stack([np.floor(rx_m / edge_m), heard])
         _, first, place, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
-        if len(first) <= MOST_POINTS:
+        if len(first) <= most:
             return first, place.ravel(), count
         edge_m *= 1.5
 

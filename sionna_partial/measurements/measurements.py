@@ -48,8 +48,9 @@ class Measurements(Shown):
 
     Parameters
     ----------
-    tx : (N, 3) float64 array
-        Transmitter position of each link [m]; one position (3,) stands for all links.
+    tx : (N, 3) float64 array, or None
+        Transmitter position of each link [m]; one position (3,) stands for all links. None, or NaN as x and y, where it
+        is not known; z may be.
     rx : (N, 3) float64 array
         Receiver position of each link [m].
     gain_db : (N,) float64 array
@@ -75,8 +76,10 @@ class Measurements(Shown):
         gain_db = _numbers("gain_db", self.gain_db)
         if gain_db.ndim != 1:
             raise MeasurementError(f"gain_db has shape {gain_db.shape}: give one gain for each link, (N,).")
-        for name in ("tx", "rx"):
-            object.__setattr__(self, name, _positions(name, getattr(self, name), len(gain_db)))
+        nowhere = np.full(3, np.nan)
+        tx = _positions("tx", nowhere if self.tx is None else self.tx, len(gain_db), known=False)
+        object.__setattr__(self, "tx", tx)
+        object.__setattr__(self, "rx", _positions("rx", self.rx, len(gain_db)))
         low, high = gain_db < LOWEST_DB, gain_db > HIGHEST_DB
         _require(~high, "gain_db", gain_db, "path gains are negative; give minus the path loss.")
         _require(~low, "gain_db", gain_db, f"give dB, not below {LOWEST_DB:g}; an outage is {GAIN_FLOOR_DB:g}.")
@@ -103,6 +106,20 @@ class Measurements(Shown):
         return Measurements(self.tx[index], self.rx[index], self.gain_db[index], std_db, self.sensitivity_db)
 
     @property
+    def tx_known(self) -> NDArray[np.bool_]:
+        """Whether the position of each transmitter (N,) is known."""
+        return np.asarray(np.isfinite(self.tx).all(axis=1))
+
+    def require_transmitters(self) -> None:
+        """Raise a MeasurementError unless the positions of all transmitters are known."""
+        missing = int((~self.tx_known).sum())
+        if missing:
+            raise MeasurementError(
+                f"measurements has {missing:,} of {len(self):,} links without the position of the transmitter: give tx "
+                "(N, 3), or its columns tx_x, tx_y; predict_map with tx=None finds it."
+            )
+
+    @property
     def is_outage(self) -> NDArray[np.bool_]:
         """Whether each link (N,) is an outage."""
         return self.gain_db <= OUTAGE_DB
@@ -116,7 +133,8 @@ def measurements_of(source: Any) -> Measurements:
     source : Measurements, mapping, data frame, Dataset or path
         With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB]; cells of a data frame may hold x, y, z. Instead
         of `tx` there may be `tx_x`, `tx_y` and `tx_z` (N,), and likewise for `rx`. A CSV has these columns, with a
-        header; without `tx_z` or `rx_z`, heights are 1.5 m. `std_db` (N,) and `sensitivity_db` are optional.
+        header; without `tx_z` or `rx_z`, heights are 1.5 m. `std_db` (N,) and `sensitivity_db` are optional, and so is
+        `tx` where the transmitter is not known.
 
     Returns
     -------
@@ -186,10 +204,13 @@ def _ends(source: Any, name: str) -> Any:
     if positions is not None:
         return positions
     x, y, z = (_field(source, f"{name}_{axis}") for axis in "xyz")
+    if name == "tx" and x is None and y is None:
+        return None if z is None else np.insert(np.full((np.size(z), 2), np.nan), 2, z, axis=1)
     if x is None or y is None:
         raise MeasurementError(f"{name} is missing from the measurements: {_GIVE}")
-    columns = [_numbers(f"{name}_{axis}", values) for axis, values in zip("xy", (x, y), strict=True)]
-    columns.append(np.full_like(columns[0], DEFAULT_HEIGHT_M) if z is None else _numbers(f"{name}_z", z))
+    known = name != "tx"
+    columns = [_numbers(f"{name}_{axis}", values, known=known) for axis, values in zip("xy", (x, y), strict=True)]
+    columns.append(np.full_like(columns[0], DEFAULT_HEIGHT_M) if z is None else _numbers(f"{name}_z", z, known=known))
     if len({column.shape for column in columns}) > 1:
         shapes = ", ".join(str(column.shape) for column in columns)
         raise MeasurementError(f"{name}_x, {name}_y and {name}_z have shapes {shapes}: give one value for each link.")
@@ -242,25 +263,30 @@ def _columns(given: str, rows: Any) -> dict[str, list[float]]:
     return found
 
 
-def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
-    """Return finite numbers as a new array, or raise a MeasurementError."""
+def _numbers(name: str, values: ArrayLike, *, known: bool = True) -> NDArray[np.float64]:
+    """Return finite numbers, and NaN where they need not be known, as a new array, or raise a MeasurementError."""
     try:
         array = np.asarray(values)
         array = np.array(np.stack(list(array)) if array.dtype == object and array.size else array, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise MeasurementError(f"{name} is not an array of numbers ({error}): give finite numbers.") from error
-    _require(np.isfinite(array), name, array, "give finite numbers, or leave the link out.")
+    good = np.isfinite(array) | (np.isnan(array) & (not known))
+    _require(good, name, array, "give finite numbers, or leave the link out.")
     return array
 
 
-def _positions(name: str, values: ArrayLike, count: int) -> NDArray[np.float64]:
-    positions = _numbers(name, values)
+def _positions(name: str, values: ArrayLike, count: int, *, known: bool = True) -> NDArray[np.float64]:
+    positions = _numbers(name, values, known=known)
     if positions.shape == (3,):
         positions = np.tile(positions, (count, 1))
     if positions.shape != (count, 3):
         raise MeasurementError(
             f"{name} has shape {positions.shape} for {count} gains: give x, y, z of each link in metres, ({count}, 3)."
         )
+    unknown = np.isnan(positions)
+    unlike = unknown != unknown[:, :1]
+    unlike[:, 2] &= unknown[:, 2]
+    _require(~unlike, name, positions, "give NaN as both x and y where the transmitter is not known.")
     return positions
 
 

@@ -18,7 +18,8 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.checks import require, require_choice
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage
+from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage, transmitter_text
+from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade, sheet_columns
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
@@ -88,8 +89,8 @@ def plot_coverage(
 ) -> Figure:
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
-    Walls are black, the unobserved area is hatched, the transmitter is a star. On a complete map the outside is left
-    blank.
+    Walls are black, the unobserved area is hatched, the transmitter is a star; a line encloses 90 % of where it may be,
+    if that is not known. On a complete map the outside is left blank.
 
     Parameters
     ----------
@@ -171,8 +172,7 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 
 def headline(what: str, coverage: xr.Dataset) -> str:
     """Title that names the transmitter's position and the frequency."""
-    x, y, z = coverage.attrs["transmitter_m"]
-    return f"{what}: transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
+    return f"{what}: {transmitter_text(coverage)}, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:
@@ -242,6 +242,9 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset 
     axis.imshow(shade(wall), extent=extent, origin="lower", zorder=3)
     x, y, _ = coverage.attrs["transmitter_m"]
     axis.plot(x, y, zorder=4, **_STAR)
+    for x_m, y_m, inside in likely_area(coverage):
+        for colour, width in (("white", 2.4), ("black", 1.0)):
+            axis.contour(x_m, y_m, inside, levels=[0.5], colors=colour, linewidths=width, zorder=4)
     axis.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
 
 
@@ -303,9 +306,22 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
     area.set_hatch_linewidth(0.5)
 
 
+def likely_area(coverage: xr.Dataset) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+    """As `unobserved_area`, the cells with 90 % of an unknown transmitter's posterior; nothing if it is known."""
+    if "p_transmitter" not in coverage:
+        return []
+    x, y = (coverage[f"tx_{name}"].to_numpy() for name in "xy")
+    step_m = max([*np.diff(x), *np.diff(y)], default=1.0)
+    axes = (np.r_[axis_m[0] - step_m, axis_m, axis_m[-1] + step_m] for axis_m in (x, y))
+    return [(*axes, np.pad(likely_region(coverage["p_transmitter"].to_numpy()), 1).astype(float))]
+
+
 def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
     """Name what is drawn; walls that only the first of several maps has are not observed in the others."""
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
+    located = any("p_transmitter" in coverage for coverage in coverages)
+    if located:
+        handles.append(Line2D([], [], color="black", linewidth=1.0, label="transmitter, 90 %"))
     if any(layer.norm is not None and not layer.label for layer in layers):
         states = (LinkState.LOS, "LOS"), (LinkState.NLOS, "NLOS"), (LinkState.OUTAGE, "outage")
         handles += [Patch(facecolor=STATE_COLOURS[state], label=name) for state, name in states]
@@ -318,4 +334,4 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
         handles.append(
             Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
         )
-    legend_below(figure, handles)
+    legend_below(figure, handles, columns=4 if located else None)

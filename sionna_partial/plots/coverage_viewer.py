@@ -17,6 +17,7 @@ from sionna_partial.plots.coverage_plot import (
     coverage_layers,
     extent_m,
     headline,
+    likely_area,
     outside,
     unobserved_area,
     wall_cells,
@@ -73,8 +74,9 @@ _PAGE = """<!doctype html>
 <body>
 <h1>{headline}</h1>
 <div id="viewer"></div>
-<p>Star: transmitter. Black: walls. Hatched: not observed. Grey: no receiver can stand there. In mean and standard
-deviation of the path gain, an outage counts &minus;150 dB. Predictor: {predictor}.</p>
+<p>Star: transmitter; a line encloses 90 % of where an unknown one may be. Black: walls. Hatched: not observed. Grey: no
+receiver can stand there. In mean and standard deviation of the path gain, an outage counts &minus;150 dB. Predictor:
+{predictor}.</p>
 <script>Bokeh.embed.embed_item({item}, "viewer")</script>
 </body>
 </html>
@@ -212,5 +214,8 @@ def _add_map(plot: Any, coverage: xr.Dataset) -> None:
     wall = wall_cells(coverage).astype(np.uint8)
     black = LinearColorMapper(palette=["#00000000", "#000000"], low=0, high=1)
     plot.image(image=[wall], x=x0, y=y0, dw=x1 - x0, dh=y1 - y0, color_mapper=black)
+    for x, y, inside in likely_area(coverage):
+        plot.contour(x, y, inside, levels=[0.5], line_color="white", line_width=3)
+        plot.contour(x, y, inside, levels=[0.5], line_color="black", line_width=1.5)
     x_tx, y_tx, _ = coverage.attrs["transmitter_m"]
     plot.scatter([x_tx], [y_tx], marker="star", size=18, fill_color="white", line_color="black")

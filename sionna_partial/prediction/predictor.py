@@ -141,6 +141,20 @@ class LinkPrediction(Shown):
         """Return the links of all `parts`, one part after the other."""
         return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
 
+    @classmethod
+    def mixture(cls, parts: Sequence["LinkPrediction"], weights: Floats) -> "LinkPrediction":
+        """Return the mixture of several distributions of the same links, given their weights, which sum to 1."""
+        if len(parts) == 1:
+            return parts[0]
+        p_all, means_db, stds_db = (np.stack(each) for each in zip(*(part.by_state for part in parts), strict=True))
+        joint = weights[:, None, None] * p_all
+        probabilities = joint.sum(axis=0)
+        fractions = np.where(probabilities > 0.0, joint, weights[:, None, None])
+        fractions = fractions / fractions.sum(axis=0)
+        mean_db = (fractions * means_db).sum(axis=0)
+        variance = (fractions * (stds_db**2 + (means_db - mean_db) ** 2)).sum(axis=0)
+        return cls.of_parts(probabilities / probabilities.sum(axis=0), mean_db, np.sqrt(variance))
+
     def reshaped(self, shape: tuple[int, ...]) -> "LinkPrediction":
         """Return the same links in another shape, as (T, N)."""
         return LinkPrediction(*(getattr(self, column.name).reshape(shape) for column in fields(self)))

@@ -1,0 +1,159 @@
+"""Where a transmitter may be: gains that were measured of it -> posterior over positions."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, logsumexp
+
+from sionna_partial.checks import Progress
+from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
+from sionna_partial.errors import PositionError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.measurements.assimilation import LIKELY_NOISE_DB, Walks, places_of
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.prediction.predictor import LinkPrediction
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats]]
+"""Links from a position (3,) to others (N, 3) [m] -> their prediction, and P(indoor) of the others (N,)."""
+
+MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
+"""Number of positions that are compared, least distance between them, and how far they go beyond free cells [m]."""
+
+MOST_PLACES = 25
+"""Number of places with measurements from which links are traced."""
+
+REACH_M = 1.5
+"""Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 %."""
+
+TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
+"""Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
+
+OFFSETS_DB, OFFSET_CHANCE, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 0.01, 40.0
+"""Offsets that powers may have in common, how likely such an offset is, and its standard deviation [dB]."""
+
+OUTDOOR = 1e-6
+"""Weight of positions that are outdoors for certain."""
+
+REGION = 0.9
+"""Probability of the region that `likely_region` returns."""
+
+
+@dataclass(frozen=True, eq=False)
+class TransmitterPosterior:
+    """Probability (ny, nx) of each cell of a grid, whose centres are at x (nx,) and y (ny,) [m], at one height [m]."""
+
+    x_m: Floats
+    y_m: Floats
+    height_m: float
+    probability: Floats
+
+    @property
+    def points_m(self) -> Floats:
+        """Centres of all cells (ny nx, 3) [m]."""
+        x_m, y_m = np.meshgrid(self.x_m, self.y_m)
+        return np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, self.height_m)])
+
+    @property
+    def position_m(self) -> Floats:
+        """The cell (3,) from which the expected distance is smallest [m]."""
+        points_m, weights = self.points_m, self.probability.ravel()
+        possible = weights > 0.0
+        expected_m = [np.linalg.norm(points_m[possible] - each, axis=1) @ weights[possible] for each in points_m]
+        return points_m[np.where(possible, expected_m, math.inf).argmin()]
+
+    @property
+    def std_m(self) -> float:
+        """Root mean square distance from `position_m` [m]."""
+        square = ((self.points_m - self.position_m) ** 2).sum(axis=1)
+        return float(np.sqrt(square @ self.probability.ravel()))
+
+    def draw(self, count: int) -> tuple[Floats, Floats]:
+        """Return positions (K, 3) [m], drawn systematically, and their weights (K,)."""
+        weights = self.probability.ravel()
+        drawn = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + 0.5) / count)
+        chosen, times = np.unique(drawn, return_counts=True)
+        return self.points_m[chosen], times / count
+
+
+def likely_region(probability: Floats) -> Bools:
+    """Return the smallest set of cells that holds 90 % of a posterior."""
+    order = np.argsort(-probability, axis=None, kind="stable")
+    inside = np.cumsum(probability.ravel()[order]) < REGION * probability.sum()
+    region = np.zeros(probability.size, dtype=bool)
+    region[order[: inside.sum() + 1]] = True
+    return region.reshape(probability.shape)
+
+
+def locate_transmitter(
+    partial: PartialMap, measured: Measurements, allowed: Callable[[Floats], Bools], predict: Predict, report: Progress
+) -> TransmitterPosterior:
+    """Compare positions by the likelihood of gains measured of one transmitter, weighted by P(indoor).
+
+    Links are reciprocal: they are predicted from the measured places to all positions (`allowed` returns where one can
+    be). A gain has the distribution that is predicted, and noise; at or below the sensitivity it is at most that.
+    Neighbouring places err alike: the log-likelihood is divided by how many count as one.
+    """
+    posterior = _grid(partial, measured)
+    points_m = posterior.points_m
+    heard = measured.gain_db > measured.sensitivity_db
+    some = measured.take(places_of(measured.rx, heard, MOST_PLACES)[0])
+    possible = np.flatnonzero(allowed(points_m))
+    if not len(possible):
+        raise PositionError("a transmitter can be nowhere: no position is away from walls and measured places.")
+    partial.require_positions("tx", points_m[possible])
+    log_chance = np.zeros((len(OFFSETS_DB), len(possible)))
+    p_indoor = np.zeros(len(possible))
+    for index, place_m in enumerate(some.rx):
+        report(index / len(some), "comparing positions of the transmitter")
+        prediction, indoor = predict(place_m, points_m[possible])
+        p_indoor += indoor / len(some)
+        log_chance += _log_likelihood(prediction, some.take(np.array([index])))
+    walks_m = Walks(partial, some.rx, 10.0 * REACH_M).lengths_m(some.rx)
+    log_chance *= len(some) / np.exp(-walks_m / REACH_M).sum()
+    log_chance = logsumexp(log_chance + _log_offset_chance()[:, None], axis=0) + np.log(np.maximum(p_indoor, OUTDOOR))
+    posterior.probability.ravel()[possible] = np.exp(log_chance - logsumexp(log_chance))
+    return posterior
+
+
+def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
+    """Lay out positions over the free cells and around them, with probability 0."""
+    cells = np.argwhere(partial.state == CellState.FREE)[:, ::-1]
+    low_m, high_m = np.reshape(partial.bounds_m, (2, 2))
+    if len(cells):
+        first_m, last_m = (ends * partial.resolution_m + partial.origin_m for ends in (cells.min(0), cells.max(0) + 1))
+        low_m, high_m = np.maximum(low_m, first_m - BEYOND_M), np.minimum(high_m, last_m + BEYOND_M)
+    spacing_m = max(LEAST_SPACING_M, math.sqrt(np.prod(high_m - low_m) / MOST_POSITIONS))
+    x_m, y_m = (
+        (low + high) / 2.0 + spacing_m * (np.arange(count) - (count - 1) / 2.0)
+        for low, high in zip(low_m, high_m, strict=True)
+        for count in [max(1, int((high - low) / spacing_m))]
+    )
+    height_m = measured.tx[0, 2] if np.isfinite(measured.tx[0, 2]) else DEFAULT_HEIGHT_M
+    return TransmitterPosterior(x_m, y_m, float(height_m), np.zeros((len(y_m), len(x_m))))
+
+
+def _log_likelihood(prediction: LinkPrediction, measured: Measurements) -> Floats:
+    """Log-likelihood (O, N) of one measurement for each offset and predicted link."""
+    probabilities, means_db, stds_db = prediction.by_state
+    noise_db = LIKELY_NOISE_DB if measured.std_db is None else measured.std_db[0]
+    spread_db = np.sqrt(stds_db**2 + noise_db**2 + TRACE_STD_DB**2)
+    heard_db = max(measured.gain_db[0], measured.sensitivity_db)
+    z = (heard_db - OFFSETS_DB[:, None, None] - means_db) / spread_db
+    if heard_db > measured.sensitivity_db:
+        log_density, anything = -0.5 * (z**2 + math.log(2.0 * math.pi)) - np.log(spread_db), 1.0 / RANGE_DB
+    else:
+        log_density, anything = log_ndtr(z), 0.5
+    with np.errstate(divide="ignore"):
+        expected = logsumexp(log_density + np.log(probabilities), axis=1)
+    return np.logaddexp(math.log1p(-CHANCE_OF_ANYTHING) + expected, math.log(CHANCE_OF_ANYTHING * anything))
+
+
+def _log_offset_chance() -> Floats:
+    """Log-probability of each offset: almost surely none."""
+    chance = np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2)
+    return np.log(OFFSET_CHANCE * chance / chance.sum() + (1.0 - OFFSET_CHANCE) * (OFFSETS_DB == 0.0))

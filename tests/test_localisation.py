@@ -1,0 +1,164 @@
+"""The position of a transmitter from measured gains, and the coverage averaged over it."""
+
+import logging
+
+import numpy as np
+import pytest
+import xarray as xr
+from extruded import drawn
+from typer.testing import CliRunner
+
+import sionna_partial as sp
+from sionna_partial.cli import app
+from sionna_partial.errors import MeasurementError, PositionError
+from sionna_partial.measurements.localisation import TransmitterPosterior, likely_region
+from sionna_partial.measurements.measurements import measurements_of
+
+HOUSE = drawn(
+    """
+    #################
+    #......#????????#
+    #......#????????#
+    #...............?
+    #...............?
+    #......#.......##
+    #################
+    """,
+    resolution_m=0.4,
+)
+TX = np.array([4.5, 1.3, 1.5])
+PLACES = np.array([(1.0, 0.7, 1.5), (2.3, 1.4, 1.5), (3.9, 1.5, 1.5), (5.3, 0.6, 1.5), (1.1, 1.9, 1.5)])
+OPTIONS = {"spacing_m": 0.4, "predictor": "paper"}
+
+
+def table(**changes: object) -> dict[str, object]:
+    gain_db = sp.trace_links(HOUSE, TX, PLACES, progress=False).gain_db
+    return {"rx": PLACES, "gain_db": gain_db, "std_db": 1.0, **changes}
+
+
+@pytest.fixture(scope="module")
+def coverage() -> xr.Dataset:
+    return sp.predict_map(HOUSE, measurements=table(), **OPTIONS)
+
+
+class TestCoverage:
+    def test_a_transmitter_in_sight_is_found(self, coverage):
+        assert np.linalg.norm(coverage.attrs["transmitter_m"] - TX) < 0.6
+        assert coverage.attrs["transmitter_std_m"] < 1.5
+        assert float(coverage.p_transmitter.sum()) == pytest.approx(1.0)
+        row, column = (
+            np.abs(coverage[axis].to_numpy() - at).argmin() for axis, at in (("tx_y", TX[1]), ("tx_x", TX[0]))
+        )
+        assert likely_region(coverage.p_transmitter.to_numpy())[row, column]
+        assert "transmitter near (" in repr(coverage.radio)
+
+    def test_coverage_is_about_that_of_the_position(self, coverage):
+        known = sp.predict_map(HOUSE, TX, **OPTIONS)
+        left = (known.x < 2.8) & known.valid & coverage.valid
+        assert float(np.abs(coverage.gain_mean_db - known.gain_mean_db).where(left).mean()) < 4.0
+        total = coverage.p_los + coverage.p_nlos + coverage.p_outage
+        assert float(np.abs(total - 1.0).max()) < 1e-5
+
+    @pytest.mark.parametrize("suffix", [".nc", ".tif", ".csv", ".png", ".html", ".yaml"])
+    def test_every_format_takes_it(self, coverage, tmp_path, suffix):
+        sp.save_coverage(coverage, tmp_path / f"coverage{suffix}")
+        assert suffix != ".nc" or sp.load_coverage(tmp_path / "coverage.nc").identical(coverage)
+
+    def test_pictures_enclose_where_it_may_be(self, coverage):
+        figure = sp.plot_coverage(coverage, layers=("link_state",))
+        assert "transmitter, 90 %" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+    def test_powers_are_located_too(self):
+        power_db = table()["gain_db"] + 31.0
+        found = sp.predict_map(HOUSE, measurements=table(gain_db=power_db), **OPTIONS)
+        assert np.linalg.norm(found.attrs["transmitter_m"] - TX) < 1.5
+
+    def test_its_height_may_be_known(self):
+        found = sp.predict_map(HOUSE, measurements=table(tx=[np.nan, np.nan, 2.0]), **OPTIONS)
+        assert found.attrs["transmitter_m"][2] == 2.0
+
+    @pytest.mark.usefixtures("command_line")
+    def test_the_command_needs_no_transmitter(self, tmp_path):
+        sp.save_map(HOUSE, tmp_path / "house.yaml")
+        rows = [f"{x},{y},{gain}" for (x, y, _), gain in zip(PLACES, table()["gain_db"], strict=True)]
+        (tmp_path / "measured.csv").write_text("\n".join(["rx_x,rx_y,gain_db", *rows, ""]))
+        command = ["predict", tmp_path / "house.yaml", "--measurements", tmp_path / "measured.csv"]
+        command += ["--out", tmp_path / "out", "--spacing", 0.8, "--predictor", "paper", "--format", ".nc"]
+        result = CliRunner().invoke(app, [str(word) for word in command])
+        assert result.exit_code == 0, result.output
+        assert "p_transmitter" in sp.load_coverage(tmp_path / "out" / "coverage.nc")
+
+
+class TestWhatIsRefused:
+    def test_no_transmitter_and_no_measurements(self):
+        with pytest.raises(PositionError, match="tx = None: give x, y and z in metres, or measurements"):
+            sp.predict_map(HOUSE, **OPTIONS)
+
+    @pytest.mark.parametrize("call", [lambda m: sp.predict_map(HOUSE, TX, measurements=m), None])
+    def test_measurements_without_a_transmitter(self, call):
+        call = call or (lambda measured: sp.calibrate_materials(HOUSE, measured))
+        with pytest.raises(MeasurementError, match="5 of 5 links without the position of the transmitter: give tx"):
+            call(table())
+
+    def test_measurements_of_several_transmitters(self):
+        tx = np.tile(TX, (5, 1)) + np.arange(5)[:, None] * [0.3, 0.0, 0.0]
+        with pytest.raises(MeasurementError, match="tx = None, and measurements are of several transmitters"):
+            sp.predict_map(HOUSE, measurements=table(tx=tx), **OPTIONS)
+
+    def test_a_position_that_is_not_used_is_named(self, caplog):
+        with caplog.at_level(logging.WARNING):
+            sp.predict_map(HOUSE, measurements=table(tx=TX), **OPTIONS)
+        assert "the position of the transmitter in the measurements is not used" in caplog.text
+
+    def test_a_transmitter_can_be_nowhere(self):
+        closet = drawn("###\n#.#\n###", resolution_m=0.1)
+        measured = sp.Measurements(None, [[0.15, 0.15, 1.5]], [-60.0])
+        with pytest.raises(PositionError, match="a transmitter can be nowhere"):
+            sp.predict_map(closet, measurements=measured, spacing_m=0.05)
+
+    @pytest.mark.parametrize("tx", [(np.nan, 1.0, 1.5), (1.0, 1.0, np.nan)])
+    def test_half_known_positions(self, tx):
+        with pytest.raises(MeasurementError, match=r"tx\[0, \d\] = (nan|1)"):
+            sp.Measurements(tx, PLACES, np.full(5, -70.0))
+
+
+def test_links_without_a_transmitter_are_read(tmp_path):
+    (tmp_path / "measured.csv").write_text("tx_z,rx_x,rx_y,gain_db\n2.1,1,2,-70\n")
+    found = measurements_of(tmp_path / "measured.csv")
+    assert (found.tx_known.tolist(), found.tx[0, 2]) == ([False], 2.1)
+
+
+class TestPosterior:
+    POSTERIOR = TransmitterPosterior(
+        np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0]), 1.5, np.array([[0.05, 0.0, 0.65], [0.0, 0.28, 0.02]])
+    )
+
+    def test_region(self):
+        assert likely_region(self.POSTERIOR.probability).tolist() == [[False, False, True], [False, True, False]]
+
+    def test_position(self):
+        assert self.POSTERIOR.position_m.tolist() == [2.0, 0.0, 1.5]
+        assert self.POSTERIOR.std_m == pytest.approx(np.sqrt(0.05 * 4 + 0.28 * 26 + 0.02 * 25))
+
+    def test_draws_represent_it(self):
+        positions_m, weights = self.POSTERIOR.draw(10)
+        assert positions_m[:, :2].tolist() == [[0.0, 0.0], [2.0, 0.0], [1.0, 5.0]]
+        assert weights.tolist() == [0.1, 0.6, 0.3]
+
+
+def test_mixtures_have_the_moments_of_their_parts():
+    ones = np.ones(2)
+    parts = [
+        sp.LinkPrediction.of_parts(
+            np.stack([p_outage * ones, 0.0 * ones, (1.0 - p_outage) * ones]),
+            np.stack([-150.0 * ones, -60.0 * ones, mean_db * ones]),
+            np.stack([0.0 * ones, ones, std_db * ones]),
+        )
+        for p_outage, mean_db, std_db in ((0.2, -80.0, 4.0), (0.6, -100.0, 8.0))
+    ]
+    mixed = sp.LinkPrediction.mixture(parts, np.array([0.25, 0.75]))
+    np.testing.assert_allclose(mixed.p_outage, 0.25 * 0.2 + 0.75 * 0.6)
+    np.testing.assert_allclose(mixed.gain_mean_db, 0.25 * parts[0].gain_mean_db + 0.75 * parts[1].gain_mean_db)
+    square = [each.gain_std_db**2 + each.gain_mean_db**2 for each in parts]
+    np.testing.assert_allclose(mixed.gain_std_db**2 + mixed.gain_mean_db**2, 0.25 * square[0] + 0.75 * square[1])
+    assert (mixed.gain_los_mean_db == -60.0).all()
