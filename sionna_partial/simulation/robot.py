@@ -6,6 +6,8 @@ unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shor
 """
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +57,18 @@ _ARRIVAL_M = 0.3
 _DECISION_STEPS = 5.0
 
 
+class Frontier(NamedTuple):
+    """Free cells (n, 2) beside unseen ones, the route (m, 2) to the middle one, and the actions that it takes [1]."""
+
+    cells: NDArray[np.intp]
+    route: NDArray[np.intp]
+    steps: float
+
+
+Choice = Callable[["Robot", list[Frontier]], int]
+"""Which of the frontiers a robot drives to."""
+
+
 class Robot:
     """Pose, map and plan of a robot in a home (ny, nx) that has some free cells, and unknown cells all around.
 
@@ -62,7 +76,15 @@ class Robot:
     (`believed_position`), on the map that it has made (`seen`).
     """
 
-    def __init__(self, truth: NDArray[np.uint8], resolution_m: float, seed: int, sensor: SensorSettings) -> None:
+    def __init__(
+        self,
+        truth: NDArray[np.uint8],
+        resolution_m: float,
+        seed: int,
+        sensor: SensorSettings,
+        choose: Choice | None = None,
+    ) -> None:
+        self._choose = choose
         self._rng, errors = np.random.default_rng(seed), np.random.default_rng((seed, 1))
         self._cell_m = resolution_m
         self._radius, self._roomy = _fitting_radius(truth == _FREE, resolution_m)
@@ -99,11 +121,13 @@ class Robot:
             return
         route = self._route
         if route is None or self._route_steps >= self._goal_steps or self._is_done(route[-1]):
-            route = self._route = self._choose_route()
+            frontiers = self.frontiers()
+            if not frontiers:
+                self.is_finished = True
+                return
+            choice = self._draw(frontiers) if self._choose is None else self._choose(self, frontiers)
+            route = self._route = frontiers[choice].route
             self._route_steps = 0
-        if route is None:
-            self.is_finished = True
-            return
         self._route_steps += 1
         ahead = int(np.argmin(self._distances_to(route))) + max(1, round(_AHEAD_M / self._cell_m))
         error_deg = self._turn_to(route[min(ahead, len(route) - 1)])
@@ -135,8 +159,8 @@ class Robot:
         beside = ndimage.binary_dilation(seen == _UNKNOWN)
         return beside & (seen == _FREE) & ~self._given_up[part]
 
-    def _choose_route(self) -> NDArray[np.intp] | None:
-        """Draw a frontier, the likelier the more it promises for few steps; None if none can be reached."""
+    def frontiers(self) -> list[Frontier]:
+        """Find the frontiers that can be reached; `act` drives to the middle of one of them."""
         known = self.seen != _UNKNOWN
         known[self._cell()] = True
         rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
@@ -144,8 +168,8 @@ class Robot:
         corner = np.array([part[0].start, part[1].start])
         labels, count = ndimage.label(self._frontier(part), structure=_EIGHT)
         sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-        router = _Router(self._travel_cost(part), tuple(self._cell() - corner))
-        middles, promises = [], []
+        router = Router(self._travel_cost(part), tuple(self._cell() - corner))
+        found = []
         for label, box in enumerate(ndimage.find_objects(labels), start=1):
             if sizes[label - 1] < _SMALLEST_FRONTIER_CELLS:
                 continue
@@ -153,12 +177,15 @@ class Robot:
             middle = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
             turn_deg = abs(self._turn_to(middle))
             steps = float(router.costs[tuple(middle - corner)] * self._cell_m / FORWARD_M + turn_deg / TURN_DEG)
-            middles.append(middle)
-            promises.append(math.sqrt(sizes[label - 1]) / (steps + _DECISION_STEPS))
-        if not any(promises):
-            return None
+            if math.isfinite(steps):
+                found.append(Frontier(cells, router.path_to(middle - corner) + corner, steps))
+        return found
+
+    def _draw(self, frontiers: list[Frontier]) -> int:
+        """Draw a frontier, the likelier the more it promises for few steps."""
+        promises = [math.sqrt(len(each.cells)) / (each.steps + _DECISION_STEPS) for each in frontiers]
         odds = np.array(promises) ** GOAL_SHARPNESS
-        return router.path_to(middles[self._rng.choice(len(middles), p=odds / odds.sum())] - corner) + corner
+        return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
 
     def _distances_to(self, cells: NDArray[np.intp]) -> NDArray[np.float64]:
         x, y = self.believed_position
@@ -168,7 +195,8 @@ class Robot:
     def _is_done(self, goal: NDArray[np.intp]) -> bool:
         around = _part((goal[0] - 1, goal[1] - 1), (goal[0] + 2, goal[1] + 2))
         middle = min(int(goal[0]), 1), min(int(goal[1]), 1)
-        return bool(self._distances_to(goal) * self._cell_m < _ARRIVAL_M and not self._frontier(around)[middle])
+        arrived = self._choose is not None or self._distances_to(goal) * self._cell_m < _ARRIVAL_M
+        return bool(arrived and not self._frontier(around)[middle])
 
     def _travel_cost(self, part: tuple[slice, slice]) -> NDArray[np.float64]:
         """Cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
@@ -227,7 +255,7 @@ def _part(low: tuple[int, int], high: tuple[int, int]) -> tuple[slice, slice]:
     return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
-class _Router:
+class Router:
     """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross."""
 
     def __init__(self, cost: NDArray[np.float64], start: tuple[int, ...]) -> None:
