@@ -14,7 +14,7 @@ import argparse
 import copy
 import json
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +28,9 @@ from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import _cast_rays, _ray_angles, _Rays
 from sionna_partial.simulation.robot import Choice, Frontier, Robot
 
-STEPS, EVERY = 300, 20
-CANDIDATES = 5
+STEPS, EVERY = 300, 25
+CANDIDATES = 4
+HORIZON = 40
 GRID_M, AROUND_M = 0.8, 3.0
 DECISION_STEPS = 5.0
 HEADINGS = 8
@@ -86,20 +87,20 @@ def best_view(robot: Robot, frontier: Frontier, cell_m: float) -> NDArray[np.boo
     return whole
 
 
-def rate(values: NDArray[np.float64], frontiers: list[Frontier]) -> NDArray[np.float64]:
+def rate(robot: Robot, values: NDArray[np.float64], frontiers: list[Frontier]) -> NDArray[np.float64]:
     """Values per action."""
-    return values / (np.array([each.steps for each in frontiers]) + DECISION_STEPS)
+    return values / (np.array([robot.steps_to(each) for each in frontiers]) + DECISION_STEPS)
 
 
 def nearest(robot: Robot, frontiers: list[Frontier]) -> int:
-    """The frontier that takes the fewest actions."""
-    return int(np.argmin([each.steps for each in frontiers]))
+    """Return the frontier that takes the fewest actions."""
+    return int(np.argmin([robot.steps_to(each) for each in frontiers]))
 
 
 def areas(home: Home, robot: Robot, frontiers: list[Frontier]) -> NDArray[np.float64]:
     """Unknown area that each frontier shows, per action."""
     shown = [best_view(robot, each, home.home.resolution_m).sum() for each in frontiers]
-    return rate(np.array(shown, float), frontiers)
+    return rate(robot, np.array(shown, float), frontiers)
 
 
 def policies(home: Home, *, oracle: bool) -> dict[str, Choice | None]:
@@ -112,14 +113,14 @@ def policies(home: Home, *, oracle: bool) -> dict[str, Choice | None]:
         def choose(robot: Robot, frontiers: list[Frontier]) -> int:
             if len(frontiers) == 1:
                 return 0
-            return int(np.argmax(rate(uncertainty_shown(home, robot, frontiers, lines), frontiers)))
+            return int(np.argmax(rate(robot, uncertainty_shown(home, robot, frontiers, lines), frontiers)))
 
         return choose
 
     chosen: dict[str, Choice | None] = {"random": None, "nearest": nearest, "area": area}
     chosen |= {"entropy": uncertain(False), "lines": uncertain(True)}
     if oracle:
-        chosen["oracle"] = oracle_of(home)
+        chosen |= {"oracle": oracle_of(home, 0), "far oracle": oracle_of(home, HORIZON)}
     return chosen
 
 
@@ -162,11 +163,17 @@ class _ChoosesAgain(Exception):
     pass
 
 
-def oracle_of(home: Home) -> Choice:
-    """Choose the frontier whose views, on the way and there, lower the error most per action."""
+def oracle_of(home: Home, horizon: int) -> Choice:
+    """Choose the frontier whose views, on the way and there, lower the error most per action.
+
+    With a horizon, the frontier after which, and then the largest areas, the error is lowest after so many actions.
+    """
 
     def again(robot: Robot, frontiers: list[Frontier]) -> int:
         raise _ChoosesAgain
+
+    def largest(robot: Robot, frontiers: list[Frontier]) -> int:
+        return int(np.argmax(areas(home, robot, frontiers)))
 
     def loss(robot: Robot) -> float:
         _, rmse_db, brier = home.errors(home.map_of(robot))
@@ -177,19 +184,16 @@ def oracle_of(home: Home) -> Choice:
             return 0
         area = areas(home, robot, frontiers)
         tried = list(dict.fromkeys([nearest(robot, frontiers), *np.argsort(-area)]))[:CANDIDATES]
-        before, scores = loss(robot), []
+        before, scores = 0.0 if horizon else loss(robot), []
         for index in tried:
             twin = copy.deepcopy(robot)
-            twin._choose, twin._route, twin._route_steps, steps = again, frontiers[index].route, 0, 0
-            while steps < STEPS:
+            twin._choose, twin._route, twin._route_steps = largest if horizon else again, frontiers[index].route, 0
+            for steps in range(1, 1 + (horizon or STEPS)):
                 try:
                     twin.act()
                 except _ChoosesAgain:
                     break
-                steps += 1
-                if twin._route is None:
-                    break
-            scores.append((before - loss(twin)) / max(steps, 1) + 1e-6 * area[index])
+            scores.append((before - loss(twin)) / (1.0 if horizon else steps + DECISION_STEPS) + 1e-6 * area[index])
         return int(tried[int(np.argmax(scores))])
 
     return choose

@@ -48,6 +48,7 @@ _AHEAD_M = 0.3
 _BUMP_M = 0.25
 _ARRIVAL_M = 0.3
 _DECISION_STEPS = 5.0
+_WIDE_M = 0.35
 
 
 Choice = Callable[["Robot", list[Frontier]], int]
@@ -110,8 +111,12 @@ class Robot:
             if not frontiers:
                 self.is_finished = True
                 return
-            choice = self._draw(frontiers) if self._choose is None else self._choose(self, frontiers)
-            route = self._route = frontiers[choice].route
+            if self._choose is None:
+                chosen = frontiers[self._draw(frontiers)]
+            else:
+                wide = [each for each in frontiers if len(each.cells) * self._cell_m >= _WIDE_M] or frontiers
+                chosen = wide[self._choose(self, wide)]
+            route = self._route = chosen.route
             self._route_steps = 0
         self._route_steps += 1
         ahead = int(np.argmin(self._distances_to(route))) + max(1, round(_AHEAD_M / self._cell_m))
@@ -160,8 +165,9 @@ class Robot:
     def _is_done(self, goal: NDArray[np.intp]) -> bool:
         around = part_of((goal[0] - 1, goal[1] - 1), (goal[0] + 2, goal[1] + 2))
         middle = min(int(goal[0]), 1), min(int(goal[1]), 1)
-        arrived = self._choose is not None or self._distances_to(goal) * self._cell_m < _ARRIVAL_M
-        return bool(arrived and not (frontier_cells(self.seen[around]) & ~self._given_up[around])[middle])
+        arrived = self._distances_to(goal) * self._cell_m < _ARRIVAL_M
+        may_turn = self._choose is not None and self._route_steps >= _DECISION_STEPS
+        return bool((arrived or may_turn) and not (frontier_cells(self.seen[around]) & ~self._given_up[around])[middle])
 
     def _step_forward(self) -> bool:
         """Move ahead, sliding along walls; return whether at least half of the step was made."""
