@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -31,10 +31,11 @@ from sionna_partial.files import atomic_write
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import unknown_in_view
-from sionna_partial.simulation.frontiers import Frontier, find_frontiers
-from sionna_partial.simulation.robot import ROBOT_RADII_M
+from sionna_partial.simulation.frontiers import Frontier, find_frontiers, wide_frontiers
+from sionna_partial.simulation.robot import FORWARD_M, ROBOT_RADII_M, Choice, Robot
 
 GOALS = ("coverage", "state", "area")
 """What is to become known; the first is the default."""
@@ -45,14 +46,11 @@ MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
 SPACING_M, MOST_RECEIVERS = 0.5, 1500
 """Distance between predicted receivers [m], and about their largest number; on large maps they are farther apart."""
 
-POSSIBLE_TRANSMITTERS = 4
+POSSIBLE_TRANSMITTERS = 3
 """Number of positions that stand for all possible ones of a transmitter."""
 
 LOOK_M = 1.25
 """Driving that takes as long as choosing a view and turning towards it [m]."""
-
-SMALLEST_M = 0.35
-"""Width of the smallest frontier that is driven to if there are others [m]: about that of the robot."""
 
 _HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
 
@@ -70,8 +68,8 @@ class NextView(Shown):
     path_length_m : float
         Length of the shortest safe path from the start [m].
     gain : float
-        Expected gain in information: uncertainty of the receivers in view, one per square metre [bit]; for the goal
-        "area" the unknown area in view [m^2].
+        Expected gain in information: uncertainty that the view removes, summed over receivers, one per square metre
+        [bit], the mean over transmitters; for the goal "area" the unknown area in view [m^2].
     gain_per_m : float
         `gain` per metre driven, where looking counts as `LOOK_M` more. Views are ranked by it.
     path_m : (K, 2) float64 array
@@ -103,8 +101,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_n
     tx_m : (T, 3) float64 array
         Transmitters that were predicted [m]; none for the goal "area".
     uncertainty : xarray.DataArray
-        On (y, x): what a receiver's link is uncertain by [bit], the probability that it is indoors included; for the
-        goal "area" 1 in unknown cells.
+        On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors.
     goal : {"coverage", "state", "area"}
     """
 
@@ -172,8 +169,9 @@ def next_views(
 ) -> NextViews:
     """Rank poses from which a robot would lower the uncertainty of a coverage map most per metre driven.
 
-    A pose is in the middle of a frontier between free and unknown cells, and looks where most is to be learnt: the
-    uncertainty of the receivers in view, as predicted by `predict_map`, if none of the unknown cells in view is a wall.
+    A pose is in the middle of a frontier between free and unknown cells, and looks where most is unknown. A view that
+    shows a part of the unobserved part of a link's direct line is expected to lower the uncertainty of that link, as
+    `predict_map` predicts it, by that fraction. Unknown cells count as free until they are seen.
 
     Parameters
     ----------
@@ -230,30 +228,74 @@ def next_views(
     uncertainty = _uncertainty(partial, tx_m, measurements, None if goal == "state" else threshold_db)
     none = np.zeros(partial.shape, dtype=bool)
     radius = ROBOT_RADII_M[0] / partial.resolution_m
-    frontiers = find_frontiers(partial.state, cell, partial.resolution_m, radius, none, none)
-    wide = [each for each in frontiers if len(each.cells) * partial.resolution_m >= SMALLEST_M] or frontiers
-    per_cell = uncertainty.sel(_axes_m(partial), method="nearest").to_numpy() * partial.resolution_m**2
-    views = sorted((_view(partial, each, per_cell, sensor) for each in wide), key=lambda view: -view.gain_per_m)
-    start_m = np.asarray(start, dtype=np.float64) if start is not None else _centres_m(partial, np.array(cell))
+    frontiers = wide_frontiers(
+        find_frontiers(partial.state, cell, partial.resolution_m, radius, none, none), partial.resolution_m
+    )
+    gains = _gains(partial, frontiers, tx_m, uncertainty, sensor)
+    views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
+    views.sort(key=lambda view: -view.gain_per_m)
+    start_m = _centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
     return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal)
 
 
-def _view(partial: PartialMap, frontier: Frontier, per_cell: NDArray[np.float64], sensor: SensorSettings) -> NextView:
-    """Choose the heading at a frontier."""
-    shown = unknown_in_view(partial.state, frontier.route[-1], _HEADINGS_DEG, partial.resolution_m, sensor)
-    gains = [float(per_cell[tuple(cells.T)].sum()) for cells in shown]
-    best = int(np.argmax(gains))
+def coverage_choice(
+    home: PartialMap, origin_m: tuple[float, float], tx: ArrayLike | None, sensor: SensorSettings
+) -> Choice:
+    """Return how a robot, whose map has another origin, chooses frontiers for the coverage of transmitters."""
+    if tx is not None:
+        _transmitters(home, tx, None)
+
+    def choose(robot: Robot, frontiers: list[Frontier]) -> int:
+        if len(frontiers) == 1:
+            return 0
+        partial = replace(home, state=robot.seen.copy(), origin_m=origin_m, interior_cells=None)
+        tx_m = _transmitters(partial, tx, None)
+        gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(partial, tx_m, None, None), sensor)
+        return int(np.argmax(np.array(gains) / [robot.steps_to(each) + LOOK_M / FORWARD_M for each in frontiers]))
+
+    return choose
+
+
+def _gains(
+    partial: PartialMap,
+    frontiers: list[Frontier],
+    tx_m: NDArray[np.float64],
+    uncertainty: xr.DataArray,
+    sensor: SensorSettings,
+) -> tuple[list[float], list[float]]:
+    """Return what is gained at each frontier, and the heading with the largest unknown area in view [degree].
+
+    A view that shows a part of the unobserved part of a link's direct line is taken to lower its uncertainty by that
+    fraction.
+    """
+    x, y = np.meshgrid(uncertainty.x, uncertainty.y)
+    rx = in_cells(partial, np.stack([x.ravel(), y.ravel()], axis=1))
+    each_m2 = uncertainty.attrs["spacing_m"] ** 2 / max(1, len(tx_m))
+    links = []
+    for tx, bits in zip(in_cells(partial, tx_m), uncertainty.to_numpy(), strict=True):
+        starts = np.broadcast_to(tx, rx.shape)
+        unobserved = map_line_fractions(partial, starts, rx)[:, CellState.UNKNOWN]
+        counts = (unobserved > GRAZE) & (bits.ravel() > 0.0)
+        links.append((starts[counts], rx[counts], bits.ravel()[counts] / unobserved[counts] * each_m2))
+    gains, headings_deg = [], []
+    for frontier in frontiers:
+        shown = unknown_in_view(partial.state, frontier.route[-1], _HEADINGS_DEG, partial.resolution_m, sensor)
+        best = int(np.argmax([len(cells) for cells in shown]))
+        headings_deg.append(float(_HEADINGS_DEG[best]))
+        gain = len(shown[best]) * partial.resolution_m**2 if not links else 0.0
+        view = np.full(partial.shape, np.uint8(CellState.FREE))
+        view[tuple(shown[best].T)] = CellState.UNKNOWN
+        for starts, ends, bits in links:
+            gain += float(line_fractions(view, starts, ends)[:, CellState.UNKNOWN] @ bits)
+        gains.append(gain)
+    return gains, headings_deg
+
+
+def _view(partial: PartialMap, frontier: Frontier, gain: float, heading_deg: float) -> NextView:
     path_m = _centres_m(partial, frontier.route)
     length_m = float(np.linalg.norm(np.diff(path_m, axis=0), axis=1).sum())
-    return NextView(
-        position_m=path_m[-1],
-        heading_deg=float(_HEADINGS_DEG[best]),
-        path_length_m=length_m,
-        gain=gains[best],
-        gain_per_m=gains[best] / (length_m + LOOK_M),
-        path_m=path_m,
-        frontier_m=_centres_m(partial, frontier.cells),
-    )
+    frontier_m = _centres_m(partial, frontier.cells)
+    return NextView(path_m[-1], heading_deg, length_m, gain, gain / (length_m + LOOK_M), path_m, frontier_m)
 
 
 def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]:
@@ -303,13 +345,11 @@ def _possible_m(partial: PartialMap) -> NDArray[np.float64]:
 def _uncertainty(
     partial: PartialMap, tx_m: NDArray[np.float64], measurements: Any, threshold_db: float | None
 ) -> xr.DataArray:
-    """Predict the uncertainty of links [bit]: of P(gain > threshold), or of the link state; the mean over transmitters."""
+    """Predict the uncertainty of links on (tx, y, x) [bit]: of P(gain > threshold), or of the link state."""
     x0, y0, x1, y1 = partial.bounds_m
-    if not len(tx_m):
-        return xr.DataArray((partial.state == CellState.UNKNOWN).astype(np.float64), _axes_m(partial), ("y", "x"))
     spacing_m = min(max(SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MOST_RECEIVERS)), x1 - x0, y1 - y0)
     measured = None if measurements is None else measurements_of(measurements)
-    total = 0.0
+    layers = [xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))] * (not len(tx_m))
     for each_m in tx_m:
         own = measured is not None and (np.linalg.norm(measured.tx - each_m, axis=1) <= SAME_TX_M).any()
         told = measured if own or len(tx_m) == 1 else None
@@ -319,14 +359,10 @@ def _uncertainty(
         else:
             above = probability_above(coverage, threshold_db)
             p = np.stack([above, 1.0 - above])
-        total = total + (entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0) / len(tx_m)
-    return total.rename("uncertainty").assign_attrs(long_name="uncertainty of the link", units="bit")
-
-
-def _axes_m(partial: PartialMap) -> dict[str, NDArray[np.float64]]:
-    """Return y and x of the centres of rows and columns [m]."""
-    centres_m = zip(("y", "x"), partial.shape, partial.origin_m[::-1], strict=True)
-    return {name: (np.arange(size) + 0.5) * partial.resolution_m + low_m for name, size, low_m in centres_m}
+        layers.append((entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0))
+    together = xr.concat(layers, "tx") if len(tx_m) else layers[0]
+    attributes = {"long_name": "uncertainty of the link", "units": "bit", "spacing_m": spacing_m}
+    return together.rename("uncertainty").assign_attrs(attributes)
 
 
 def _centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import BLUE, RED, STAR, WALL, YELLOW, Figure, corners_m, legend_below, window_m
 
 _WIDTH_IN, _DPI = 8.0, 130
-_AROUND_M, _VIEW_M, _VIEW_DEG = 3.0, 0.9, 60.0
+_AROUND_M, _VIEW_M, _VIEW_DEG = 1.5, 0.9, 60.0
 
 
 def plot_next_views(views: NextViews) -> Figure:
@@ -52,22 +52,8 @@ def plot_next_views(views: NextViews) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
     draw_map(axis, partial)
-    if views.goal != "area":
-        half = 0.5 * float(views.uncertainty.x[1] - views.uncertainty.x[0])
-        x, y = views.uncertainty.x.to_numpy(), views.uncertainty.y.to_numpy()
-        extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
-        most = 1.0 if views.goal == "coverage" else math.log2(3)
-        picture = axis.imshow(
-            views.uncertainty,
-            extent=extent,
-            origin="lower",
-            cmap="Purples",
-            vmin=0.0,
-            vmax=most,
-            alpha=0.85,
-            zorder=0.7,
-        )
-        figure.colorbar(picture, ax=axis, label="uncertainty of the link [bit]", shrink=0.8)
+    if len(views.tx_m):
+        _draw_uncertainty(figure, axis, views)
     for rank, view in reversed([*enumerate(views, start=1)]):
         _draw_view(axis, rank, view)
     axis.plot(*views.start_m, marker="o", color=BLUE, markersize=7, markeredgecolor="white", zorder=5)
@@ -84,6 +70,15 @@ def plot_next_views(views: NextViews) -> Figure:
         handles.insert(0, Line2D([], [], label="transmitter", markersize=13, **STAR))
     legend_below(figure, handles)
     return figure
+
+
+def _draw_uncertainty(figure: Figure, axis: Axes, views: NextViews) -> None:
+    x, y = views.uncertainty.x.to_numpy(), views.uncertainty.y.to_numpy()
+    half = 0.5 * views.uncertainty.attrs["spacing_m"]
+    style = {"extent": (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half), "origin": "lower", "zorder": 0.7}
+    most = 1.0 if views.goal == "coverage" else math.log2(3)
+    picture = axis.imshow(views.uncertainty.mean("tx"), cmap="Purples", vmin=0.0, vmax=most, alpha=0.85, **style)
+    figure.colorbar(picture, ax=axis, label="uncertainty of the link [bit]", shrink=0.8)
 
 
 def _draw_view(axis: Axes, rank: int, view: NextView) -> None:

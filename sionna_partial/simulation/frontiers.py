@@ -14,6 +14,9 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.planar import grid_edges
 
+WIDE_M = 0.35
+"""Length of a frontier that is about as wide as a robot [m]."""
+
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 _EIGHT = np.ones((3, 3), dtype=bool)
 _SMALLEST_FRONTIER_CELLS = 3
@@ -62,6 +65,11 @@ def find_frontiers(
         if math.isfinite(cost_m):
             found.append(Frontier(cells, router.path_to(middle - corner) + corner, cost_m))
     return found
+
+
+def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
+    """Return those of at least a robot's width, or all if none is."""
+    return [each for each in frontiers if len(each.cells) * cell_m >= WIDE_M] or frontiers
 
 
 def part_of(low: Sequence[int], high: Sequence[int]) -> tuple[slice, slice]:

@@ -16,7 +16,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import Camera
-from sionna_partial.simulation.frontiers import Frontier, find_frontiers, part_of
+from sionna_partial.simulation.frontiers import Frontier, find_frontiers, part_of, wide_frontiers
 
 FORWARD_M = 0.25
 """Length of a forward action [m] (Active Neural SLAM, Section 4)."""
@@ -48,7 +48,6 @@ _AHEAD_M = 0.3
 _BUMP_M = 0.25
 _ARRIVAL_M = 0.3
 _DECISION_STEPS = 5.0
-_WIDE_M = 0.35
 
 
 Choice = Callable[["Robot", list[Frontier]], int]
@@ -114,7 +113,7 @@ class Robot:
             if self._choose is None:
                 chosen = frontiers[self._draw(frontiers)]
             else:
-                wide = [each for each in frontiers if len(each.cells) * self._cell_m >= _WIDE_M] or frontiers
+                wide = wide_frontiers(frontiers, self._cell_m)
                 chosen = wide[self._choose(self, wide)]
             route = self._route = chosen.route
             self._route_steps = 0
