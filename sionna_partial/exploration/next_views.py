@@ -3,7 +3,7 @@
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
@@ -109,7 +109,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_n
     partial: PartialMap
     start_m: NDArray[np.float64]
     tx_m: NDArray[np.float64]
-    uncertainty: xr.DataArray
+    uncertainty: xr.DataArray = field(repr=False)
     goal: str
 
     def __len__(self) -> int:

@@ -4,7 +4,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,7 +16,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.progress import reporting
-from sionna_partial.settings import SensorSettings
+from sionna_partial.settings import Policy, SensorSettings
 from sionna_partial.simulation.robot import Choice, Robot
 
 MAX_STEPS = 100_000
@@ -28,9 +28,6 @@ its map may block every route."""
 
 PROGRESS = 0.005
 """Fraction of the free area that counts as progress."""
-
-Policy = Literal["random", "coverage"]
-"""How a robot chooses frontiers."""
 
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
 _MARGIN_M = 2.0
