@@ -1,10 +1,10 @@
 """Where a robot that is to predict coverage should drive: an oracle, and what can be computed without it.
 
 In every home robots with the same camera and start explore for 300 steps. They differ in which frontier they choose:
-one at random (`explore`), the nearest, the one that shows the largest unknown area per action, or the most uncertainty
-of the predicted links. The oracle (`--oracle`) tries the frontiers in simulation, and takes the one whose views lower
-the error of the prediction most per action. Prediction and truth are compared on the same links every 15 steps. Run it
-with
+one at random (`explore`), the nearest, the one that shows the largest unknown area per action, the most uncertainty of
+receivers (`entropy`), or the most uncertain lines to receivers (`lines`, as `next_views`). The oracle (`--oracle`)
+tries frontiers in simulation, and takes the one whose views lower the error of the prediction most per action; the far
+oracle goes on for 40 actions. Prediction and truth are compared on the same links every 25 steps. Run it with
 
     python benchmarks/next_views.py ../shared/gibson/*/map.yaml --oracle --out views.jsonl
     python benchmarks/next_views.py --table views.jsonl
@@ -25,7 +25,7 @@ import sionna_partial as sp
 from sionna_partial.coverage import clear_of_walls
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import SensorSettings
-from sionna_partial.simulation.camera import _cast_rays, _ray_angles, _Rays
+from sionna_partial.simulation.camera import unknown_in_view
 from sionna_partial.simulation.robot import Choice, Frontier, Robot
 
 STEPS, EVERY = 300, 25
@@ -33,8 +33,9 @@ CANDIDATES = 4
 HORIZON = 40
 GRID_M, AROUND_M = 0.8, 3.0
 DECISION_STEPS = 5.0
-HEADINGS = 8
+HEADINGS_DEG = np.arange(0.0, 360.0, 45.0)
 ACCURACIES = (0.80, 0.85)
+DIGITS = (0, 0, 3, 2, 3)
 SENSOR = SensorSettings()
 
 
@@ -51,7 +52,7 @@ class Home:
         self.truth = np.pad(home.state, 1, constant_values=sp.CellState.UNKNOWN)
 
     def map_of(self, robot: Robot) -> sp.PartialMap:
-        """What a robot has seen."""
+        """Return what a robot has seen."""
         state = robot.seen[1:-1, 1:-1]
         return sp.PartialMap(state.copy(), self.home.resolution_m, self.home.origin_m, self.home.wall_height_m)
 
@@ -65,26 +66,9 @@ class Home:
         return float((state == self.state).mean()), float(np.sqrt(((mean - self.gain_db) ** 2).mean())), float(brier)
 
 
-def best_view(robot: Robot, frontier: Frontier, cell_m: float) -> NDArray[np.bool_]:
-    """Cells that the largest view from the end of a route would show, as far as walls are known."""
-    row, column = frontier.route[-1] + 0.5
-    reach = SENSOR.range_m / cell_m
-    low = np.maximum(0, np.array([row, column]) - reach - 2).astype(int)
-    part = tuple(slice(a, int(b + reach + 3)) for a, b in zip(low, (row, column), strict=True))
-    seen = np.pad(robot.seen[part], 1, constant_values=sp.CellState.WALL)
-    open_, nothing = np.where(seen == sp.CellState.WALL, seen, sp.CellState.FREE), np.zeros(seen.shape, bool)
-    best, most = nothing, -1
-    for heading_deg in np.arange(HEADINGS) * 360.0 / HEADINGS:
-        angles = _ray_angles(heading_deg, SENSOR.field_of_view_deg, reach)
-        view = np.full_like(seen, sp.CellState.UNKNOWN)
-        start = (column - low[1] + 1, row - low[0] + 1)
-        _cast_rays(open_.astype(np.uint8), nothing, view, (0, 0), _Rays(start, (0.0, 0.0), angles, 0 * angles, reach))
-        new = (view == sp.CellState.FREE) & (seen == sp.CellState.UNKNOWN)
-        if new.sum() > most:
-            best, most = new, int(new.sum())
-    whole = np.zeros(robot.seen.shape, bool)
-    whole[part] = best[1:-1, 1:-1]
-    return whole
+def best_view(robot: Robot, frontier: Frontier, cell_m: float) -> NDArray[np.intp]:
+    """Unknown cells (N, 2) of the largest view from the end of a route, as far as walls are known."""
+    return max(unknown_in_view(robot.seen, frontier.route[-1], HEADINGS_DEG, cell_m, SENSOR), key=len)
 
 
 def rate(robot: Robot, values: NDArray[np.float64], frontiers: list[Frontier]) -> NDArray[np.float64]:
@@ -99,7 +83,7 @@ def nearest(robot: Robot, frontiers: list[Frontier]) -> int:
 
 def areas(home: Home, robot: Robot, frontiers: list[Frontier]) -> NDArray[np.float64]:
     """Unknown area that each frontier shows, per action."""
-    shown = [best_view(robot, each, home.home.resolution_m).sum() for each in frontiers]
+    shown = [len(best_view(robot, each, home.home.resolution_m)) for each in frontiers]
     return rate(robot, np.array(shown, float), frontiers)
 
 
@@ -124,9 +108,7 @@ def policies(home: Home, *, oracle: bool) -> dict[str, Choice | None]:
     return chosen
 
 
-def uncertainty_shown(
-    home: Home, robot: Robot, frontiers: list[Frontier], lines: bool
-) -> NDArray[np.float64]:
+def uncertainty_shown(home: Home, robot: Robot, frontiers: list[Frontier], lines: bool) -> NDArray[np.float64]:
     """Entropy of the link states of receivers that each frontier shows, or of the fraction of their lines shown."""
     partial = home.map_of(robot)
     rows, columns = (np.flatnonzero((partial.state != sp.CellState.UNKNOWN).any(axis=axis)) for axis in (1, 0))
@@ -145,7 +127,9 @@ def uncertainty_shown(
     entropy = np.nan_to_num(-(p * np.log(np.maximum(p, 1e-12))).sum(axis=0) * weight)
     values = []
     for frontier in frontiers:
-        shown = best_view(robot, frontier, cell_m)[1:-1, 1:-1]
+        shown = np.zeros(robot.seen.shape, dtype=bool)
+        shown[tuple(best_view(robot, frontier, cell_m).T)] = True
+        shown = shown[1:-1, 1:-1]
         if not lines:
             at = np.floor((rx_m[:, :2] - partial.origin_m) / cell_m).astype(int)
             values.append((entropy * shown[at[:, 1], at[:, 0]]).sum())
@@ -188,7 +172,9 @@ def oracle_of(home: Home, horizon: int) -> Choice:
         for index in tried:
             twin = copy.deepcopy(robot)
             twin._choose, twin._route, twin._route_steps = largest if horizon else again, frontiers[index].route, 0
-            for steps in range(1, 1 + (horizon or STEPS)):
+            steps = 0
+            while steps < (horizon or STEPS):
+                steps += 1
                 try:
                     twin.act()
                 except _ChoosesAgain:
@@ -231,11 +217,9 @@ def main() -> None:
     for seed, path in enumerate(arguments.maps, start=arguments.seed):
         rng = np.random.default_rng(seed)
         home = Home(sp.load_map(path), arguments.transmitters, arguments.receivers, rng)
-        curves = {
-            name: curve(home, seed, choose) for name, choose in policies(home, oracle=arguments.oracle).items()
-        }
+        curves = {name: curve(home, seed, choose) for name, choose in policies(home, oracle=arguments.oracle).items()}
         records.append({"home": path.parent.name, "seed": seed, "curves": curves})
-        print(path.parent.name, seed, {name: round(float(np.mean(v, axis=0)[1]), 4) for name, v in curves.items()}, flush=True)
+        print(path.parent.name, "done", flush=True)
         if arguments.out:
             with arguments.out.open("a") as stream:
                 stream.write(json.dumps(records[-1]) + "\n")
@@ -243,7 +227,7 @@ def main() -> None:
 
 
 def steps_to(accuracy: NDArray[np.float64], level: float) -> float:
-    """Steps after which an accuracy is reached; `STEPS` where it is not."""
+    """Return the steps after which an accuracy is reached; `STEPS` where it is not."""
     reached = np.flatnonzero(accuracy >= level)
     if not len(reached):
         return float(STEPS)
@@ -255,27 +239,27 @@ def steps_to(accuracy: NDArray[np.float64], level: float) -> float:
 
 
 def table(records: list[dict]) -> Iterator[str]:
-    """Lines of a table, as Markdown: means over homes, and paired differences from the nearest frontier."""
+    """Lines of a table, as Markdown: means over homes, in brackets paired changes from the nearest frontier."""
     values: dict[str, dict[str, list[list[float]]]] = defaultdict(lambda: defaultdict(list))
     for record in records:
         for name, each in record["curves"].items():
             seen, accuracy, rmse_db = np.array(each).T
             row = [steps_to(accuracy, level) for level in ACCURACIES] + [accuracy.mean(), rmse_db.mean(), seen.mean()]
             values[name][record["home"]].append(row)
-    of_home = {name: np.array([np.mean(rows, axis=0) for rows in homes.values()]) for name, homes in values.items()}
-    yield f"{len(of_home['nearest'])} homes, {len(records)} explorations\n"
-    yield "| frontier | steps to .80 | steps to .85 | mean accuracy | mean RMSE [dB] | mean observed |"
-    yield "|---|---|---|---|---|---|"
-    for name, rows in of_home.items():
-        a, b, c, d, e = rows.mean(axis=0)
-        yield f"| {name} | {a:.0f} | {b:.0f} | {c:.3f} | {d:.2f} | {e:.3f} |"
-    yield ""
-    for name, rows in of_home.items():
-        if name != "nearest":
-            change = rows - of_home["nearest"]
-            mean, error = change.mean(axis=0), change.std(axis=0, ddof=1) / np.sqrt(len(change)) if len(change) > 1 else 0 * change[0]
-            cells = [f"{m:+.{n}f} ± {s:.{n}f}" for m, s, n in zip(mean, error, (0, 0, 3, 2, 3), strict=True)]
-            yield f"| {name} - nearest | " + " | ".join(cells) + " |"
+    yield "| frontier | homes | steps to .80 | steps to .85 | mean accuracy | mean RMSE [dB] | mean observed |"
+    yield "|---|---|---|---|---|---|---|"
+    of_home = {name: {home: np.mean(rows, axis=0) for home, rows in homes.items()} for name, homes in values.items()}
+    for name, homes in of_home.items():
+        rows = np.array(list(homes.values()))
+        base = np.array([of_home["nearest"][home] for home in homes])
+        means = [f"{mean:.{digits}f}" for mean, digits in zip(rows.mean(axis=0), DIGITS, strict=True)]
+        errors = (rows - base).std(axis=0, ddof=min(1, len(rows) - 1)) / np.sqrt(len(rows))
+        changes = zip((rows - base).mean(axis=0), errors, DIGITS, strict=True)
+        cells = [
+            mean + (f" ({change:+.{digits}f} ± {error:.{digits}f})" if name != "nearest" else "")
+            for mean, (change, error, digits) in zip(means, changes, strict=True)
+        ]
+        yield f"| {name} | {len(rows)} | " + " | ".join(cells) + " |"
 
 
 if __name__ == "__main__":

@@ -46,7 +46,8 @@ _FREE, _WALL, _UNKNOWN, _UNSEEN_WALL = "white", "black", "0.86", "0.68"
 _VIEW_OPACITY = 0.35
 _WIDTH_IN, _DPI = 8.0, 165
 _FRAME_IN, _FRAME_DPI = 5.6, 90
-_MIXED_COLOURS, _MOST_MIXED_COLOURS, _ALIKE = 128, 240, 16
+_MIXED_COLOURS, _ALIKE = 128, 16
+_MAX_COVERAGE = Image.Quantize.MAXCOVERAGE
 _SPACING_M, _PALEST = 0.3, 0.35
 _PREDICTED = {
     "gain_mean_db": ("predicted path gain [dB]", "viridis", -150.0, -50.0),
@@ -138,8 +139,7 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], 
             _beside(frame, _predicted(partial, tx, (x0, x1, y0, y1), size))
             for frame, partial in zip(frames, exploration.maps, strict=True)
         ]
-    sample = frames[-1] if tx is None else _beside(frames[0], frames[-1])
-    palette = _palette(sample, _MIXED_COLOURS if tx is None else _MOST_MIXED_COLOURS)
+    palette = _palette(frames[-1]) if tx is None else _beside(frames[0], frames[-1]).quantize(256, _MAX_COVERAGE)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     times_ms = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
     with atomic_write(path) as stream:
@@ -190,11 +190,11 @@ def _beside(left: Image.Image, right: Image.Image) -> Image.Image:
     return both
 
 
-def _palette(frame: Image.Image, count: int) -> Image.Image:
+def _palette(frame: Image.Image) -> Image.Image:
     """Choose the colours of all frames: exactly those that are drawn, and the mixtures that the last frame has."""
     drawn = np.array([to_rgb(colour) for colour in (_FREE, _WALL, _UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
     exact = np.rint(255 * drawn).astype(int)
-    mixed = np.reshape(frame.quantize(count, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
+    mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
     apart = np.abs(mixed[:, None] - exact).max(axis=2).min(axis=1) > _ALIKE
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate([exact, mixed[apart]]).ravel().tolist())
