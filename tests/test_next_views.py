@@ -64,7 +64,7 @@ def test_area_is_that_of_the_unknown_cells_in_view(hall):
     (door, hole) = sorted(sp.next_views(hall, goal="area", start=at(1.0, 1.9)), key=lambda view: -view.gain)
     assert door.position_m == pytest.approx(at(3.9, 1.7), abs=0.25)
     assert door.heading_deg == 0.0
-    assert 2.0 < door.gain < math.pi / 4 * 3.2**2
+    assert 5.0 < door.gain < 1.2 * math.pi / 4 * 3.2**2
     assert hole.gain < 2.0
     near = sp.next_views(hall, goal="area", start=at(1.0, 1.3))[1]
     assert near.position_m == pytest.approx(hole.position_m)
@@ -135,7 +135,7 @@ def test_maps_where_nothing_can_stand():
     with pytest.raises(MapError, match="the map has 0 free cells: a robot needs somewhere to stand"):
         sp.next_views(sp.map_from_array([[2, 2], [2, 2]], resolution_m=1.0))
     with pytest.raises(PositionError, match="tx can be in no free cell clear of walls: give a transmitter"):
-        sp.next_views(sp.map_from_array(np.where(np.eye(8), 0, 1).astype(int), resolution_m=0.01))
+        sp.next_views(sp.map_from_array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], resolution_m=0.01))
 
 
 def test_picture(hall):

@@ -4,6 +4,7 @@ import io
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -173,7 +174,7 @@ def _predicted(
         left = 0.1 + column * (size[0] + 0.5)
         panel = figure.add_axes((left / wide, 0.3 / size[1], width / wide, height / size[1]))
         draw_map(panel, partial)
-        limits = {"vmin": least, "vmax": most, "extent": extent, "origin": "lower"}
+        limits: dict[str, Any] = {"vmin": least, "vmax": most, "extent": extent, "origin": "lower"}
         picture = panel.imshow(coverage[name], cmap=colours, alpha=alpha, zorder=2.0, **limits)
         panel.plot(*np.ravel(tx)[:2], markersize=15, zorder=5, **STAR)
         panel.set(xlim=window[:2], ylim=window[2:], aspect="equal", xticks=[], yticks=[])

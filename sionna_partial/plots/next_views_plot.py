@@ -1,6 +1,7 @@
 """Figure of next views: the map, the uncertainty of the prediction, and the poses from which a robot lowers it."""
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -75,7 +76,11 @@ def plot_next_views(views: NextViews) -> Figure:
 def _draw_uncertainty(figure: Figure, axis: Axes, views: NextViews) -> None:
     x, y = views.uncertainty.x.to_numpy(), views.uncertainty.y.to_numpy()
     half = 0.5 * views.uncertainty.attrs["spacing_m"]
-    style = {"extent": (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half), "origin": "lower", "zorder": 0.7}
+    style: dict[str, Any] = {
+        "extent": (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half),
+        "origin": "lower",
+        "zorder": 0.7,
+    }
     most = 1.0 if views.goal == "coverage" else math.log2(3)
     picture = axis.imshow(views.uncertainty.mean("tx"), cmap="Purples", vmin=0.0, vmax=most, alpha=0.85, **style)
     figure.colorbar(picture, ax=axis, label="uncertainty of the link [bit]", shrink=0.8)
@@ -87,4 +92,13 @@ def _draw_view(axis: Axes, rank: int, view: NextView) -> None:
     ends_deg = view.heading_deg + np.array([-0.5, 0.5]) * _VIEW_DEG
     axis.add_patch(Wedge(tuple(view.position_m), _VIEW_M, *ends_deg, color=YELLOW, alpha=0.8, linewidth=0, zorder=4))
     label = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
-    axis.text(*view.position_m, str(rank), fontsize=8, ha="center", va="center", bbox=label, zorder=6)
+    axis.text(
+        float(view.position_m[0]),
+        float(view.position_m[1]),
+        str(rank),
+        fontsize=8,
+        ha="center",
+        va="center",
+        bbox=label,
+        zorder=6,
+    )
