@@ -22,8 +22,8 @@ SECTIONS = {
     "Start": ["docs/install", "docs/usage"],
     "Guides": [
         *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/channels", "docs/transmitters"),
-        *("docs/measured_powers", "docs/calibration", "docs/placement", "docs/differentiable", "docs/training"),
-        "docs/cluster",
+        *("docs/measured_powers", "docs/calibration", "docs/placement", "docs/next_views", "docs/differentiable"),
+        *("docs/training", "docs/cluster"),
     ],
     "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],
     "Reference": ["build/api/index", "docs/conventions", "docs/glossary"],
@@ -47,6 +47,7 @@ ROOMS = {
     "simulation": "Homes and robots",
     "calibration": "Calibration and placement",
     "placement": "Calibration and placement",
+    "exploration": "Homes and robots",
     "differentiable": "Gradients",
     "datasets": "Data sets and training",
     "training": "Data sets and training",

@@ -15,6 +15,9 @@ from sionna_partial.datasets.shards import read_dataset as read_dataset
 from sionna_partial.differentiable.scene import DifferentiableScene as DifferentiableScene
 from sionna_partial.errors import SionnaPartialError as SionnaPartialError
 from sionna_partial.evaluation.evaluate import evaluate as evaluate
+from sionna_partial.exploration.next_views import NextView as NextView
+from sionna_partial.exploration.next_views import NextViews as NextViews
+from sionna_partial.exploration.next_views import next_views as next_views
 from sionna_partial.export import load_coverage as load_coverage
 from sionna_partial.export import save_coverage as save_coverage
 from sionna_partial.export import save_network as save_network
@@ -44,6 +47,7 @@ from sionna_partial.plots.map_plot import plot_map as plot_map
 from sionna_partial.plots.material_plot import plot_calibration as plot_calibration
 from sionna_partial.plots.network_plot import plot_network as plot_network
 from sionna_partial.plots.network_plot import plot_network_placement as plot_network_placement
+from sionna_partial.plots.next_views_plot import plot_next_views as plot_next_views
 from sionna_partial.plots.placement_plot import plot_placement as plot_placement
 from sionna_partial.prediction.features import LinkFeatures as LinkFeatures
 from sionna_partial.prediction.features import link_features as link_features

@@ -50,6 +50,9 @@ NetworkKind = Literal["paper", "paths", "map"]
 Objective = Literal["coverage", "percentile"]
 """What a transmitter is placed for: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
 
+Policy = Literal["random", "coverage"]
+"""How an exploring robot chooses frontiers."""
+
 Frequency = Annotated[float, Within(*FREQUENCIES_HZ)]
 Fraction = Annotated[float, Within(0.0, 1.0)]
 Height = Annotated[float, Within(0.0, 1000.0, open_low=True)]

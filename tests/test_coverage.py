@@ -362,7 +362,6 @@ def test_progress_grows_to_1(fakes):
         ({"tx": (0.6, 3.6, 9.0)}, PositionError, r"tx = .* is not between floor and ceiling"),
         ({"tx": "here"}, PositionError, r"tx = 'here' is not numeric"),
         ({"tx": (("a", "b"))}, PositionError, r"tx = \('a', 'b'\) is not numeric"),
-        ({"tx": [(0.6, 3.6, 1.5), (0.7, 3.6, 1.5)]}, PositionError, r"tx has shape \(2, 3\): give one transmitter"),
         ({"rx_height_m": 0.0}, SettingsError, r"rx_height_m = 0\.0 is not allowed"),
         ({"rx_height_m": 3.0}, SettingsError, r"rx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
         ({"rx_height_m": float("nan")}, SettingsError, r"rx_height_m = nan is not allowed"),

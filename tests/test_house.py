@@ -28,7 +28,7 @@ ROOMS = {
         *("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.points", "mesh.files", "ros_map"),
         *("drawings", "bags", "map_files"),
     ),
-    "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
+    "simulation": ("furniture", "buildings", "homes", "camera", "frontiers", "robot", "explore"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
         *("candidates", "paths", "links", "engine", "slab"),
@@ -50,12 +50,13 @@ ROOMS = {
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
+    "exploration": ("next_views",),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training",),
     "plots": (
         *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
-        *("material_plot", "placement_plot", "network_plot", "evaluation_plot"),
+        *("material_plot", "placement_plot", "network_plot", "next_views_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
     "cli": ("options", "prediction", "channels", "network", "learning", "planning", "app"),
@@ -195,7 +196,7 @@ class TestLightImports:
         "command",
         [
             *("", "predict", "export-scene", "explore", "dataset", "train", "evaluate"),
-            *("calibrate", "place", "channels", "network", "demo", "info"),
+            *("calibrate", "place", "next", "channels", "network", "demo", "info"),
         ],
     )
     def test_help(self, command: str) -> None:

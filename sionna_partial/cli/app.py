@@ -15,7 +15,7 @@ from sionna_partial.cli.channels import channels
 from sionna_partial.cli.learning import dataset, evaluate, train
 from sionna_partial.cli.network import network
 from sionna_partial.cli.options import TransmitterCommand
-from sionna_partial.cli.planning import calibrate, place
+from sionna_partial.cli.planning import calibrate, next_views, place
 from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.process import end_at_signals, end_process
@@ -98,5 +98,7 @@ def _prepare(
 app.command(cls=TransmitterCommand)(predict)
 app.command(cls=TransmitterCommand)(channels)
 app.command(cls=TransmitterCommand)(network)
-for _command in (export_scene, explore, dataset, train, evaluate, calibrate, place, demo, info):
+app.command("next", cls=TransmitterCommand)(next_views)
+app.command(cls=TransmitterCommand)(explore)
+for _command in (export_scene, dataset, train, evaluate, calibrate, place, demo, info):
     app.command()(_command)

@@ -1,4 +1,4 @@
-"""Subcommands that fit a material or a transmitter position: calibrate, place."""
+"""Subcommands that fit a material or a transmitter position, or plan a robot's way: calibrate, place, next."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
 from sionna_partial.files import CALIBRATED_FILE, atomic_files, require_writable
 from sionna_partial.progress import reporting
-from sionna_partial.settings import Objective
+from sionna_partial.settings import Objective, SensorSettings
 
 TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
 """Angles of incidence of the printed losses [degrees]."""
@@ -113,6 +113,60 @@ def place(
         score = f"the worst tenth of the receivers is predicted at {result.score:.1f} dB"
     typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {score}")
     opt.print_files(out, ["placement.json", "placement.png"])
+
+
+def next_views(
+    map_path: opt.Map,
+    out: Annotated[Path, typer.Option(help="Folder for the poses and a picture.", show_default=False)],
+    tx: Annotated[
+        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z. Default: any position.")
+    ] = "",
+    measurements: Annotated[Path | None, typer.Option(help="CSV of measured gains.", show_default=False)] = None,
+    goal: Annotated[str, typer.Option(metavar="coverage|state|area", help="What is to become known.")] = "coverage",
+    count: Annotated[int, typer.Option(help="Largest number of poses.")] = 5,
+    start: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="X Y", help="Where the robot is [m]. Default: amid the free cells.", show_default=False),
+    ] = None,
+    threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
+    field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
+    range_m: opt.Range = SensorSettings.range_m,
+    strict: opt.Strict = False,
+    height_band: opt.HeightBand = None,
+    up: opt.Up = None,
+    wall_height: opt.WallHeight = None,
+) -> None:
+    """Rank poses where a robot learns most about the coverage per metre driven.
+
+    The folder --out gets the poses as YAML, as in a geometry_msgs/PoseArray, and a picture.
+    """
+    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    require_writable(out)
+    with reporting(None, command=True) as report:
+        report(0.0, "predicting")
+        views = sp.next_views(
+            partial,
+            opt.parse_position(tx) if tx else None,
+            measurements,
+            goal,
+            count,
+            start=start,
+            threshold_db=threshold,
+            sensor=SensorSettings(field_of_view_deg=field_of_view, range_m=range_m),
+        )
+        with atomic_files(out) as folder:
+            views.save(folder / "next_views.yaml")
+            sp.plot_next_views(views).savefig(folder / "next_views.png")
+    unit = "m2" if goal == "area" else "bit"
+    for view in views:
+        x, y = view.position_m
+        typer.echo(
+            f"({x:.2f}, {y:.2f}) m, heading {view.heading_deg:.0f} deg, after {view.path_length_m:.1f} m: "
+            f"{view.gain:.2f} {unit}, {view.gain_per_m:.2f} {unit}/m"
+        )
+    if not views:
+        typer.echo("nothing unknown can be reached")
+    opt.print_files(out, ["next_views.yaml", "next_views.png"])
 
 
 def _table(result: "sp.MaterialCalibration") -> str:

@@ -10,7 +10,7 @@ import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
 from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.progress import reporting
-from sionna_partial.settings import SceneSettings, SensorSettings
+from sionna_partial.settings import Policy, SceneSettings, SensorSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 """Formats of a coverage map."""
@@ -102,6 +102,10 @@ def explore(
     range_noise: opt.RangeNoise = SensorSettings.range_noise_m,
     drift: opt.Drift = SensorSettings.drift_m_per_m,
     missed_walls: opt.MissedWalls = SensorSettings.missed_wall_fraction,
+    policy: Annotated[Policy, typer.Option(help="Choice of frontiers: at random, or for the coverage.")] = "random",
+    tx: Annotated[
+        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]: of the policy, and predicted in the animation.")
+    ] = "",
     height_band: opt.HeightBand = None,
     up: opt.Up = None,
 ) -> None:
@@ -110,6 +114,7 @@ def explore(
     The folder --out gets the partial maps, the complete one, a picture and an animation.
     """
     sensor = SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
+    position = opt.parse_position(tx) if tx else None
     require_writable(out)
     with reporting(None, command=True) as report:
         report(0.0, "reading the home" if home else "making a home")
@@ -120,6 +125,8 @@ def explore(
             sorted({*steps, *frames}),
             seed,
             sensor=sensor,
+            policy=policy,
+            tx=position,
             progress=lambda fraction, message: report(0.1 + 0.4 * fraction, message),
         )
         asked, suffix = exploration.at(steps), ".yaml" if complete.mesh is None else ".npz"
@@ -131,7 +138,7 @@ def explore(
             report(0.6, "drawing exploration.png")
             sp.plot_exploration(asked).savefig(folder / "exploration.png")
             report(0.7, "drawing exploration.gif")
-            sp.animate_exploration(exploration, folder / "exploration.gif")
+            sp.animate_exploration(exploration, folder / "exploration.gif", position)
     opt.print_files(out, [*maps, "exploration.png", "exploration.gif"])
 
 

@@ -4,22 +4,28 @@ import io
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.path import Path as MarkerPath
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from sionna_partial.checks import require
 from sionna_partial.constants import CellState
+from sionna_partial.coverage import predict_map
 from sionna_partial.files import atomic_write
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import (
     BLUE,
     RED,
+    STAR,
     YELLOW,
     Figure,
     corners_m,
@@ -42,6 +48,12 @@ _VIEW_OPACITY = 0.35
 _WIDTH_IN, _DPI = 8.0, 165
 _FRAME_IN, _FRAME_DPI = 5.6, 90
 _MIXED_COLOURS, _ALIKE = 128, 16
+_MAX_COVERAGE = Image.Quantize.MAXCOVERAGE
+_SPACING_M, _PALEST = 0.3, 0.35
+_PREDICTED = {
+    "gain_mean_db": ("predicted path gain [dB]", "viridis", -150.0, -50.0),
+    "gain_std_db": ("its standard deviation [dB]", "magma_r", 0.0, 40.0),
+}
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
@@ -88,8 +100,10 @@ def plot_exploration(exploration: Exploration) -> Figure:
     return figure
 
 
-def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) -> None:
+def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], tx: ArrayLike | None = None) -> None:
     """Write a GIF of an exploration, with a frame for each of its `steps`.
+
+    With a transmitter, the predicted path gain and its uncertainty grow beside the map; each frame takes a prediction.
 
     Parameters
     ----------
@@ -97,11 +111,15 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) 
         From `explore_trajectory`, for instance with `steps=range(0, 201, 4)`.
     path : path-like
         The file, with the suffix `.gif`. Equal explorations give equal bytes.
+    tx : (3,) or (2,) array-like, optional
+        Transmitter [m].
 
     Raises
     ------
     SettingsError
         For something else than an Exploration, or another suffix.
+    PositionError
+        For a transmitter outside the map or in a wall.
     OutputError
         If the file cannot be written.
 
@@ -117,7 +135,12 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str]) 
     longest = max(x1 - x0, y1 - y0)
     size = _FRAME_IN * (x1 - x0) / longest + 0.6, _FRAME_IN * (y1 - y0) / longest + 0.7
     frames = [_frame(exploration, index, size) for index in range(len(exploration.steps))]
-    palette = _palette(frames[-1])
+    if tx is not None:
+        frames = [
+            _beside(frame, _predicted(partial, tx, (x0, x1, y0, y1), size))
+            for frame, partial in zip(frames, exploration.maps, strict=True)
+        ]
+    palette = _palette(frames[-1]) if tx is None else _beside(frames[0], frames[-1]).quantize(256, _MAX_COVERAGE)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     times_ms = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
     with atomic_write(path) as stream:
@@ -135,6 +158,37 @@ def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> I
     _draw(panel, exploration, index)
     panel.set(xticks=[], yticks=[], xlabel="", ylabel="")
     return Image.open(io.BytesIO(figure_png(figure))).convert("RGB")
+
+
+def _predicted(
+    partial: PartialMap, tx: ArrayLike, window: tuple[float, float, float, float], size: tuple[float, float]
+) -> Image.Image:
+    """Draw the predicted path gain and its standard deviation, the paler the less likely receivers are indoors."""
+    coverage = predict_map(partial, tx, spacing_m=_SPACING_M, progress=False)
+    width, height, wide = size[0] - 0.6, size[1] - 0.7, 2 * size[0] + 1.0
+    figure = Figure(figsize=(wide, size[1]), dpi=_FRAME_DPI)
+    x, y, half = coverage.x.to_numpy(), coverage.y.to_numpy(), _SPACING_M / 2
+    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
+    alpha = coverage.p_indoor.fillna(0.0).clip(_PALEST, 1.0).to_numpy()
+    for column, (name, (title, colours, least, most)) in enumerate(_PREDICTED.items()):
+        left = 0.1 + column * (size[0] + 0.5)
+        panel = figure.add_axes((left / wide, 0.3 / size[1], width / wide, height / size[1]))
+        draw_map(panel, partial)
+        limits: dict[str, Any] = {"vmin": least, "vmax": most, "extent": extent, "origin": "lower"}
+        picture = panel.imshow(coverage[name], cmap=colours, alpha=alpha, zorder=2.0, **limits)
+        panel.plot(*np.ravel(tx)[:2], markersize=15, zorder=5, **STAR)
+        panel.set(xlim=window[:2], ylim=window[2:], aspect="equal", xticks=[], yticks=[])
+        panel.set_title(title, fontsize=11)
+        bar = figure.add_axes(((left + width + 0.08) / wide, 0.3 / size[1], 0.12 / wide, height / size[1]))
+        figure.colorbar(ScalarMappable(picture.norm, colours), cax=bar)
+    return Image.open(io.BytesIO(figure_png(figure))).convert("RGB")
+
+
+def _beside(left: Image.Image, right: Image.Image) -> Image.Image:
+    both = Image.new("RGB", (left.width + right.width, max(left.height, right.height)), "white")
+    both.paste(left, (0, 0))
+    both.paste(right, (left.width, 0))
+    return both
 
 
 def _palette(frame: Image.Image) -> Image.Image:

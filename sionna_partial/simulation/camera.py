@@ -69,6 +69,29 @@ class Camera:
         seen[known] = np.where(log_odds[known] > 0, _WALL, _FREE)
 
 
+def unknown_in_view(
+    state: NDArray[np.uint8],
+    cell: NDArray[np.intp],
+    headings_deg: NDArray[np.float64],
+    cell_m: float,
+    sensor: SensorSettings,
+) -> list[NDArray[np.intp]]:
+    """Unknown cells (N, 2) that a picture taken in a cell would show if none of them were walls, for each heading."""
+    reach = sensor.range_m / cell_m
+    low = np.maximum(cell - math.ceil(reach) - 2, 0)
+    window = state[tuple(slice(start, end + math.ceil(reach) + 3) for start, end in zip(low, cell, strict=True))]
+    window = np.pad(window, 1, constant_values=_WALL)
+    bright, missed = np.where(window == _WALL, window, np.uint8(_FREE)), np.zeros(window.shape, dtype=np.bool_)
+    row, column = cell - low + 1.5
+    shown = []
+    for heading_deg in headings_deg:
+        view = np.full_like(window, _UNKNOWN)
+        angles = _ray_angles(heading_deg, sensor.field_of_view_deg, reach)
+        _cast_rays(bright, missed, view, (0, 0), _Rays((column, row), (0.0, 0.0), angles, np.zeros_like(angles), reach))
+        shown.append(np.argwhere((view == _FREE) & (window == _UNKNOWN)) + low - 1)
+    return shown
+
+
 def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
     """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)

@@ -6,17 +6,17 @@ unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shor
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.constants import CellState
-from sionna_partial.planar import grid_edges
+from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import Camera
+from sionna_partial.simulation.frontiers import Frontier, find_frontiers, part_of, wide_frontiers
 
 FORWARD_M = 0.25
 """Length of a forward action [m] (Active Neural SLAM, Section 4)."""
@@ -43,16 +43,15 @@ Active Neural SLAM's global policy draws its goals from a distribution. The best
 than the robot of the paper; with this power the mean observed fractions on real homes are the paper's.
 """
 
-_FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
-_EIGHT = np.ones((3, 3), dtype=bool)
-_SMALLEST_FRONTIER_CELLS = 3
-_COMFORT_M = 0.3
-_COMFORT_COST = 3.0
-_TIGHT_COST = 15.0
+_FREE = int(CellState.FREE)
 _AHEAD_M = 0.3
 _BUMP_M = 0.25
 _ARRIVAL_M = 0.3
 _DECISION_STEPS = 5.0
+
+
+Choice = Callable[["Robot", list[Frontier]], int]
+"""Which of the frontiers a robot drives to."""
 
 
 class Robot:
@@ -62,7 +61,15 @@ class Robot:
     (`believed_position`), on the map that it has made (`seen`).
     """
 
-    def __init__(self, truth: NDArray[np.uint8], resolution_m: float, seed: int, sensor: SensorSettings) -> None:
+    def __init__(
+        self,
+        truth: NDArray[np.uint8],
+        resolution_m: float,
+        seed: int,
+        sensor: SensorSettings,
+        choose: Choice | None = None,
+    ) -> None:
+        self._choose = choose
         self._rng, errors = np.random.default_rng(seed), np.random.default_rng((seed, 1))
         self._cell_m = resolution_m
         self._radius, self._roomy = _fitting_radius(truth == _FREE, resolution_m)
@@ -99,11 +106,17 @@ class Robot:
             return
         route = self._route
         if route is None or self._route_steps >= self._goal_steps or self._is_done(route[-1]):
-            route = self._route = self._choose_route()
+            frontiers = self.frontiers()
+            if not frontiers:
+                self.is_finished = True
+                return
+            if self._choose is None:
+                chosen = frontiers[self._draw(frontiers)]
+            else:
+                wide = wide_frontiers(frontiers, self._cell_m)
+                chosen = wide[self._choose(self, wide)]
+            route = self._route = chosen.route
             self._route_steps = 0
-        if route is None:
-            self.is_finished = True
-            return
         self._route_steps += 1
         ahead = int(np.argmin(self._distances_to(route))) + max(1, round(_AHEAD_M / self._cell_m))
         error_deg = self._turn_to(route[min(ahead, len(route) - 1)])
@@ -129,36 +142,19 @@ class Robot:
         bearing_deg = math.degrees(math.atan2(int(cell[0]) + 0.5 - y, int(cell[1]) + 0.5 - x))
         return (bearing_deg - self.heading_deg + 180.0) % 360.0 - 180.0
 
-    def _frontier(self, part: tuple[slice, slice]) -> NDArray[np.bool_]:
-        """Free cells of a part of the map that touch an unseen one, where the robot has not given up."""
-        seen = self.seen[part]
-        beside = ndimage.binary_dilation(seen == _UNKNOWN)
-        return beside & (seen == _FREE) & ~self._given_up[part]
+    def frontiers(self) -> list[Frontier]:
+        """Find the frontiers that can be reached."""
+        return find_frontiers(self.seen, self._cell(), self._cell_m, self._radius, self._bumps, self._given_up)
 
-    def _choose_route(self) -> NDArray[np.intp] | None:
-        """Draw a frontier, the likelier the more it promises for few steps; None if none can be reached."""
-        known = self.seen != _UNKNOWN
-        known[self._cell()] = True
-        rows, columns = np.flatnonzero(known.any(axis=1)), np.flatnonzero(known.any(axis=0))
-        part = _part((rows[0] - 1, columns[0] - 1), (rows[-1] + 2, columns[-1] + 2))
-        corner = np.array([part[0].start, part[1].start])
-        labels, count = ndimage.label(self._frontier(part), structure=_EIGHT)
-        sizes = np.bincount(labels.ravel(), minlength=count + 1)[1:]
-        router = _Router(self._travel_cost(part), tuple(self._cell() - corner))
-        middles, promises = [], []
-        for label, box in enumerate(ndimage.find_objects(labels), start=1):
-            if sizes[label - 1] < _SMALLEST_FRONTIER_CELLS:
-                continue
-            cells = np.argwhere(labels[box] == label) + np.add(corner, [side.start for side in box])
-            middle = cells[np.argmin(np.hypot(*(cells - cells.mean(axis=0)).T))]
-            turn_deg = abs(self._turn_to(middle))
-            steps = float(router.costs[tuple(middle - corner)] * self._cell_m / FORWARD_M + turn_deg / TURN_DEG)
-            middles.append(middle)
-            promises.append(math.sqrt(sizes[label - 1]) / (steps + _DECISION_STEPS))
-        if not any(promises):
-            return None
+    def steps_to(self, frontier: Frontier) -> float:
+        """About the number of actions that it takes to drive to a frontier."""
+        return frontier.cost_m / FORWARD_M + abs(self._turn_to(frontier.route[-1])) / TURN_DEG
+
+    def _draw(self, frontiers: list[Frontier]) -> int:
+        """Draw a frontier, the likelier the more it promises for few steps."""
+        promises = [math.sqrt(len(each.cells)) / (self.steps_to(each) + _DECISION_STEPS) for each in frontiers]
         odds = np.array(promises) ** GOAL_SHARPNESS
-        return router.path_to(middles[self._rng.choice(len(middles), p=odds / odds.sum())] - corner) + corner
+        return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
 
     def _distances_to(self, cells: NDArray[np.intp]) -> NDArray[np.float64]:
         x, y = self.believed_position
@@ -166,19 +162,11 @@ class Robot:
         return distances
 
     def _is_done(self, goal: NDArray[np.intp]) -> bool:
-        around = _part((goal[0] - 1, goal[1] - 1), (goal[0] + 2, goal[1] + 2))
+        around = part_of((goal[0] - 1, goal[1] - 1), (goal[0] + 2, goal[1] + 2))
         middle = min(int(goal[0]), 1), min(int(goal[1]), 1)
-        return bool(self._distances_to(goal) * self._cell_m < _ARRIVAL_M and not self._frontier(around)[middle])
-
-    def _travel_cost(self, part: tuple[slice, slice]) -> NDArray[np.float64]:
-        """Cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
-        seen = self.seen[part]
-        distance = ndimage.distance_transform_edt(seen != _WALL) - 0.5
-        nearness = np.clip(1.0 - distance * self._cell_m / _COMFORT_M, 0.0, 1.0)
-        cost = 1.0 + _COMFORT_COST * nearness
-        cost[(distance < self._radius) | self._bumps[part]] = _TIGHT_COST
-        cost[seen != _FREE] = 0.0
-        return cost
+        arrived = self._distances_to(goal) * self._cell_m < _ARRIVAL_M
+        may_turn = self._choose is not None and self._route_steps >= _DECISION_STEPS
+        return bool((arrived or may_turn) and not (frontier_cells(self.seen[around]) & ~self._given_up[around])[middle])
 
     def _step_forward(self) -> bool:
         """Move ahead, sliding along walls; return whether at least half of the step was made."""
@@ -220,33 +208,6 @@ class Robot:
         rows = np.arange(max(0, int(row - reach)), max(0, min(ny, int(row + reach) + 2)))
         columns = np.arange(max(0, int(column - reach)), max(0, min(nx, int(column + reach) + 2)))
         return rows[:, None], columns[None]
-
-
-def _part(low: tuple[int, int], high: tuple[int, int]) -> tuple[slice, slice]:
-    """Part of a map from one row and column up to, and without, others; it ends where the map does."""
-    return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
-
-
-class _Router:
-    """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross."""
-
-    def __init__(self, cost: NDArray[np.float64], start: tuple[int, ...]) -> None:
-        self._cells = np.argwhere(cost > 0)
-        self._index = np.full(cost.shape, -1)
-        self._index[tuple(self._cells.T)] = np.arange(len(self._cells))
-        ends, costs = grid_edges(cost)
-        graph = csr_array((costs, self._index.ravel()[ends]), shape=(len(self._cells),) * 2)
-        options = {"directed": False, "indices": self._index[start], "return_predecessors": True}
-        cheapest, self._before = dijkstra(graph, **options)
-        self.costs = np.full(cost.shape, np.inf)
-        self.costs[tuple(self._cells.T)] = cheapest
-
-    def path_to(self, cell: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Cells (n, 2) from the start to `cell`."""
-        path = [self._index[tuple(cell)]]
-        while self._before[path[-1]] >= 0:
-            path.append(self._before[path[-1]])
-        return self._cells[path[::-1]]
 
 
 def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float, NDArray[np.bool_]]:

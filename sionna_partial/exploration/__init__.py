@@ -1,0 +1,1 @@
+"""Where a robot should drive next."""

@@ -1,0 +1,380 @@
+"""Where a robot should drive next for a better coverage map: partial map -> ranked poses."""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import xarray as xr
+import yaml
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.cluster.vq import kmeans2
+from scipy.special import entr
+
+from sionna_partial.checks import (
+    real_array,
+    require_choice,
+    require_number,
+    require_whole,
+    settings_or_default,
+    shown,
+)
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.coverage import SAME_TX_M, clear_of_walls, predict_map, probability_above
+from sionna_partial.display import Pictured, Shown
+from sionna_partial.errors import MapError, PositionError
+from sionna_partial.files import atomic_write
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
+from sionna_partial.settings import SensorSettings
+from sionna_partial.simulation.camera import unknown_in_view
+from sionna_partial.simulation.frontiers import Frontier, find_frontiers, wide_frontiers
+from sionna_partial.simulation.robot import FORWARD_M, ROBOT_RADII_M, Choice, Robot
+
+GOALS = ("coverage", "state", "area")
+"""What is to become known; the first is the default."""
+
+MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
+"""Largest numbers of poses that are returned, and of transmitters that are predicted."""
+
+SPACING_M, MOST_RECEIVERS = 0.5, 1500
+"""Distance between predicted receivers [m], and about their largest number; on large maps they are farther apart."""
+
+POSSIBLE_TRANSMITTERS = 3
+"""Number of positions that stand for all possible ones of a transmitter."""
+
+LOOK_M = 1.25
+"""Driving that takes as long as choosing a view and turning towards it [m]."""
+
+_HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
+
+
+@dataclass(frozen=True, eq=False)
+class NextView(Shown):
+    """A pose from which a robot sees something that is not known.
+
+    Parameters
+    ----------
+    position_m : (2,) float64 array
+        World x and y [m], in a free cell.
+    heading_deg : float
+        Direction of the view, from x towards y [degree].
+    path_length_m : float
+        Length of the shortest safe path from the start [m].
+    gain : float
+        Expected gain in information: uncertainty that the view removes, summed over receivers, one per square metre
+        [bit], the mean over transmitters; for the goal "area" the unknown area in view [m^2].
+    gain_per_m : float
+        `gain` per metre driven, where looking counts as `LOOK_M` more. Views are ranked by it.
+    path_m : (K, 2) float64 array
+        The path, from the start to the pose [m].
+    frontier_m : (F, 2) float64 array
+        Centres of the free cells beside unknown ones to which the robot drives [m].
+    """
+
+    position_m: NDArray[np.float64]
+    heading_deg: float
+    path_length_m: float
+    gain: float
+    gain_per_m: float
+    path_m: NDArray[np.float64]
+    frontier_m: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_next_views"):
+    """Poses to drive to, the best first: a sequence of `NextView`.
+
+    Parameters
+    ----------
+    views : tuple of NextView
+        Empty where nothing unknown can be reached.
+    partial : PartialMap
+    start_m : (2,) float64 array
+        Where the paths begin [m].
+    tx_m : (T, 3) float64 array
+        Transmitters that were predicted [m]; none for the goal "area".
+    uncertainty : xarray.DataArray
+        On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors.
+    goal : {"coverage", "state", "area"}
+    """
+
+    views: tuple[NextView, ...]
+    partial: PartialMap
+    start_m: NDArray[np.float64]
+    tx_m: NDArray[np.float64]
+    uncertainty: xr.DataArray = field(repr=False)
+    goal: str
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.views)
+
+    @overload
+    def __getitem__(self, index: int) -> NextView: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[NextView]: ...
+    def __getitem__(self, index: int | slice) -> NextView | Sequence[NextView]:
+        """Return a pose, 0 being the best."""
+        return self.views[index]
+
+    def to_yaml(self) -> str:
+        """Return the poses as YAML: `header` and `poses` of a geometry_msgs/PoseArray, and what is expected of each.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
+        >>> views = sp.next_views(sp.map_from_array(cells, resolution_m=0.5), goal="area")
+        >>> print(views.to_yaml().splitlines()[1])
+          frame_id: map
+        """
+        expected = ("heading_deg", "path_length_m", "gain", "gain_per_m")
+        record = {
+            "header": {"frame_id": "map"},
+            "poses": [_pose(view) for view in self],
+            "goal": self.goal,
+            "views": [{name: round(float(getattr(view, name)), 3) for name in expected} for view in self],
+        }
+        return yaml.safe_dump(record, sort_keys=False, default_flow_style=None)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write `to_yaml` to a file.
+
+        Raises
+        ------
+        OutputError
+            If writing fails.
+        """
+        with atomic_write(path, "w") as stream:
+            stream.write(self.to_yaml())
+
+
+def next_views(
+    scene: PartialMap | str | Path,
+    tx: ArrayLike | None = None,
+    measurements: Any = None,
+    goal: str = GOALS[0],
+    count: int = 5,
+    *,
+    start: ArrayLike | None = None,
+    threshold_db: float = -100.0,
+    sensor: SensorSettings | None = None,
+) -> NextViews:
+    """Rank poses from which a robot would lower the uncertainty of a coverage map most per metre driven.
+
+    A pose is in the middle of a frontier between free and unknown cells, and looks where most is unknown. A view that
+    shows a part of the unobserved part of a link's direct line is expected to lower the uncertainty of that link, as
+    `predict_map` predicts it, by that fraction. Unknown cells count as free until they are seen.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        The map, or whatever `load_map` reads.
+    tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
+        One or several transmitters [m]. By default those of the measurements or, without, any position: the mean over
+        some free cells.
+    measurements : Measurements, mapping, data frame or path, optional
+        Gains that were measured of the transmitters, as for `predict_map`.
+    goal : {"coverage", "state", "area"}
+        What is to become known: whether the path gain exceeds the threshold, the link state, or the map alone, for
+        which nothing is predicted.
+    count : int
+        Largest number of poses.
+    start : (2,) array-like, optional
+        Where the robot is [m]; by default in the middle of the free cells that hang together.
+    threshold_db : float
+        Path gain above which a receiver is covered [dB].
+    sensor : SensorSettings, optional
+        What the robot sees in one look.
+
+    Returns
+    -------
+    NextViews
+        A sequence of at most `count` poses, the best first.
+
+    Raises
+    ------
+    MapError
+        If the map cannot be read, or has no free cell.
+    PositionError
+        For a start that is in no free cell, or a transmitter outside the map or in a wall.
+    SettingsError
+        For another goal, or a count or threshold out of range.
+    MeasurementError
+        If the measurements cannot be read, or none is usable.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> partial = sp.explore(sp.make_home(3), steps=(60,), seed=0)[0]
+    >>> views = sp.next_views(partial, goal="area", count=3)
+    >>> len(views), views[0].gain_per_m >= views[1].gain_per_m
+    (3, True)
+    """
+    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    require_choice("goal", goal, GOALS)
+    require_whole("count", count, 1, MOST_VIEWS)
+    require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
+    sensor = settings_or_default("sensor", sensor, SensorSettings)
+    cell = _start_cell(partial, start)
+    tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measurements)
+    uncertainty = _uncertainty(partial, tx_m, measurements, None if goal == "state" else threshold_db)
+    none = np.zeros(partial.shape, dtype=bool)
+    radius = ROBOT_RADII_M[0] / partial.resolution_m
+    frontiers = wide_frontiers(
+        find_frontiers(partial.state, cell, partial.resolution_m, radius, none, none), partial.resolution_m
+    )
+    gains = _gains(partial, frontiers, tx_m, uncertainty, sensor)
+    views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
+    views.sort(key=lambda view: -view.gain_per_m)
+    start_m = _centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
+    return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal)
+
+
+def coverage_choice(
+    home: PartialMap, origin_m: tuple[float, float], tx: ArrayLike | None, sensor: SensorSettings
+) -> Choice:
+    """Return how a robot, whose map has another origin, chooses frontiers for the coverage of transmitters."""
+    if tx is not None:
+        _transmitters(home, tx, None)
+
+    def choose(robot: Robot, frontiers: list[Frontier]) -> int:
+        if len(frontiers) == 1:
+            return 0
+        partial = replace(home, state=robot.seen.copy(), origin_m=origin_m, interior_cells=None)
+        tx_m = _transmitters(partial, tx, None)
+        gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(partial, tx_m, None, None), sensor)
+        return int(np.argmax(np.array(gains) / [robot.steps_to(each) + LOOK_M / FORWARD_M for each in frontiers]))
+
+    return choose
+
+
+def _gains(
+    partial: PartialMap,
+    frontiers: list[Frontier],
+    tx_m: NDArray[np.float64],
+    uncertainty: xr.DataArray,
+    sensor: SensorSettings,
+) -> tuple[list[float], list[float]]:
+    """Return what is gained at each frontier, and the heading with the largest unknown area in view [degree].
+
+    A view that shows a part of the unobserved part of a link's direct line is taken to lower its uncertainty by that
+    fraction.
+    """
+    x, y = np.meshgrid(uncertainty.x, uncertainty.y)
+    rx = in_cells(partial, np.stack([x.ravel(), y.ravel()], axis=1))
+    each_m2 = uncertainty.attrs["spacing_m"] ** 2 / max(1, len(tx_m))
+    links = []
+    for tx, bits in zip(in_cells(partial, tx_m), uncertainty.to_numpy(), strict=True):
+        starts = np.broadcast_to(tx, rx.shape)
+        unobserved = map_line_fractions(partial, starts, rx)[:, CellState.UNKNOWN]
+        counts = (unobserved > GRAZE) & (bits.ravel() > 0.0)
+        links.append((starts[counts], rx[counts], bits.ravel()[counts] / unobserved[counts] * each_m2))
+    gains, headings_deg = [], []
+    for frontier in frontiers:
+        shown = unknown_in_view(partial.state, frontier.route[-1], _HEADINGS_DEG, partial.resolution_m, sensor)
+        best = int(np.argmax([len(cells) for cells in shown]))
+        headings_deg.append(float(_HEADINGS_DEG[best]))
+        gain = len(shown[best]) * partial.resolution_m**2 if not links else 0.0
+        view = np.full(partial.shape, np.uint8(CellState.FREE))
+        view[tuple(shown[best].T)] = CellState.UNKNOWN
+        for starts, ends, bits in links:
+            gain += float(line_fractions(view, starts, ends)[:, CellState.UNKNOWN] @ bits)
+        gains.append(gain)
+    return gains, headings_deg
+
+
+def _view(partial: PartialMap, frontier: Frontier, gain: float, heading_deg: float) -> NextView:
+    path_m = _centres_m(partial, frontier.route)
+    length_m = float(np.linalg.norm(np.diff(path_m, axis=0), axis=1).sum())
+    frontier_m = _centres_m(partial, frontier.cells)
+    return NextView(path_m[-1], heading_deg, length_m, gain, gain / (length_m + LOOK_M), path_m, frontier_m)
+
+
+def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]:
+    """Return the free cell at the start; by default in the middle of the largest part of the free cells."""
+    free = partial.state == CellState.FREE
+    if not free.any():
+        raise MapError("the map has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
+    if start is None:
+        labels, _ = ndimage.label(free)
+        cells = np.argwhere(labels == np.bincount(labels[free]).argmax())
+        near = cells - cells.mean(axis=0)
+    else:
+        remedy = "give x and y of the robot in metres, in a free cell."
+        start_m = real_array("start", start, PositionError, remedy).astype(np.float64)
+        stands = start_m.shape == (2,) and np.isfinite(start_m).all() and partial.state_at(start_m) == CellState.FREE
+        if not stands:
+            raise PositionError(f"start = {shown(start)} is not in a free cell: {remedy}")
+        cells = np.argwhere(free)
+        near = _centres_m(partial, cells) - start_m
+    row, column = cells[np.hypot(*near.T).argmin()]
+    return int(row), int(column)
+
+
+def _transmitters(partial: PartialMap, tx: ArrayLike | None, measurements: Any) -> NDArray[np.float64]:
+    """Return the transmitters (T, 3) to predict [m]."""
+    if tx is None:
+        tx = _possible_m(partial) if measurements is None else np.unique(measurements_of(measurements).tx, axis=0)
+    tx_m = np.atleast_2d(real_array("tx", tx, PositionError, "give x, y and z in metres, (3,) or (T, 3)."))
+    if tx_m.ndim == 2 and tx_m.shape[1] == 2:
+        tx_m = np.insert(tx_m.astype(np.float64), 2, DEFAULT_HEIGHT_M, axis=1)
+    if len(tx_m) > MOST_TRANSMITTERS:
+        raise PositionError(f"tx has {len(tx_m)} transmitters: give at most {MOST_TRANSMITTERS}.")
+    return partial.require_positions("tx", tx_m)
+
+
+def _possible_m(partial: PartialMap) -> NDArray[np.float64]:
+    """Return positions that stand for all free cells (T, 3) [m]."""
+    cells_m = np.insert(_centres_m(partial, np.argwhere(partial.state == CellState.FREE)), 2, DEFAULT_HEIGHT_M, axis=1)
+    cells_m = cells_m[clear_of_walls(partial, cells_m)]
+    if not len(cells_m):
+        raise PositionError("tx can be in no free cell clear of walls: give a transmitter.")
+    count = min(POSSIBLE_TRANSMITTERS, len(cells_m))
+    middles_m, _ = kmeans2(cells_m, cells_m[np.linspace(0, len(cells_m) - 1, count).astype(np.intp)], minit="matrix")
+    return cells_m[[np.linalg.norm(cells_m - middle_m, axis=1).argmin() for middle_m in middles_m]]
+
+
+def _uncertainty(
+    partial: PartialMap, tx_m: NDArray[np.float64], measurements: Any, threshold_db: float | None
+) -> xr.DataArray:
+    """Predict the uncertainty of links on (tx, y, x) [bit]: of P(gain > threshold), or of the link state."""
+    x0, y0, x1, y1 = partial.bounds_m
+    spacing_m = min(max(SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MOST_RECEIVERS)), x1 - x0, y1 - y0)
+    measured = None if measurements is None else measurements_of(measurements)
+    layers = [xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))] * (not len(tx_m))
+    for each_m in tx_m:
+        own = measured is not None and (np.linalg.norm(measured.tx - each_m, axis=1) <= SAME_TX_M).any()
+        told = measured if own or len(tx_m) == 1 else None
+        coverage = predict_map(partial, each_m, spacing_m=spacing_m, measurements=told, progress=False)
+        if threshold_db is None:
+            p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
+        else:
+            above = probability_above(coverage, threshold_db)
+            p = np.stack([above, 1.0 - above])
+        layers.append((entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0))
+    together = xr.concat(layers, "tx") if len(tx_m) else layers[0]
+    attributes = {"long_name": "uncertainty of the link", "units": "bit", "spacing_m": spacing_m}
+    return together.rename("uncertainty").assign_attrs(attributes)
+
+
+def _centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> NDArray[np.float64]:
+    """Return x and y of the centres of cells (..., 2), rows and columns [m]."""
+    return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
+
+
+def _pose(view: NextView) -> dict[str, dict[str, float]]:
+    """Return a geometry_msgs/Pose."""
+    x, y = view.position_m.round(3)
+    half = math.radians(view.heading_deg) / 2.0
+    return {
+        "position": {"x": float(x), "y": float(y), "z": 0.0},
+        "orientation": {"x": 0.0, "y": 0.0, "z": round(math.sin(half), 6), "w": round(math.cos(half), 6)},
+    }
