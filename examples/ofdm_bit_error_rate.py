@@ -61,3 +61,16 @@ for i, color in enumerate(("tab:blue", "tab:orange")):
 left.set(xlabel="frequency from the carrier [MHz]", ylabel="gain [dB]")
 left.legend()
 right.set(xlabel="transmitted power [dBm]", ylabel="bit error rate", ylim=(1e-5, 1))
+
+# %%
+# On a map that shows half of the apartment the channel is not known: `sample_channels` draws what it may be. Bit error
+# rates of the second link over 100 draws, for a robot that wants to know how much power will do.
+
+partial = sp.load_map(scenes_folder() / "apartment" / "step100" / "map.yaml")
+samples = sp.sample_channels(partial, (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)], n=100)
+drawn = np.abs(samples.cfr(SUBCARRIERS_HZ).h.to_numpy()[:, 1, 0, 0]) ** 2
+power = 10 ** (TX_POWER_DBM / 10) / len(SUBCARRIERS_HZ) / 10 ** (NOISE_DBM / 10)
+of_draws = erfc(np.sqrt(power[:, None, None] * drawn / 2)).mean(axis=2) / 2
+needed = np.where((of_draws < 1e-3).any(axis=0), TX_POWER_DBM[np.argmax(of_draws < 1e-3, axis=0)], np.inf)
+for probability in (0.5, 0.9):
+    print(f"with probability {probability:.0%}, {np.quantile(needed, probability, method='higher'):.0f} dBm are enough")

@@ -1,42 +1,30 @@
 """
-Several transmitters
-====================
+Three access points in a half-seen office
+=========================================
 
-`predict_map` takes one transmitter. Several are one call each, and the maps are combined with xarray: which of two
-positions serves a receiver better, and how strong is the better one?
+A robot has seen a part of an office floor. Where will three access points serve, with which SINR, and how sure is that?
 """
 
-import numpy as np
-import xarray as xr
-from matplotlib.figure import Figure
-
 import sionna_partial as sp
-from sionna_partial.resources import scenes_folder
 
-partial = sp.load_map(scenes_folder() / "house" / "step150" / "map.yaml")
-positions = [(4.5, 11.0, 1.5), (7.0, 3.5, 1.5)]
-predictor = sp.Predictor.load()
-maps = [sp.predict_map(partial, tx, predictor=predictor, spacing_m=0.3) for tx in positions]
-coverage = xr.concat(maps, dim="transmitter", combine_attrs="drop_conflicts")
-
-# %%
-# The mean gain of each transmitter, and of the stronger of the two at every receiver.
-
-gain_db = coverage["gain_mean_db"]
-for tx, of_one in zip(positions, gain_db, strict=True):
-    print(f"{tx}: median of the mean gain {of_one.median().item():.1f} dB")
-print(f"the stronger one: {gain_db.max('transmitter').median().item():.1f} dB")
+floor = sp.make_home(220003, kind="floor")
+partial = sp.explore(floor, (0.5,), sensor=sp.SensorSettings(field_of_view_deg=360.0, range_m=12.0))[0]
+free = sp.place_transmitters(partial, count=3, threshold_db=-90.0, tx_height_m=2.2)
+print(f"observed {partial.observed_fraction:.0%}, predicted coverage with three access points {free.score:.0%}")
+free_figure = sp.plot_network_placement(free)
 
 # %%
-# Where each of them is the stronger one, and the gain of that one. Black: no receiver can be there.
+# All three in one call; links are drawn together, as one unseen wall may block more than one access point.
 
-figure = Figure(figsize=(10, 3.6), layout="constrained")
-axes = figure.subplots(1, 2, sharey=True)
-known = gain_db.notnull().all("transmitter")
-best = gain_db.fillna(-np.inf).argmax("transmitter").where(known)
-bar = {"ticks": [0, 1], "label": "stronger transmitter"}
-best.plot.imshow(ax=axes[0], levels=[-0.5, 0.5, 1.5], cmap="coolwarm", cbar_kwargs=bar)
-gain_db.max("transmitter").plot.imshow(ax=axes[1], cmap="viridis", cbar_kwargs={"label": "mean gain [dB]"})
-for axis in axes:
-    axis.plot(*np.array(positions)[:, :2].T, "*", color="white", markeredgecolor="black", markersize=12)
-    axis.set(aspect="equal", facecolor="black", xlabel="x [m]", ylabel="y [m]")
+access_points = {f"AP {number + 1}": position for number, position in enumerate(free.positions_m)}
+coverage = sp.predict_map(partial, access_points, spacing_m=1.0)
+network = sp.network_map(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6, load=0.5, sinr_threshold_db=10.0)
+for name, share in network.p_best.mean(("x", "y")).to_series().items():
+    print(f"{name}: strongest at {share:.0%} of the receivers")
+alone = coverage.p_outage.prod("tx", skipna=False).mean().item()
+print(f"all fail: {network.p_all_outage.mean().item():.1%}; if they were independent, {alone:.1%}")
+
+# %%
+# Best server, SINR, the probability of 10 dB, and the rate.
+
+figure = sp.plot_network(network)
