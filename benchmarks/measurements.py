@@ -4,9 +4,8 @@ In every home a robot with a camera explores; transmitters and receivers are dra
 robot's way, equally spaced, or at N random points indoors, are those of the complete home with 2 dB of noise, and at
 most -120 dB is heard. Changes of accuracy and RMSE against the prediction without measurements are means over homes,
 with the standard error over homes; homes with fewer than 30 links in a group are left out of it. The calibration error
-of the link state, and the fraction of gains in the 90 % interval, are over all links. Opponents, from the
-same measurements: path loss fitted to them, and the same process with distance alone in place of map and trace. Run it
-with
+of the link state, and the fraction of gains in the 90 % interval, are over all links. Opponents, from the same
+measurements: path loss fitted to them, and the same process with distance alone in place of map and trace. Run it with
 
     python benchmarks/measurements.py ../shared/gibson/*/map.yaml
     python benchmarks/measurements.py --made 24        # homes of make_home
@@ -221,10 +220,13 @@ def unknown_transmitters(homes: list[tuple[str, sp.PartialMap]], step: int, coun
         cells = [f"{np.median(each):.1f}, {each.mean():.1f} m" for each in of_group[:, 1:4].T]
         inside, area_m2 = of_group[:, 4:].mean(axis=0)
         print(f"| {group} ({len(of_group)}) | " + " | ".join(cells) + f" | {inside:.2f} | {area_m2:.0f} m² |")
-    for method, values in zip(("known", "known, measured", "unknown, measured"), np.array(coverages).T, strict=True):
-        change = values - np.array(coverages).T[0]
-        (accuracy, rmse_db), (d_accuracy, d_rmse) = values.mean(axis=1), change.std(axis=1, ddof=1) / len(homes) ** 0.5
-        print(f"{method}: {accuracy:.3f}, {rmse_db:.1f} dB; of the change {d_accuracy:.3f}, {d_rmse:.1f} dB")
+    methods = ("known", "known, measured", "unknown, measured")
+    for method, values in zip(methods, np.swapaxes(coverages, 0, 1), strict=True):
+        change = values - np.array(coverages)[:, 0]
+        (accuracy, rmse_db), (d_accuracy, d_rmse) = values.mean(axis=0), change.std(axis=0, ddof=1) / len(homes) ** 0.5
+        print(
+            f"{method}: {accuracy:.3f}, {rmse_db:.1f} dB, standard error of the change {d_accuracy:.3f}, {d_rmse:.1f} dB"
+        )
 
 
 def prediction_from(partial: sp.PartialMap) -> Predict:
