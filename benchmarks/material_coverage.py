@@ -4,7 +4,7 @@ Each home gets random materials, permittivity 1.5 to 8 and conductivity 0.005 to
 `material_calibration.py`; an outage stays one. Run
 
     python benchmarks/material_coverage.py
-    python benchmarks/material_coverage.py --first 51000 --materials 2 --steps 100
+    python benchmarks/material_coverage.py --first 51000 --homes 12 --materials 2 --steps 100
 """
 
 import argparse
