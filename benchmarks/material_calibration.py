@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.tracing.slab import reflection_loss_db
 from sionna_partial.tracing.trace import trace_each
 
@@ -105,7 +106,7 @@ def trial(
     tx = np.repeat(positions, len(each[0]), axis=0)
     rx = np.concatenate(each)
     measured = np.arange(len(rx)) % 2 == 0
-    noisy = truth + arguments.noise * rng.standard_normal(len(truth))
+    noisy = np.where(truth > GAIN_FLOOR_DB, truth + arguments.noise * rng.standard_normal(len(truth)), truth)
     began = time.perf_counter()
     result = sp.calibrate_materials(
         known, {"tx": tx[measured], "rx": rx[measured], "gain_db": noisy[measured]}, start=STARTS[start]

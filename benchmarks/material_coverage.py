@@ -1,9 +1,10 @@
 """Whether the 90 % interval of a reflection's loss holds the truth, over random materials, maps and noise.
 
-Each case has a home of its own and a random material, permittivity 1.5 to 8 and conductivity 0.005 to 1 S/m. Its gains
-are measured as in `material_calibration.py`. Run
+Each home gets random materials, permittivity 1.5 to 8 and conductivity 0.005 to 1 S/m. Gains are measured as in
+`material_calibration.py`; an outage stays one. Run
 
-    python benchmarks/material_coverage.py --cases 12
+    python benchmarks/material_coverage.py
+    python benchmarks/material_coverage.py --first 51000 --homes 12 --materials 2 --steps 100
 """
 
 import argparse
@@ -13,37 +14,42 @@ from material_calibration import ANGLES_DEG, LARGEST_LOSS_DB, free_positions, ga
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.tracing.slab import reflection_loss_db
 
 
 def main() -> None:
     """Calibrate each case, and print the coverage."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", type=int, default=12, help="number of random materials, each in a home of its own")
+    parser.add_argument("--homes", type=int, default=10, help="number of homes")
+    parser.add_argument("--materials", type=int, default=4, help="number of random materials in each home")
     parser.add_argument("--first", type=int, default=50_000, help="seed of the first home")
     parser.add_argument("--steps", type=int, default=0, help="steps of exploration; 0 for complete maps")
     parser.add_argument("--links", type=int, default=200)
     parser.add_argument("--noise", type=float, default=3.0, help="standard deviation of the noise [dB]")
     arguments = parser.parse_args()
     done = []
-    for seed in range(arguments.first, arguments.first + arguments.cases):
-        done.append(case(seed, arguments))
-        print(line(f"home {seed}", done[-1:]), flush=True)
+    for seed in range(arguments.first, arguments.first + arguments.homes):
+        home = sp.make_home(seed)
+        known = sp.explore(home, steps=(arguments.steps,))[0] if arguments.steps else home
+        for number in range(arguments.materials):
+            done.append(case(home, known, np.random.default_rng([seed, number]), arguments))
+            print(line(f"home {seed}", done[-1:]), flush=True)
     print(line("all", done))
 
 
-def case(seed: int, arguments: argparse.Namespace) -> NDArray[np.float64]:
+def case(
+    home: sp.PartialMap, known: sp.PartialMap, rng: np.random.Generator, arguments: argparse.Namespace
+) -> NDArray[np.float64]:
     """Return the error, the stated deviation, and whether the interval holds the truth, by polarisation and angle."""
-    rng = np.random.default_rng([seed, 90])
     permittivity, conductivity_s_m = np.exp(rng.uniform(np.log([1.5, 0.005]), np.log([8.0, 1.0])))
     hidden = sp.Material(float(permittivity), float(conductivity_s_m))
-    home = sp.make_home(seed)
-    known = sp.explore(home, steps=(arguments.steps,))[0] if arguments.steps else home
     tx = free_positions(known, 8, rng)
     rx = [free_positions(known, arguments.links // 8, rng) for _ in tx]
-    noise_db = arguments.noise * rng.standard_normal(arguments.links // 8 * 8)
-    measured = {"tx": np.repeat(tx, len(rx[0]), axis=0), "rx": np.concatenate(rx)}
-    found = sp.calibrate_materials(known, {**measured, "gain_db": gains_db(home, tx, rx, hidden) + noise_db})
+    gain_db = gains_db(home, tx, rx, hidden)
+    gain_db += np.where(gain_db > GAIN_FLOOR_DB, arguments.noise * rng.standard_normal(len(gain_db)), 0.0)
+    measured = {"tx": np.repeat(tx, len(rx[0]), axis=0), "rx": np.concatenate(rx), "gain_db": gain_db}
+    found = sp.calibrate_materials(known, measured)
     print(f"hidden {hidden}: {found.materials[0]}, noise {found.noise_db:.2f} dB, {found.used.sum()} links")
     rows = []
     for polarisation in ("te", "tm"):

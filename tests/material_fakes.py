@@ -34,10 +34,12 @@ class FakePaths:
         return self.power(permittivity, conductivity_s_m), slopes
 
 
-def fake_target(permittivity: float, conductivity_s_m: float, noise_db: float = 1.0) -> MaterialTarget:
+def fake_target(
+    permittivity: float, conductivity_s_m: float, noise_db: float = 1.0, weight: float = 1.0
+) -> MaterialTarget:
     gain_db = 10.0 * np.log10(FakePaths().power(np.array([permittivity]), np.array([conductivity_s_m])))
     noise = noise_db * np.random.default_rng(0).standard_normal(len(gain_db))
-    return MaterialTarget(cast(LinkPaths, FakePaths()), gain_db + noise, np.zeros(len(gain_db)))
+    return MaterialTarget(cast(LinkPaths, FakePaths()), gain_db + noise, np.zeros(len(gain_db)), weight)
 
 
 def quiet(share: float, message: str) -> None:

@@ -166,6 +166,15 @@ class TestPartialMap:
         assert found.left_out["runs through unobserved space"] > 5
         assert (~found.used).sum() == sum(found.left_out.values())
 
+    def test_uncertainty_is_larger_where_paths_may_be_missing(self, result: sp.MaterialCalibration) -> None:
+        """One unknown corner changes no link, but makes the map incomplete."""
+        state = FLAT.state.copy()
+        state[48, 78] = sp.CellState.UNKNOWN
+        found = sp.calibrate_materials(replace(FLAT, state=state), measured(), start=START, trace_settings=SETTINGS)
+        assert found.used.all()
+        ratio = found.reflection_loss_db(ANGLES_DEG)[1] / result.reflection_loss_db(ANGLES_DEG)[1]
+        assert (ratio > 1.2).all()
+
     def test_outages_are_left_out(self, result: sp.MaterialCalibration) -> None:
         assert result.left_out == {"measured outage": 0, "no path on the map": 0, "runs through unobserved space": 0}
         measurements = measured()

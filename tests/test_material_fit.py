@@ -72,8 +72,9 @@ class TestFitErrors:
 
 
 class TestMaterialTarget:
-    def test_slopes_are_those_of_the_loss(self) -> None:
-        target = fake_target(4.0, 0.3)
+    @pytest.mark.parametrize("weight", [1.0, 0.35])
+    def test_slopes_are_those_of_the_loss(self, weight: float) -> None:
+        target = fake_target(4.0, 0.3, weight=weight)
         here = point(target, 3.7, 0.25)
         gradient, curvature = target.slopes(here)
         for number, move in enumerate(np.eye(2) * GRADIENT_STEP):
@@ -81,9 +82,14 @@ class TestMaterialTarget:
             for sign in (1, -1):
                 values = LOSSLESS + np.exp(here.logs + sign * move[:, None])
                 error_db = target.gain_db - target.gains_db(target.paths.power(*values))
-                losses.append(here.errors.curve(error_db, target.is_direct)[0].sum() + prior_loss(values))
+                losses.append(weight * here.errors.curve(error_db, target.is_direct)[0].sum() + prior_loss(values))
             assert gradient[number] == pytest.approx((losses[0] - losses[1]) / (2 * GRADIENT_STEP), rel=1e-3, abs=1e-3)
         assert (np.linalg.eigvalsh(curvature) > 0.0).all()
+
+    def test_weight_is_the_power_of_the_likelihood(self) -> None:
+        full, tempered = (point(fake_target(4.0, 0.3, weight=weight), 3.7, 0.25) for weight in (1.0, 0.35))
+        prior = prior_loss(full.values)
+        assert tempered.loss - prior == pytest.approx(0.35 * (full.loss - prior))
 
     def test_vanishing_paths_give_a_floor(self) -> None:
         gains_db = fake_target(4.0, 0.3).gains_db(FakePaths().power(*LOSSLESS))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.calibration.material_fit import (
+    INCOMPLETE_WEIGHT,
     LOSSLESS,
     MaterialTarget,
     Point,
@@ -169,7 +170,8 @@ def calibrate_materials(
 
     Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged; their scatter shows how much of
     the noise averages out. Links of a partial map are used where the line of sight, or half of the power without one,
-    runs through observed space. Outages contain no information on the material.
+    runs through observed space. On incomplete maps the power 0.35 of the likelihood is taken, because links have the
+    errors of missing paths in common. Outages contain no information on the material.
 
     Parameters
     ----------
@@ -223,7 +225,8 @@ def calibrate_materials(
         report(0.0, "building the scene")
         paths = building.paths(links, settings, scene_settings, report)
         used, left_out = usable_links(partial, paths, links, np.bincount(link))
-        target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used])
+        weight = 1.0 if partial.is_complete else INCOMPLETE_WEIGHT
+        target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used], weight)
         begin = tuple(building.start.values())
         fit = _fit(target, begin, settings.frequency_hz, report)
         report(1.0, "done")
