@@ -1,8 +1,10 @@
 """Training of the `PathModel`: paths on partial maps held against those in the whole of a home."""
 
 import math
+import sys
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -182,3 +184,7 @@ def _points(home: PartialMap, count: int, rng: np.random.Generator) -> Floats:
     row, column = rng.permutation(np.argwhere(home.state == CellState.FREE))[:count].T
     cell = np.stack([column, row], axis=1) + rng.uniform(0.25, 0.75, (len(row), 2))
     return np.column_stack([home.origin_m + cell * home.resolution_m, np.full(len(row), DEFAULT_HEIGHT_M)])
+
+
+if __name__ == "__main__":
+    fit_path_model(made_examples()).save(Path(sys.argv[1]))
