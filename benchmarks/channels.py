@@ -23,6 +23,8 @@ from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.antennas import planar_array
 
 HOME = "house"
+_UNIT = dict.fromkeys(("trace", "sample_channels, 100 draws"), "trace")
+_UNIT |= dict.fromkeys(("predict_map", "predict_map, three transmitters"), "predict_map")
 
 
 def main() -> None:
@@ -44,6 +46,10 @@ def speed(receivers: int, streamed: int, runs: int) -> None:
     print(f"{receivers} receivers of the {HOME}, one core, processor time, median of {runs} runs")
     for name, value in seconds.items():
         print(f"{name:34}{value:8.3f} s{value / seconds['trace']:8.2f} of the trace")
+    print(f"\nthe {HOME} as a robot has seen it after 150 steps")
+    seconds = isolated(partial_times, receivers, runs)
+    for name, value in seconds.items():
+        print(f"{name:34}{value:8.3f} s{value / seconds[_UNIT[name]]:8.2f} of {_UNIT[name]}")
     print(f"\n{streamed} receivers, 8 x 8 by 2 x 2 antennas, written some at a time")
     for suffix in (".nc", ".zarr"):
         row = isolated(stream, streamed, suffix)
@@ -65,6 +71,22 @@ def times(receivers: int, runs: int) -> dict[str, float]:
         "cfr, 64 subcarriers, 8x8 by 2x2": lambda: links.cfr(subcarriers_hz, **arrays),
         "beam_gains, 64 by 16 beams": lambda: links.beam_gains(*codebooks, **wide),
         "spreads": links.spreads,
+    }
+    return {name: float(np.median([_seconds(step) for _ in range(runs + 1)][1:])) for name, step in steps.items()}
+
+
+def partial_times(receivers: int, runs: int) -> dict[str, float]:
+    """Median seconds of draws, and of maps of several transmitters, where not all was seen."""
+    limit_cores(1)
+    _, tx, rx = _scene(receivers)
+    partial = sp.load_map(scenes_folder() / HOME / "step150")
+    rx = rx[partial.radios_can_stand(rx)]
+    model, three = sp.Predictor.load(), tx + np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [-0.2, 0.3, 0.0]])
+    steps: dict[str, Callable[[], object]] = {
+        "trace": lambda: sp.trace_links(partial, tx, rx),
+        "sample_channels, 100 draws": lambda: sp.sample_channels(partial, tx, rx, predictor=model, memory_gb=8.0),
+        "predict_map": lambda: sp.predict_map(partial, tx, spacing_m=0.25, predictor=model),
+        "predict_map, three transmitters": lambda: sp.predict_map(partial, three, spacing_m=0.25, predictor=model),
     }
     return {name: float(np.median([_seconds(step) for _ in range(runs + 1)][1:])) for name, step in steps.items()}
 

@@ -224,9 +224,7 @@ def unknown_transmitters(homes: list[tuple[str, sp.PartialMap]], step: int, coun
     for method, values in zip(methods, np.swapaxes(coverages, 0, 1), strict=True):
         change = values - np.array(coverages)[:, 0]
         (accuracy, rmse_db), (d_accuracy, d_rmse) = values.mean(axis=0), change.std(axis=0, ddof=1) / len(homes) ** 0.5
-        print(
-            f"{method}: {accuracy:.3f}, {rmse_db:.1f} dB, the change's standard error {d_accuracy:.3f}, {d_rmse:.1f} dB"
-        )
+        print(f"{method}: {accuracy:.3f}, {rmse_db:.1f} dB; change ± {d_accuracy:.3f}, {d_rmse:.1f} dB")
 
 
 def prediction_from(partial: sp.PartialMap) -> Predict:

@@ -64,6 +64,12 @@ def test_draws_agree_with_the_prediction_and_with_themselves(
     assert np.ptp(samples.gain_db, axis=0).max() > 20.0
 
 
+def test_no_receivers_have_no_paths(partial: sp.PartialMap) -> None:
+    samples = sp.sample_channels(partial, TX, np.zeros((0, 3)), n=5)
+    assert samples.gain_db.shape == (5, 0)
+    assert len(samples.drawn.a) == 0
+
+
 def test_equal_seeds_give_equal_draws(
     partial: sp.PartialMap, receivers: np.ndarray[Any, Any], samples: sp.ChannelSamples
 ) -> None:

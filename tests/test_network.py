@@ -77,7 +77,7 @@ def test_links_through_the_same_unknown_cells_are_alike() -> None:
     rx_m = np.array([[5.0, 5.0, 1.5], [5.0, 4.8, 1.5], [1.0, 5.0, 1.5]])
     correlation = JointLatents(partial).correlation(tx_m, rx_m)
     assert correlation[0, 1] > 0.7 > 0.5 > correlation[0, 2]
-    quantiles = JointLatents(partial).quantiles(tx_m, rx_m, 100, [0])
+    quantiles = JointLatents(partial).quantiles(tx_m, rx_m, 100, [[0]])[0]
     assert (np.sort(quantiles, axis=0) * 100 // 1 == np.arange(100)[:, None]).all()  # evenly spread
 
 

@@ -47,15 +47,18 @@ class JointLatents:
         smooth = np.concatenate([*self._smoothed(tx_m, rx_m)])
         return (1.0 - OWN_VARIANCE) * (smooth @ smooth.T) + OWN_VARIANCE * np.eye(len(smooth))
 
-    def quantiles(self, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]) -> Floats:
-        """Draw `count` times: quantiles (count, L) in (0, 1), evenly spread for each link."""
-        rng, draws = np.random.default_rng(seed), max(count, _FEWEST_DRAWS)
-        field = rng.standard_normal((math.prod(self._shape), draws))
-        shared = np.concatenate([rows @ field for rows in self._smoothed(tx_m, rx_m)])
-        latent = math.sqrt(1.0 - OWN_VARIANCE) * shared
-        latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape)
-        rank = latent.argsort(axis=1).argsort(axis=1)[:, :count]
-        return ((rank + rng.random(rank.shape)) / draws).T
+    def quantiles(self, tx_m: Floats, rx_m: Floats, count: int, seeds: list[list[int]]) -> Floats:
+        """Draw `count` times from F fields: quantiles (F, count, L) in (0, 1), evenly spread for each link."""
+        if not len(tx_m):
+            return np.zeros((len(seeds), count, 0))
+        draws = max(count, _FEWEST_DRAWS)
+        sources = [np.random.default_rng(seed) for seed in seeds]
+        fields = [rng.standard_normal((math.prod(self._shape), draws)) for rng in sources]
+        shared = [
+            np.concatenate(parts)
+            for parts in zip(*([rows @ each for each in fields] for rows in self._smoothed(tx_m, rx_m)), strict=True)
+        ]
+        return np.stack([_evenly_spread(*each, count) for each in zip(shared, sources, strict=True)])
 
     def draw(
         self, links: LinkPrediction, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]
@@ -67,7 +70,8 @@ class JointLatents:
         """
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
         shape = (count, len(tx_m), len(rx_m))
-        of_state, of_gain = (self.quantiles(*ends, count, [*seed, number]).reshape(shape) for number in (0, 1))
+        quantiles = self.quantiles(*ends, count, [[*seed, 0], [*seed, 1]])
+        of_state, of_gain = (each.reshape(shape) for each in quantiles)
         probabilities, means_db, stds_db = links.by_state
         p_outage = probabilities[LinkState.OUTAGE]
         state = np.where(of_state < p_outage + probabilities[LinkState.NLOS], LinkState.NLOS, LinkState.LOS)
@@ -112,3 +116,11 @@ class JointLatents:
                 rows.reshape(-1, *self._shape), (0.0, *2 * (REACH_M / math.sqrt(2.0) / edge_m,)), mode="constant"
             ).reshape(rows.shape)
             yield smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
+
+
+def _evenly_spread(shared: Floats, rng: np.random.Generator, count: int) -> Floats:
+    """Quantiles (count, L) of latents with this shared part (L, draws)."""
+    latent = math.sqrt(1.0 - OWN_VARIANCE) * shared
+    latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape)
+    rank = latent.argsort(axis=1).argsort(axis=1)[:, :count]
+    return ((rank + rng.random(rank.shape)) / latent.shape[1]).T

@@ -251,9 +251,8 @@ class _Draws:
         matrix = prediction.reshaped((len(tx_m), len(rx_m)))
         state, gain_db = latents.draw(matrix, tx_m, rx_m, count, [seed])
         state, gain_db = state.reshape(count, -1), gain_db.reshape(count, -1)
-        self._quantiles = {
-            each: latents.quantiles(tx_of, rx_of, count, [seed, each]) for each in (_SURVIVAL, _ANALOGUE)
-        }
+        seeds = [[seed, each] for each in (_SURVIVAL, _ANALOGUE)]
+        self._survival_quantile, self._analogue_quantile = latents.quantiles(tx_of, rx_of, count, seeds)
         # no path with LOS is weaker than free space
         gain_db = np.where(state == LinkState.LOS, np.maximum(gain_db, self._geometry.free_space_db), gain_db)
         self.state, self.gain_db = state, np.where(certain, traced.gain_db.ravel(), gain_db)
@@ -285,7 +284,7 @@ class _Draws:
         paths, place = self._indirect(links)
         traced_power = np.abs(self._traced.a[paths]) ** 2
         chance = np.where(is_los[:, place], *(self._survival[each][paths] for each in (LinkState.LOS, LinkState.NLOS)))
-        latent = ndtri(self._quantiles[_SURVIVAL][:, links])[:, place] + rng.standard_normal(chance.shape)
+        latent = ndtri(self._survival_quantile[:, links])[:, place] + rng.standard_normal(chance.shape)
         survives = (latent < math.sqrt(2.0) * ndtri(chance)) & (state[:, place] != LinkState.OUTAGE)
         belongs = csr_array((traced_power, (np.arange(len(paths)), place)), shape=(len(paths), len(links)))
         survivors = survives.astype(np.float64) @ belongs
@@ -322,7 +321,7 @@ class _Draws:
             draw, row = np.nonzero(self.state[:, links] == state)
             geometry, survivors_db = self._geometry.take(links[row]), path_gain_db(survivors[draw, row])
             keys = geometry.keys(state, self.gain_db[draw, links[row]], survivors_db)
-            quantile = self._quantiles[_ANALOGUE][draw, links[row]]
+            quantile = self._analogue_quantile[draw, links[row]]
             analogue[draw, row] = self._model.analogues(state, keys, quantile)
         return analogue
 

@@ -28,7 +28,8 @@ MOST_PLACES = 25
 """Number of places with measurements from which links are traced."""
 
 REACH_M = 1.5
-"""Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 %."""
+"""Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 %
+of the transmitters of procedural homes that some place hears."""
 
 TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
