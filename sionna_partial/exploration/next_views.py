@@ -132,8 +132,8 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_n
         >>> import sionna_partial as sp
         >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
         >>> views = sp.next_views(sp.map_from_array(cells, resolution_m=0.5), goal="area")
-        >>> print(views.to_yaml().splitlines()[1])
-          frame_id: map
+        >>> print(views.to_yaml().splitlines()[0])
+        header: {frame_id: map}
         """
         expected = ("heading_deg", "path_length_m", "gain", "gain_per_m")
         record = {
