@@ -264,7 +264,7 @@ class _Draws:
         """Return the paths of all draws, ordered as `TracedLinks` has them, without vertices."""
         parts = [*self._parts()]
         order = path_order(parts)
-        return {name: np.concatenate([getattr(part, name) for part in parts])[order] for name in _COLUMNS}
+        return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
     def _parts(self) -> Iterator[SolvedPaths]:
         """Paths of all draws, some links at a time."""
