@@ -409,6 +409,8 @@ def _transmitters(
     if positions.shape[-1:] == (2,):
         positions = np.insert(positions, 2, DEFAULT_HEIGHT_M, axis=-1)
     tx_m = partial.require_positions("tx", positions)
+    if not tx_m.size:
+        raise PositionError(f"tx has shape {tx_m.shape}: give at least one transmitter.")
     names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
     return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)
 

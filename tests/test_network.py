@@ -10,7 +10,7 @@ import xarray as xr
 
 import sionna_partial as sp
 from sionna_partial.channels.joint import JointLatents
-from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.errors import OutputError, PositionError, SettingsError
 from sionna_partial.placement.several import _greedy, _score, _swapped
 
 TX = {"west": (1.0, 1.0, 1.5), "east": (4.5, 2.5, 1.5)}
@@ -96,6 +96,11 @@ def test_several_are_placed_as_well_as_by_exhaustive_search(half_seen: sp.Partia
     assert own.score == 1.0
     assert own.rx_m.shape == (1, 3)
     assert len(sp.plot_network_placement(placed).axes) == 2
+
+
+def test_no_transmitter_is_no_network(half_seen: sp.PartialMap) -> None:
+    with pytest.raises(PositionError, match="at least one transmitter"):
+        sp.predict_map(half_seen, np.zeros((0, 3)), spacing_m=0.4)
 
 
 @pytest.mark.parametrize(

@@ -124,6 +124,11 @@ def test_poses_as_yaml(hall, tmp_path):
         ({"tx": (99.0, 1.0, 1.5)}, PositionError, r"tx\[0\] = .* is outside the map"),
         ({"tx": np.tile(at(1.0, 1.9), (21, 1))}, PositionError, "tx has 21 transmitters: give at most 20"),
         ({"tx": at(1.0, 1.9), "measurements": "none.csv"}, MeasurementError, "none.csv' cannot be read"),
+        (
+            {"tx": None, "measurements": {"rx": [(1.0, 1.0, 1.5)], "gain_db": [-80.0]}},
+            MeasurementError,
+            "1 of 1 links without the position",
+        ),
     ],
 )
 def test_bad_input(hall, arguments, error, message):

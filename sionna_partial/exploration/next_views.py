@@ -319,10 +319,16 @@ def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]
     return int(row), int(column)
 
 
+def _measured_m(measurements: Any) -> NDArray[np.float64]:
+    measured = measurements_of(measurements)
+    measured.require_transmitters()
+    return np.unique(measured.tx, axis=0)
+
+
 def _transmitters(partial: PartialMap, tx: ArrayLike | None, measurements: Any) -> NDArray[np.float64]:
     """Return the transmitters (T, 3) to predict [m]."""
     if tx is None:
-        tx = _possible_m(partial) if measurements is None else np.unique(measurements_of(measurements).tx, axis=0)
+        tx = _possible_m(partial) if measurements is None else _measured_m(measurements)
     tx_m = np.atleast_2d(real_array("tx", tx, PositionError, "give x, y and z in metres, (3,) or (T, 3)."))
     if tx_m.ndim == 2 and tx_m.shape[1] == 2:
         tx_m = np.insert(tx_m.astype(np.float64), 2, DEFAULT_HEIGHT_M, axis=1)
