@@ -23,6 +23,7 @@ from measurements import FIRST_SEED, points
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.evaluation.baselines import indoor_gain_db
 from sionna_partial.tracing.antennas import planar_array
 
 STEPS, TRANSMITTERS, RECEIVERS, DRAWS, NEAREST_M = (0, 50, 100, 200), 3, 40, 100, 0.15
@@ -99,23 +100,10 @@ def score_map(
 
 def values(links: sp.TracedLinks, draws: int = 1) -> Floats:
     """Gain [dB], delay spread [ns] and azimuth spreads [deg] (draws, L, 4) of links; nothing where there is no path."""
-    count = links.gain_db.size
-    link = links.path_tx.astype(np.int64) * len(links.rx) + links.path_rx
-    power = np.abs(links.a) ** 2
-
-    def total(weights: Floats) -> Floats:
-        return np.bincount(link, weights=weights, minlength=count)
-
-    whole = np.maximum(total(power), 1e-30)
-    delay_ns = links.delay_s * 1e9
-    mean_ns = total(power * delay_ns) / whole
-    spread_ns = np.sqrt(total(power * (delay_ns - mean_ns[link]) ** 2) / whole)
-    columns = [links.gain_db.ravel(), spread_ns]
-    for azimuth_rad in (links.departure_rad[:, 1], links.arrival_rad[:, 1]):
-        resultant = np.hypot(total(power * np.cos(azimuth_rad)), total(power * np.sin(azimuth_rad))) / whole
-        resultant = np.where(whole > 1e-30, np.clip(resultant, 1e-9, 1.0), 1.0)
-        columns.append(np.degrees(np.sqrt(-2.0 * np.log(resultant))))
-    return np.stack(columns, axis=1).reshape(draws, -1, len(columns))
+    spreads = links.spreads()
+    angles = [np.degrees(spreads[f"azimuth_{end}_spread_rad"].to_numpy()) for end in ("departure", "arrival")]
+    columns = [links.gain_db, 1e9 * spreads["delay_spread_s"].to_numpy(), *angles]
+    return np.nan_to_num(np.stack([column.ravel() for column in columns], axis=1)).reshape(draws, -1, len(columns))
 
 
 def indoor_office(distance_m: Floats, states: NDArray[np.uint8], rng: np.random.Generator) -> Floats:
@@ -123,9 +111,8 @@ def indoor_office(distance_m: Floats, states: NDArray[np.uint8], rng: np.random.
     distance_m, log = np.maximum(distance_m, 1.0), np.log10(29.0)
     los = states == sp.LinkState.LOS
     z = rng.standard_normal((*states.shape, 4))
-    loss_db = 32.4 + 17.3 * np.log10(distance_m) + 20.0 * np.log10(28.0)
-    nlos_db = np.maximum(loss_db, 17.3 + 38.3 * np.log10(distance_m) + 24.9 * np.log10(28.0))
-    gain_db = -np.where(los, loss_db + 3.0 * z[..., 0], nlos_db + 8.03 * z[..., 0])
+    mean_db = indoor_gain_db(distance_m, 28e9)
+    gain_db = np.where(los, mean_db[sp.LinkState.LOS] + 3.0 * z[..., 0], mean_db[sp.LinkState.NLOS] + 8.03 * z[..., 0])
     spread_ns = 1e9 * 10.0 ** np.where(
         los, -0.01 * log - 7.692 + 0.18 * z[..., 1], -0.28 * log - 7.173 + (0.10 * log + 0.055) * z[..., 1]
     )

@@ -46,8 +46,8 @@ from sionna_partial.plots.exploration_plot import plot_exploration as plot_explo
 from sionna_partial.plots.map_plot import plot_map as plot_map
 from sionna_partial.plots.material_plot import plot_calibration as plot_calibration
 from sionna_partial.plots.network_plot import plot_network as plot_network
-from sionna_partial.plots.network_plot import plot_network_placement as plot_network_placement
 from sionna_partial.plots.next_views_plot import plot_next_views as plot_next_views
+from sionna_partial.plots.placement_plot import plot_network_placement as plot_network_placement
 from sionna_partial.plots.placement_plot import plot_placement as plot_placement
 from sionna_partial.prediction.features import LinkFeatures as LinkFeatures
 from sionna_partial.prediction.features import link_features as link_features

@@ -2,7 +2,7 @@
 
 import io
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from sionna_partial.coverage import ATTRIBUTES, require_coverage
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
-from sionna_partial.network import VARIABLES
+from sionna_partial.network import VARIABLES, require_network
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.coverage_viewer import coverage_page
 from sionna_partial.plots.network_plot import plot_network
@@ -76,14 +76,11 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     >>> sp.save_coverage(coverage, "coverage.nc")
     >>> sp.save_coverage(coverage, "coverage.csv")
     """
-    target = output_path(path)
-    suffix = target.suffix.lower()
+    target, suffix = _target(path, FORMATS)
     if suffix == ".nc" and isinstance(coverage, xr.Dataset) and "tx" in coverage.dims:
         require_coverage(coverage.isel(tx=0))
     else:
         coverage = require_coverage(coverage)
-    if suffix not in FORMATS:
-        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(FORMATS)}.")
     if suffix == ".yaml":
         _write_ros_map(coverage, target)
     else:
@@ -150,20 +147,26 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     >>> coverage = sp.predict_map(home, [(3.0, 4.0, 2.2), (6.0, 3.0, 1.0)], spacing_m=0.5)
     >>> sp.save_network(sp.network_map(coverage), "network.nc")
     """
-    picture = plot_network(network)
+    require_network(network)
     names = [name for name in VARIABLES if network[name].dims == ("y", "x")]
     encoders: dict[str, Callable[[], bytes]] = {
         ".nc": lambda: _encode_netcdf(network),
         ".tif": lambda: _encode_geotiff(network, names),
         ".csv": lambda: _encode_table(network[names].to_dataframe(dim_order=["y", "x"]).reset_index()),
-        ".png": lambda: figure_png(picture),
+        ".png": lambda: figure_png(plot_network(network)),
     }
-    target = output_path(path)
-    if target.suffix.lower() not in encoders:
-        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(encoders)}.")
-    content = encoders[target.suffix.lower()]()
+    target, suffix = _target(path, encoders)
+    content = encoders[suffix]()
     with atomic_write(target) as stream:
         stream.write(content)
+
+
+def _target(path: str | os.PathLike[str], formats: Collection[str]) -> tuple[Path, str]:
+    """Return a path that can be written and its suffix, which must be one of `formats`."""
+    target = output_path(path)
+    if target.suffix.lower() not in formats:
+        raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(formats)}.")
+    return target, target.suffix.lower()
 
 
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:

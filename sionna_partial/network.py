@@ -146,6 +146,12 @@ def network_map(
     )
 
 
+def require_network(network: xr.Dataset) -> None:
+    """Raise a SettingsError unless `network` is what `network_map` returns."""
+    is_network = isinstance(network, xr.Dataset) and "best_server" in network
+    require(is_network, "network", type(network).__name__, "give what network_map returned.")
+
+
 def _map_of(coverage: xr.Dataset) -> PartialMap:
     """Return the map at the receivers, as far as the coverage shows it."""
     spacing_m = float(coverage.attrs["spacing_m"])

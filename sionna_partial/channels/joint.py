@@ -28,8 +28,8 @@ KNOWN_WEIGHT = 0.1
 """Weight of a known cell, in weights of an unknown one."""
 
 OWN_VARIANCE = 0.1
-"""Fraction of a latent's variance that no other link shares. All three maximise the likelihood of pairs of link states
-on homes of `make_home` (`benchmarks/channels.py joint`)."""
+"""Fraction of a latent's variance that no other link shares. All three are near the maximum of the likelihood of
+pairs of link states on homes of `make_home` (`benchmarks/joint_links.py`)."""
 
 _CELL_M, _MOST_CELLS = 0.35, 4096
 _POINTS = 48

@@ -21,7 +21,7 @@ from sionna_partial.channels.path_model import (
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.link_context import path_unobserved_m
+from sionna_partial.prediction.link_context import traced_unobserved_m
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home
@@ -61,10 +61,8 @@ def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -
     known, true = (trace_links(each, tx_m, rx_m, progress=False) for each in (partial, home))
     ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
     geometry = LinkGeometry.of(partial, *ends, known.settings.frequency_hz)
-    link, true_link = (each.path_tx.astype(np.intp) * len(rx_m) + each.path_rx for each in (known, true))
-    unobserved_m = path_unobserved_m(
-        partial, tx_m[known.path_tx], known.interactions, known.vertices_m, rx_m[known.path_rx]
-    )
+    link, true_link = known.path_link, true.path_link
+    unobserved_m = traced_unobserved_m(partial, known)
     same = _same(known, link, true, true_link)
     state = true.link_state.ravel()
     taught = (known.interactions > 0).any(axis=1) & (state[link] != LinkState.OUTAGE)

@@ -79,8 +79,7 @@ class ArrayPaths:
     @cached_property
     def first(self) -> NDArray[np.intp]:
         """Where the paths of each link begin, and the number of all paths: (links + 1,)."""
-        link = self.paths.path_tx.astype(np.int64) * len(self.paths.rx) + self.paths.path_rx
-        return np.searchsorted(link, np.arange(self.links + 1))
+        return np.searchsorted(self.paths.path_link, np.arange(self.links + 1))
 
     @property
     def most(self) -> int:

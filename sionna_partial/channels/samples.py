@@ -20,7 +20,7 @@ from sionna_partial.errors import MemoryLimitError
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
-from sionna_partial.prediction.link_context import path_unobserved_m
+from sionna_partial.prediction.link_context import traced_unobserved_m
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.progress import reporting
@@ -237,12 +237,10 @@ class _Draws:
     ) -> None:
         tx_m, rx_m = traced.tx.reshape(-1, 3), traced.rx
         self._traced, self._count, self._seed, self._rx_count = traced, count, seed, len(rx_m)
-        self._link = traced.path_tx.astype(np.intp) * len(rx_m) + traced.path_rx
+        self._link = traced.path_link
         tx_of, rx_of = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
         self._geometry = LinkGeometry.of(partial, tx_of, rx_of, traced.settings.frequency_hz)
-        unobserved_m = path_unobserved_m(
-            partial, tx_m[traced.path_tx], traced.interactions, traced.vertices_m, rx_m[traced.path_rx]
-        )
+        unobserved_m = traced_unobserved_m(partial, traced)
         self._crosses = unobserved_m > 0.0
         probabilities, _, stds_db = prediction.by_state
         certain = (probabilities.max(axis=0) == 1.0) & ((probabilities > 0.0) * stds_db == 0.0).all(axis=0)

@@ -12,12 +12,10 @@ if TYPE_CHECKING:
 
 def spreads(links: "TracedLinks") -> xr.Dataset:
     """Large-scale parameters (`TracedLinks.spreads`)."""
-    tx_m, count = links.tx.reshape(-1, 3), len(links.rx)
-    link = links.path_tx.astype(np.int64) * count + links.path_rx
-    power = np.abs(links.a) ** 2
+    link, power = links.path_link, np.abs(links.a) ** 2
 
     def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(link, values, len(tx_m) * count).astype(np.float64)
+        return np.bincount(link, values, links.gain_db.size).astype(np.float64)
 
     with np.errstate(divide="ignore", invalid="ignore"):
         all_power = total(power)

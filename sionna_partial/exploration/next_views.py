@@ -13,6 +13,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 from scipy.cluster.vq import kmeans2
+from scipy.spatial.distance import cdist
 from scipy.special import entr
 
 from sionna_partial.checks import (
@@ -24,7 +25,7 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage import SAME_TX_M, clear_of_walls, predict_map, probability_above
+from sionna_partial.coverage import SAME_TX_M, TX_COORDINATES, clear_of_walls, predict_map, probability_above
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
@@ -355,20 +356,20 @@ def _uncertainty(
     x0, y0, x1, y1 = partial.bounds_m
     spacing_m = min(max(SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MOST_RECEIVERS)), x1 - x0, y1 - y0)
     measured = None if measurements is None else measurements_of(measurements)
-    layers = [xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))] * (not len(tx_m))
-    for each_m in tx_m:
-        own = measured is not None and (np.linalg.norm(measured.tx - each_m, axis=1) <= SAME_TX_M).any()
+    uncertainty = xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))
+    if len(tx_m):
+        own = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
         told = measured if own or len(tx_m) == 1 else None
-        coverage = predict_map(partial, each_m, spacing_m=spacing_m, measurements=told, progress=False)
+        coverage = predict_map(partial, tx_m, spacing_m=spacing_m, measurements=told, progress=False)
         if threshold_db is None:
             p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
         else:
             above = probability_above(coverage, threshold_db)
             p = np.stack([above, 1.0 - above])
-        layers.append((entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0))
-    together = xr.concat(layers, "tx") if len(tx_m) else layers[0]
+        uncertainty = (entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0)
+        uncertainty = uncertainty.drop_vars(("tx", *TX_COORDINATES))
     attributes = {"long_name": "uncertainty of the link", "units": "bit", "spacing_m": spacing_m}
-    return together.rename("uncertainty").assign_attrs(attributes)
+    return uncertainty.rename("uncertainty").assign_attrs(attributes)
 
 
 def _centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> NDArray[np.float64]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +60,7 @@ class TransmitterPosterior:
         x_m, y_m = np.meshgrid(self.x_m, self.y_m)
         return np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, self.height_m)])
 
-    @property
+    @cached_property
     def position_m(self) -> Floats:
         """The cell (3,) from which the expected distance is smallest [m]."""
         points_m, weights = self.points_m, self.probability.ravel()

@@ -32,7 +32,7 @@ _SWAPS = 20
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkPlacement(Pictured, plot="plots.network_plot:plot_network_placement"):
+class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placement"):
     """Positions for several transmitters, and the search that found them.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Figure of a transmitter's placement: the map, the search, and the predicted coverage."""
+"""Figures of placements of one and of several transmitters: the map, the search, and the predicted coverage."""
 
 from typing import Any
 
@@ -14,6 +14,7 @@ from matplotlib.ticker import PercentFormatter
 from sionna_partial.checks import require
 from sionna_partial.constants import CellState
 from sionna_partial.placement.placement import TransmitterPlacement
+from sionna_partial.placement.several import NetworkPlacement
 from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import RED, STAR, UNKNOWN, WALL, Figure, corners_m, legend_below, window_m
 
@@ -70,6 +71,46 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     return figure
 
 
+def plot_network_placement(placement: NetworkPlacement) -> Figure:
+    """Draw the transmitters that `place_transmitters` chose, the candidates, and the receivers that they cover.
+
+    Parameters
+    ----------
+    placement : NetworkPlacement
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not registered with pyplot: it need not be closed.
+
+    Raises
+    ------
+    SettingsError
+        For something else than a NetworkPlacement.
+    """
+    kind = type(placement).__name__
+    require(isinstance(placement, NetworkPlacement), "placement", kind, "give what place_transmitters returned.")
+    ny, nx = placement.partial.shape
+    figure = Figure(figsize=(_WIDTH_IN, min(max(7.0 * ny / nx, 3.0), 14.0) + 1.2), dpi=_DPI, layout="constrained")
+    axis = figure.add_subplot()
+    draw_map(axis, placement.partial)
+    scale = _draw_receivers(axis, placement)
+    axis.plot(*placement.candidates_m[:, :2].T, "o", markerfacecolor="white", markeredgecolor="black", markersize=5)
+    axis.plot(*placement.positions_m[:, :2].T, zorder=6, **_STAR)
+    title = f"{len(placement.positions_m)} transmitters, predicted coverage {placement.score:.1%}"
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
+    label = f"probability that one is above {placement.settings.threshold_db:g} dB"
+    bar = figure.colorbar(scale, ax=axis, label=label, shrink=0.8)
+    bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
+    candidate = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
+    handles = [
+        Line2D([], [], label="transmitter", markersize=12, **STAR),
+        Line2D([], [], label="candidate", **candidate),  # type: ignore[arg-type]
+    ]
+    legend_below(figure, handles)
+    return figure
+
+
 def _headline(placement: TransmitterPlacement) -> str:
     x, y, z = placement.position_m
     score = placement.score
@@ -86,7 +127,7 @@ def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, flo
     return window_m(np.vstack([known_m, counting_m - half, counting_m + half]))
 
 
-def _draw_receivers(axis: Axes, placement: TransmitterPlacement) -> ScalarMappable:
+def _draw_receivers(axis: Axes, placement: TransmitterPlacement | NetworkPlacement) -> ScalarMappable:
     """Draw a square for each receiver, and return the colour scale."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]

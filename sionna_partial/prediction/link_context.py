@@ -210,6 +210,12 @@ def path_unobserved_m(
     return total_m
 
 
+def traced_unobserved_m(partial: PartialMap, links: TracedLinks) -> Floats:
+    """Return the same length (P,) [m] of all paths of traced links."""
+    tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx], links.rx[links.path_rx]
+    return path_unobserved_m(partial, tx_m, links.interactions, links.vertices_m, rx_m)
+
+
 def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
     """Return the fraction (P,) of the power of paths that unobserved space of an attenuation length [m] lets pass."""
     return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)

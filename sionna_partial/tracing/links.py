@@ -34,6 +34,11 @@ class ChannelPaths:
     vertices_m: NDArray[np.float64]
     settings: TraceSettings
 
+    @property
+    def path_link(self) -> NDArray[np.int64]:
+        """Number of the link of each path (P,): transmitter by transmitter, as `gain_db` is when flattened."""
+        return self.path_tx.astype(np.int64) * len(self.rx) + self.path_rx
+
     def cir(
         self,
         *,
@@ -378,7 +383,7 @@ class TracedLinks(ChannelPaths, Shown):
     def _link_columns(self) -> dict[str, NDArray[Any]]:
         tx_m, count = self.tx.reshape(-1, 3), len(self.rx)
         tx, rx = np.repeat(np.arange(len(tx_m)), count), np.tile(np.arange(count), len(tx_m))
-        link = self.path_tx.astype(np.int64) * count + self.path_rx
+        link = self.path_link
         first, paths = np.unique(link, return_index=True, return_counts=True)[1:]  # the shortest is listed first
         delay_s, number = np.full(len(tx), np.nan), np.zeros(len(tx), np.int64)
         delay_s[link[first]], number[link[first]] = self.delay_s[first], paths
