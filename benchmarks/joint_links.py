@@ -66,7 +66,7 @@ def gain(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats, chances: Floats, tr
     rng = np.random.default_rng(0)
     for chance, true in zip(chances, truth, strict=True):
         uncertain = np.flatnonzero((chance > UNCERTAIN[0]) & (chance < UNCERTAIN[1]))
-        pairs = np.array([*itertools.combinations(uncertain, 2)]).reshape(-1, 2)
+        pairs = np.array([*itertools.combinations(uncertain, 2)], dtype=np.intp).reshape(-1, 2)
         same = [(each[pairs[:, 0]] == each[pairs[:, 1]]).all(axis=1) for each in (tx_m, rx_m)]
         for group, members in enumerate((same[0], same[1], ~same[0] & ~same[1])):
             a, b = rng.permutation(pairs[members])[:PAIRS].T
