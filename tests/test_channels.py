@@ -1,6 +1,6 @@
 """Channel responses: against stock Sionna RT on the same paths, and against traces from antenna to antenna."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -431,6 +431,13 @@ class TestSpreads:
         assert several.spreads().delay_spread_s.dims == ("tx", "rx")
 
 
+def of_receivers(channels: xr.Dataset) -> Iterator[tuple[Any, Any]]:
+    """Impulse responses of each receiver, as generators for `CIRDataset` yield them."""
+    for rx in range(channels.sizes["rx"]):
+        one = channels.isel(rx=[rx])
+        yield one.a.to_numpy(), one.tau.to_numpy().astype(np.float32)
+
+
 class TestFiles:
     ARRAYS: ClassVar = {"tx_array": (2, 2, "iso", "VH"), "rx_array": (1, 2)}
 
@@ -486,11 +493,22 @@ class TestFiles:
         """`CIRDataset` takes a generator of a [rx, rx_ant, tx, tx_ant, path, time] and tau [rx, tx, path]."""
         sp.save_channels(several, tmp_path / "channels.zarr", tx_array=array_of(2, 2))
         found = sp.load_channels(tmp_path / "channels.zarr")
-        for rx in range(3):
-            a, tau = (found[name].isel(rx=[rx]).to_numpy() for name in ("a", "tau"))
+        for a, tau in of_receivers(found):
             assert a.shape == (1, 1, 2, 4, found.sizes["path"], 1)
             assert tau.shape == (1, 2, found.sizes["path"])
             assert a.dtype == np.complex64
+
+    def test_in_the_data_set_of_sionna(self, several: sp.TracedLinks, tmp_path: Path) -> None:
+        """Runs where the whole of Sionna is installed, not its ray tracer alone."""
+        cir_dataset = pytest.importorskip("sionna.phy.channel").CIRDataset
+        sp.save_channels(several, tmp_path / "channels.nc", tx_array=array_of(2, 2))
+        found = sp.load_channels(tmp_path / "channels.nc")
+        sizes = (found.sizes[name] for name in ("rx_ant", "tx", "tx_ant", "path", "time"))
+        a, tau = cir_dataset(lambda: of_receivers(found), 3, 1, *sizes)()
+        assert a.shape == (3, 1, 1, 2, 4, found.sizes["path"], 1)
+        powers = (np.abs(np.asarray(a)) ** 2).reshape(3, -1).sum(axis=1)
+        np.testing.assert_allclose(np.sort(powers), np.sort((np.abs(found.a) ** 2).sum(found.a.dims[1:])), rtol=1e-5)
+        np.testing.assert_allclose(np.sort(np.ravel(tau)), np.sort(np.ravel(found.tau)), rtol=1e-6)
 
     def test_blocks_and_progress(
         self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
