@@ -53,7 +53,7 @@ class JointLatents:
             return np.zeros((len(seeds), count, 0))
         draws = max(count, _FEWEST_DRAWS)
         sources = [np.random.default_rng(seed) for seed in seeds]
-        fields = [rng.standard_normal((math.prod(self._shape), draws)) for rng in sources]
+        fields = [rng.standard_normal((math.prod(self._shape), draws), np.float32) for rng in sources]
         shared = [
             np.concatenate(parts)
             for parts in zip(*([rows @ each for each in fields] for rows in self._smoothed(tx_m, rx_m)), strict=True)
@@ -63,22 +63,10 @@ class JointLatents:
     def draw(
         self, links: LinkPrediction, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]
     ) -> tuple[NDArray[np.uint8], Floats]:
-        """Draw states and gains (count, T, N) [dB] of predicted links (T, N) from `tx_m` (T, 3) to `rx_m` (N, 3) [m].
-
-        The lowest quantiles of a link are its outages, the highest its LOS, and the gain of each state has quantiles of
-        its own.
-        """
+        """Draw states and gains (count, T, N) [dB] of predicted links (T, N) from `tx_m` (T, 3) to `rx_m` (N, 3)."""
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
-        shape = (count, len(tx_m), len(rx_m))
         quantiles = self.quantiles(*ends, count, [[*seed, 0], [*seed, 1]])
-        of_state, of_gain = (each.reshape(shape) for each in quantiles)
-        probabilities, means_db, stds_db = links.by_state
-        p_outage = probabilities[LinkState.OUTAGE]
-        state = np.where(of_state < p_outage + probabilities[LinkState.NLOS], LinkState.NLOS, LinkState.LOS)
-        state = np.where(of_state < p_outage, LinkState.OUTAGE, state).astype(np.uint8)
-        mean_db, std_db = (np.take_along_axis(each, state.astype(np.intp), axis=0) for each in (means_db, stds_db))
-        gain_db = np.clip(mean_db + std_db * ndtri(of_gain), GAIN_FLOOR_DB, 0.0)
-        return state, np.where(state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+        return states_and_gains(links, *quantiles.reshape(2, count, len(tx_m), len(rx_m)))
 
     @cached_property
     def _step(self) -> int:
@@ -110,7 +98,7 @@ class JointLatents:
             column, row = np.moveaxis((points_m - self.partial.origin_m) / edge_m, 2, 0)
             cell = np.clip(np.floor(row), 0, limit[1]) * self._shape[1] + np.clip(np.floor(column), 0, limit[0])
             index = cell.astype(np.intp)
-            rows = np.zeros((len(index), len(self._weight)))
+            rows = np.zeros((len(index), len(self._weight)), np.float32)
             np.add.at(rows, (np.arange(len(index))[:, None], index), self._weight[index])
             smooth = ndimage.gaussian_filter(
                 rows.reshape(-1, *self._shape), (0.0, *2 * (REACH_M / math.sqrt(2.0) / edge_m,)), mode="constant"
@@ -118,9 +106,24 @@ class JointLatents:
             yield smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
 
 
+def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -> tuple[NDArray[np.uint8], Floats]:
+    """States and gains (n, ...) [dB] of predicted links (...) at quantiles of both.
+
+    The lowest quantiles of a link are its outages, the highest its LOS. The gain of each state has quantiles of its
+    own.
+    """
+    probabilities, means_db, stds_db = links.by_state
+    p_outage = probabilities[LinkState.OUTAGE]
+    state = np.where(of_state < p_outage + probabilities[LinkState.NLOS], LinkState.NLOS, LinkState.LOS)
+    state = np.where(of_state < p_outage, LinkState.OUTAGE, state).astype(np.uint8)
+    mean_db, std_db = (np.take_along_axis(each, state.astype(np.intp), axis=0) for each in (means_db, stds_db))
+    gain_db = np.clip(mean_db + std_db * ndtri(of_gain), GAIN_FLOOR_DB, 0.0)
+    return state, np.where(state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+
+
 def _evenly_spread(shared: Floats, rng: np.random.Generator, count: int) -> Floats:
     """Quantiles (count, L) of latents with this shared part (L, draws)."""
     latent = math.sqrt(1.0 - OWN_VARIANCE) * shared
-    latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape)
+    latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape, np.float32)
     rank = latent.argsort(axis=1).argsort(axis=1)[:, :count]
     return ((rank + rng.random(rank.shape)) / latent.shape[1]).T

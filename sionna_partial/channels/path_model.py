@@ -40,6 +40,9 @@ _SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0
 """Units in which links with LOS, and without, are compared: gain above free space [dB], logarithms of distance and
 unobserved length, gain of the surviving paths above that of the link [dB], whether each end is in an observed cell."""
 
+_NEARLY = 0.3
+"""How much less alike than the most alike, as a fraction, an analogue may be."""
+
 _WEAKEST_DB = -30.0
 _MAX_BYTES = 20_000_000
 
@@ -66,7 +69,7 @@ class LinkGeometry:
         unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m)
         return cls(distance_m, unobserved_m, tx_seen, rx_seen, departure_rad, free_space_db)
 
-    @property
+    @cached_property
     def arrival_rad(self) -> Floats:
         """Zenith and azimuth (L, 2) of arrival at the receiver."""
         zenith_rad, azimuth_rad = self.departure_rad.T
@@ -89,14 +92,15 @@ class LinkGeometry:
         return np.stack(columns, axis=1) / _SCALE[STATES.index(state)]
 
 
-def survival_inputs(links: TracedLinks, unobserved_m: Floats, geometry: LinkGeometry, link: Integers) -> Floats:
-    """Return the inputs (P, 8) of the network for traced paths, whose links are numbers `link` (P,) of `geometry`."""
+def survival_inputs(links: TracedLinks, paths: Integers, unobserved_m: Floats, geometry: LinkGeometry) -> Floats:
+    """Return the inputs (P, 8) of the network for some traced paths, by their numbers (P,), on all links."""
+    link, interactions = links.path_link[paths], links.interactions[paths]
     columns = (
         np.log1p(4.0 * unobserved_m),
         unobserved_m > 1e-3,
-        (links.interactions > 0).sum(axis=1),
-        (links.interactions == DIFFRACTION).any(axis=1),
-        np.log10(np.maximum(np.abs(links.a), 1e-12)) + 4.0,
+        (interactions > 0).sum(axis=1),
+        (interactions == DIFFRACTION).any(axis=1),
+        np.log10(np.maximum(np.abs(links.a[paths]), 1e-12)) + 4.0,
         geometry.distance_m[link] / 5.0,
         geometry.tx_seen[link],
         geometry.rx_seen[link],
@@ -153,7 +157,8 @@ class PathModel:
     def analogues(self, state: LinkState, keys: Floats, quantile: Floats) -> Integers:
         """Numbers (L,) of analogues of links of one state: of those alike, that of a quantile (L,) of delay spread."""
         tree, start = self._trees[STATES.index(state)]
-        alike = tree.query(keys, k=np.arange(1, min(ALIKE, tree.n) + 1), workers=core_count())[1] + start
+        places = np.arange(1, min(ALIKE, tree.n) + 1)
+        alike = tree.query(keys, k=places, eps=_NEARLY, workers=core_count())[1] + start
         order = np.take_along_axis(alike, np.argsort(self.spread_ns[alike], axis=1), axis=1)
         chosen = (quantile * order.shape[1]).astype(np.intp)
         return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]

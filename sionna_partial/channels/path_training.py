@@ -62,13 +62,11 @@ def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -
     ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
     geometry = LinkGeometry.of(partial, *ends, known.settings.frequency_hz)
     link, true_link = known.path_link, true.path_link
-    unobserved_m = traced_unobserved_m(partial, known)
     same = _same(known, link, true, true_link)
     state = true.link_state.ravel()
-    taught = (known.interactions > 0).any(axis=1) & (state[link] != LinkState.OUTAGE)
-    inputs = np.column_stack([survival_inputs(known, unobserved_m, geometry, link), state[link] == LinkState.LOS])[
-        taught
-    ]
+    taught = np.flatnonzero((known.interactions > 0).any(axis=1) & (state[link] != LinkState.OUTAGE))
+    inputs = survival_inputs(known, taught, traced_unobserved_m(partial, known, taught), geometry)
+    inputs = np.column_stack([inputs, state[link[taught]] == LinkState.LOS])
     new = np.ones(len(true_link), dtype=bool)
     new[same[same >= 0]] = False
     new &= (true.interactions > 0).any(axis=1)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
-from sionna_partial.channels.joint import JointLatents
+from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.channels.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.checks import Progress, require_number, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
@@ -42,9 +43,9 @@ RANGE_DB = 30.0
 
 _COLUMNS = tuple(name for name in SolvedPaths.__dataclass_fields__ if name != "vertices_m")
 _NO_VERTICES = np.zeros((0, 1, 3))
-_PATHS_AT_ONCE = 1_000_000
+_PATHS_AT_ONCE = 100_000
 _PATHS_OF_DRAW, _PATH_BYTES = 20, 300
-_SURVIVAL, _ANALOGUE, _REST = 2, 3, 4
+_STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,74 +237,74 @@ class _Draws:
         self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
     ) -> None:
         tx_m, rx_m = traced.tx.reshape(-1, 3), traced.rx
-        self._traced, self._count, self._seed, self._rx_count = traced, count, seed, len(rx_m)
+        self._traced, self._seed, self._rx_count = traced, seed, len(rx_m)
         self._link = traced.path_link
-        tx_of, rx_of = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
-        self._geometry = LinkGeometry.of(partial, tx_of, rx_of, traced.settings.frequency_hz)
-        unobserved_m = traced_unobserved_m(partial, traced)
-        self._crosses = unobserved_m > 0.0
+        ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
+        self._geometry = LinkGeometry.of(partial, *ends, traced.settings.frequency_hz)
         probabilities, _, stds_db = prediction.by_state
         certain = (probabilities.max(axis=0) == 1.0) & ((probabilities > 0.0) * stds_db == 0.0).all(axis=0)
-        self._certain = certain
-        latents = JointLatents(partial)
-        matrix = prediction.reshaped((len(tx_m), len(rx_m)))
-        state, gain_db = latents.draw(matrix, tx_m, rx_m, count, [seed])
-        state, gain_db = state.reshape(count, -1), gain_db.reshape(count, -1)
-        seeds = [[seed, each] for each in (_SURVIVAL, _ANALOGUE)]
-        self._survival_quantile, self._analogue_quantile = latents.quantiles(tx_of, rx_of, count, seeds)
+        self._certain_paths, self._uncertain = np.flatnonzero(certain[self._link]), np.flatnonzero(~certain)
+        seeds = [[seed, each] for each in (_STATE, _GAIN, _SURVIVAL, _ANALOGUE)]
+        of_state, of_gain, of_survival, of_analogue = JointLatents(partial).quantiles(*ends, count, seeds)
+        state, gain_db = states_and_gains(prediction, of_state, of_gain)
         # no path with LOS is weaker than free space
         gain_db = np.where(state == LinkState.LOS, np.maximum(gain_db, self._geometry.free_space_db), gain_db)
         self.state, self.gain_db = state, np.where(certain, traced.gain_db.ravel(), gain_db)
+        self._survival_latent = ndtri(of_survival[:, self._uncertain])
+        self._analogue_quantile = of_analogue[:, self._uncertain]
         self._model = PathModel.load()
-        inputs = survival_inputs(traced, unobserved_m, self._geometry, self._link)
-        self._survival = {each: self._model.survival(inputs, each) for each in (LinkState.LOS, LinkState.NLOS)}
+        self._paths, self._place = self._indirect()
+        unobserved_m = traced_unobserved_m(partial, traced, self._paths)
+        self._crosses = np.zeros(len(self._link), dtype=bool)
+        self._crosses[self._paths] = unobserved_m > 0.0
+        inputs = survival_inputs(traced, self._paths, unobserved_m, self._geometry)
+        self._survives_below = [
+            math.sqrt(2.0) * ndtri(self._model.survival(inputs, each)) for each in (LinkState.LOS, LinkState.NLOS)
+        ]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Return the paths of all draws, ordered as `TracedLinks` has them, without vertices."""
-        parts = [*self._parts()]
+        paths = len(self.state) * (len(self._link) + _PATHS_OF_DRAW * len(self._uncertain))
+        blocks = np.array_split(np.arange(len(self.state)), min(len(self.state), 1 + paths // _PATHS_AT_ONCE))
+        ordered = [self._ordered(block) for block in blocks]
+        return {name: np.concatenate([each.pop(name) for each in ordered]) for name in _COLUMNS}
+
+    def _ordered(self, draws: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+        """Columns of all paths of some draws."""
+        parts = [*self._parts(draws, np.random.default_rng([self._seed, _REST, draws[0]]))]
         order = path_order(parts)
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
-    def _parts(self) -> Iterator[SolvedPaths]:
-        """Paths of all draws, some links at a time."""
-        paths = np.flatnonzero(self._certain[self._link])
-        yield self._copies(np.repeat(np.arange(self._count), len(paths)), np.tile(paths, self._count), None, None)
-        uncertain = np.flatnonzero(~self._certain)
-        paths_of_link = np.bincount(self._link, minlength=len(self._certain))[uncertain] + _PATHS_OF_DRAW
-        block = np.cumsum(paths_of_link * self._count) // _PATHS_AT_ONCE
-        for number in np.unique(block):
-            yield from self._uncertain(uncertain[block == number], np.random.default_rng([self._seed, _REST, number]))
-
-    def _uncertain(self, links: NDArray[np.intp], rng: np.random.Generator) -> Iterator[SolvedPaths]:
-        """Paths of draws of some links: the surviving ones, the direct ones, and those of analogues."""
-        state, power = self.state[:, links], 10.0 ** (self.gain_db[:, links] / 10.0)
-        is_los = state == LinkState.LOS
-        rest = np.maximum(power - is_los * 10.0 ** (self._geometry.free_space_db[links] / 10.0), 0.0)
-        paths, place = self._indirect(links)
-        traced_power = np.abs(self._traced.a[paths]) ** 2
-        chance = np.where(is_los[:, place], *(self._survival[each][paths] for each in (LinkState.LOS, LinkState.NLOS)))
-        latent = ndtri(self._survival_quantile[:, links])[:, place] + rng.standard_normal(chance.shape)
-        survives = (latent < math.sqrt(2.0) * ndtri(chance)) & (state[:, place] != LinkState.OUTAGE)
-        belongs = csr_array((traced_power, (np.arange(len(paths)), place)), shape=(len(paths), len(links)))
-        survivors = survives.astype(np.float64) @ belongs
-        analogue = self._analogues(links, survivors)
+    def _parts(self, draws: NDArray[np.intp], rng: np.random.Generator) -> Iterator[SolvedPaths]:
+        """Paths of some draws: those of certain links, the surviving and direct ones, and those of analogues."""
+        certain, links, place = self._certain_paths, self._uncertain, self._place
+        yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
+        state, power = self.state[draws][:, links], 10.0 ** (self.gain_db[draws][:, links] / 10.0)
+        is_los, free_space = state == LinkState.LOS, 10.0 ** (self._geometry.free_space_db[links] / 10.0)
+        rest = np.maximum(power - is_los * free_space, 0.0)
+        latent = self._survival_latent[draws][:, place]
+        latent += rng.standard_normal(latent.shape)
+        survives = latent < np.where(is_los[:, place], *self._survives_below)
+        survives &= (state != LinkState.OUTAGE)[:, place]
+        survivors = survives.astype(np.float64) @ self._power
+        analogue = self._analogues(draws, survivors)
         has_paths = (np.diff(self._model.first)[analogue] > 0) & (analogue >= 0)
         # without an analogue's paths the survivors have all of the power
         scale = np.where((survivors > rest) | ~has_paths, rest / np.maximum(survivors, 1e-30), 1.0)
-        draw, row = np.nonzero(survives & (scale > 0.0)[:, place])
-        yield self._copies(draw, paths[row], np.sqrt(scale[draw, place[row]]), rng)
-        left = np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
+        row, path = np.nonzero(survives & (scale > 0.0)[:, place])
+        yield self._copies(draws[row], self._paths[path], np.sqrt(scale[row, place[path]]), rng)
         alone = ~has_paths & (survivors == 0.0) & (state == LinkState.NLOS)
-        draw, row = np.nonzero(is_los | alone)
-        direct = np.where(is_los[draw, row], 10.0 ** (self._geometry.free_space_db[links[row]] / 10.0), rest[draw, row])
-        nothing = np.zeros((len(draw), 2))
-        kind = np.where(is_los[draw, row], 0, UNSEEN)
-        yield self._made(draw, links[row], direct, np.zeros(len(draw)), nothing, nothing, kind, rng)
-        yield self._of_analogues(links, analogue, left, rng)
+        row, link = np.nonzero(is_los | alone)
+        kind = np.where(is_los[row, link], 0, UNSEEN)
+        direct, nothing = np.where(kind == 0, free_space[link], rest[row, link]), np.zeros((len(row), 2))
+        yield self._made(draws[row], links[link], direct, np.zeros(len(row)), nothing, nothing, kind, rng)
+        left = np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
+        yield self._of_analogues(draws, analogue, left, rng)
 
-    def _indirect(self, links: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indirect traced paths of some links that are not too weak, and the place of the link of each in `links`."""
-        place = np.full(len(self._certain), -1)
+    def _indirect(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Indirect traced paths of uncertain links that are not too weak, and the place of the link of each there."""
+        links = self._uncertain
+        place = np.full(len(self._geometry.distance_m), -1)
         place[links] = np.arange(len(links))
         paths = np.flatnonzero((place[self._link] >= 0) & (self._traced.interactions > 0).any(axis=1))
         power, at = np.abs(self._traced.a[paths]) ** 2, place[self._link[paths]]
@@ -312,37 +313,43 @@ class _Draws:
         kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
         return paths[kept], at[kept]
 
-    def _analogues(self, links: NDArray[np.intp], survivors: NDArray[np.float64]) -> NDArray[np.intp]:
-        """Analogues (n, L) of draws of some links; -1 in an outage."""
-        analogue = np.full(survivors.shape, -1)
+    @cached_property
+    def _power(self) -> csr_array:
+        """Power of these paths, by which link it belongs to."""
+        power, rows = np.abs(self._traced.a[self._paths]) ** 2, np.arange(len(self._paths))
+        return csr_array((power, (rows, self._place)), shape=(len(rows), len(self._uncertain)))
+
+    def _analogues(self, draws: NDArray[np.intp], survivors: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
+        links, analogue = self._uncertain, np.full(survivors.shape, -1)
         for state in (LinkState.LOS, LinkState.NLOS):
-            draw, row = np.nonzero(self.state[:, links] == state)
-            geometry, survivors_db = self._geometry.take(links[row]), path_gain_db(survivors[draw, row])
-            keys = geometry.keys(state, self.gain_db[draw, links[row]], survivors_db)
-            quantile = self._analogue_quantile[draw, links[row]]
-            analogue[draw, row] = self._model.analogues(state, keys, quantile)
+            row, link = np.nonzero(self.state[draws][:, links] == state)
+            geometry, survivors_db = self._geometry.take(links[link]), path_gain_db(survivors[row, link])
+            keys = geometry.keys(state, self.gain_db[draws[row], links[link]], survivors_db)
+            quantile = self._analogue_quantile[draws[row], link]
+            analogue[row, link] = self._model.analogues(state, keys, quantile)
         return analogue
 
     def _of_analogues(
         self,
-        links: NDArray[np.intp],
+        draws: NDArray[np.intp],
         analogue: NDArray[np.intp],
         power: NDArray[np.float64],
         rng: np.random.Generator,
     ) -> SolvedPaths:
-        """Paths of analogues (n, L) with a power in sum (n, L), mirrored at random for each link and draw."""
-        draw, row = np.nonzero(power > 0.0)
-        chosen, mirror = analogue[draw, row], rng.choice([-1.0, 1.0], len(draw))
+        """Paths of analogues (D, U) with a power in sum (D, U), mirrored at random for each link and draw."""
+        row, link = np.nonzero(power > 0.0)
+        chosen, mirror = analogue[row, link], rng.choice([-1.0, 1.0], len(row))
         first, count = self._model.first[chosen], np.diff(self._model.first)[chosen]
-        each = np.repeat(np.arange(len(draw)), count)
+        each = np.repeat(np.arange(len(row)), count)
         path = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
         fraction = self._model.fraction[path].astype(np.float64)
-        total = np.bincount(each, weights=fraction, minlength=len(draw))
+        total = np.bincount(each, weights=fraction, minlength=len(row))
         turned = np.column_stack([np.ones(len(path)), mirror[each]])
         return self._made(
-            draw[each],
-            links[row[each]],
-            power[draw, row][each] * fraction / total[each],
+            draws[row[each]],
+            self._uncertain[link[each]],
+            power[row, link][each] * fraction / total[each],
             1e-9 * np.maximum(self._model.excess_ns[path].astype(np.float64), 0.0),
             turned * self._model.departure_rad[path],
             turned * self._model.arrival_rad[path],
@@ -358,11 +365,11 @@ class _Draws:
         rng: np.random.Generator | None,
     ) -> SolvedPaths:
         """Traced paths in some draws; what crosses the unseen has a random phase."""
-        columns = {name: getattr(self._traced, name)[paths] for name in _COLUMNS}
+        columns = {name: getattr(self._traced, name).take(paths, axis=0) for name in _COLUMNS}
         if rng is not None and scale is not None:
             turn = np.where(self._crosses[paths], rng.uniform(0.0, 2.0 * np.pi, len(paths)), 0.0)
-            columns["transfer"] = columns["transfer"] * (scale * np.exp(1j * turn))[:, None, None]
-        columns["path_tx"] = (columns["path_tx"] + draw * self._tx_count).astype(np.int32)
+            columns["transfer"] *= (scale * np.exp(1j * turn))[:, None, None]
+        columns["path_tx"] += (draw * self._tx_count).astype(np.int32)
         return SolvedPaths(**columns, vertices_m=_NO_VERTICES)
 
     def _made(
@@ -377,20 +384,22 @@ class _Draws:
         rng: np.random.Generator,
     ) -> SolvedPaths:
         """Paths that were not traced: angles are those from the direct line, and they keep the polarisation."""
-        line, depth = self._geometry.take(link), max(1, self._traced.interactions.shape[1])
-        seen = (kind == 0) & (self._geometry.unobserved_m[link] == 0.0)
+        geometry, depth = self._geometry, max(1, self._traced.interactions.shape[1])
+        seen = (kind == 0) & (geometry.unobserved_m[link] == 0.0)
         amplitude = np.sqrt(power) * np.exp(2j * np.pi * np.where(seen, 0.0, rng.random(len(link))))
-        interactions = np.zeros((len(link), depth), np.uint8)
-        interactions[:, 0] = kind
+        transfer, interactions = np.zeros((len(link), 2, 2), complex), np.zeros((len(link), depth), np.uint8)
+        transfer[:, 0, 0], transfer[:, 1, 1], interactions[:, 0] = amplitude, -amplitude, kind
         angles = []
-        for direct_rad, turned_rad in ((line.departure_rad, departure_rad), (line.arrival_rad, arrival_rad)):
-            zenith, azimuth = (direct_rad + turned_rad).T
-            angles.append(np.stack([np.clip(zenith, 0.0, np.pi), wrapped(azimuth)], axis=1))
+        for direct_rad, turned_rad in ((geometry.departure_rad, departure_rad), (geometry.arrival_rad, arrival_rad)):
+            angle_rad = direct_rad.take(link, axis=0) + turned_rad
+            np.clip(angle_rad[:, 0], 0.0, np.pi, out=angle_rad[:, 0])
+            angle_rad[:, 1] = wrapped(angle_rad[:, 1])
+            angles.append(angle_rad)
         return SolvedPaths(
             path_tx=(draw * self._tx_count + link // self._rx_count).astype(np.int32),
             path_rx=(link % self._rx_count).astype(np.int32),
-            transfer=amplitude[:, None, None] * np.diag([1.0, -1.0]),
-            delay_s=line.distance_m / SPEED_OF_LIGHT_M_S + excess_s,
+            transfer=transfer,
+            delay_s=geometry.distance_m[link] / SPEED_OF_LIGHT_M_S + excess_s,
             departure_rad=angles[0],
             arrival_rad=angles[1],
             interactions=interactions,

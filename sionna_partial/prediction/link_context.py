@@ -210,10 +210,10 @@ def path_unobserved_m(
     return total_m
 
 
-def traced_unobserved_m(partial: PartialMap, links: TracedLinks) -> Floats:
-    """Return the same length (P,) [m] of all paths of traced links."""
-    tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx], links.rx[links.path_rx]
-    return path_unobserved_m(partial, tx_m, links.interactions, links.vertices_m, rx_m)
+def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: NDArray[np.intp]) -> Floats:
+    """Return the same length (P,) [m] of some paths of traced links, by their numbers (P,)."""
+    tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
+    return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)
 
 
 def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
