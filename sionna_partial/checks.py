@@ -59,6 +59,16 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
 
+def require_bool(name: str, value: object) -> None:
+    """Raise a SettingsError that names a value which is neither True nor False."""
+    require(isinstance(value, bool), name, value, "give True or False.")
+
+
+def require_type(name: str, value: object, kind: type, remedy: str) -> None:
+    """Raise a SettingsError that names the type of `value` unless it is of a kind."""
+    require(isinstance(value, kind), name, type(value).__name__, remedy)
+
+
 def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise a SettingsError unless `value` is one of several words."""
     words = tuple(choices)

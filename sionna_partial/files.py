@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+from sionna_partial.checks import shown
 from sionna_partial.errors import OutputError, SionnaPartialError
 from sionna_partial.process import own_folder, signals_held
 
@@ -51,8 +52,9 @@ def open_regular(
     remedy: str = "give a smaller file.",
 ) -> IO[bytes]:
     """Open a regular file of at most `most` bytes; pipes and devices, which need not end, raise an `error`."""
+    source = input_path(path, field, error, "give the name of a file.")
     try:
-        stream = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+        stream = open(source, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
     except (OSError, ValueError) as cause:
         reason = getattr(cause, "strerror", None) or cause
         raise error(f"{field} = '{path}' cannot be read ({reason}): check the path.") from cause
@@ -80,6 +82,13 @@ def read_bytes(
             return stream.read(os.fstat(stream.fileno()).st_size + 1)
         except OSError as cause:
             raise error(f"{field} = '{path}' cannot be read ({cause.strerror}): check the disk.") from cause
+
+
+def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:
+    """Return a path to read from, or raise an `error` if it is none."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+        raise error(f"{field} = {shown(path)} is not a path: {remedy}")
+    return Path(path)
 
 
 def output_path(path: object) -> Path:

@@ -90,9 +90,7 @@ class TestPlotExploration:
         assert titles[-1].startswith("step 39:")
 
     def test_it_needs_an_exploration(self, home):
-        with pytest.raises(
-            SettingsError, match="exploration = 'PartialMap' is not allowed: give an Exploration, as explore_trajectory"
-        ):
+        with pytest.raises(SettingsError, match="exploration = 'PartialMap' is not allowed: give what explore_traj"):
             plot_exploration(home)
 
 
@@ -144,5 +142,7 @@ class TestAnimateExploration:
             animate_exploration(exploration.at((60,)), tmp_path / "file" / "way.gif")
 
     def test_it_needs_an_exploration(self):
-        with pytest.raises(SettingsError, match="exploration = 'str' is not allowed: give an Exploration"):
+        with pytest.raises(
+            SettingsError, match="exploration = 'str' is not allowed: give what explore_trajectory returned"
+        ):
             animate_exploration("exploration", Path("way.gif"))

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import dask
 import dask.array as da
@@ -11,13 +11,11 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sionna_partial.channels.responses import ArrayPaths
-from sionna_partial.checks import Progress, require, require_choice
+from sionna_partial.checks import Progress, require, require_choice, require_type
 from sionna_partial.errors import OutputError, SettingsError
-from sionna_partial.files import atomic_files, atomic_path, open_regular, output_path
+from sionna_partial.files import atomic_files, atomic_path, input_path, open_regular, output_path
 from sionna_partial.progress import reporting
-
-if TYPE_CHECKING:
-    from sionna_partial.tracing.links import ChannelPaths
+from sionna_partial.tracing.links import ChannelPaths
 
 Layout = Literal["sionna", "deepmimo"]
 """Names and axes of the arrays in a file."""
@@ -32,7 +30,7 @@ MAX_BYTES = 2**44
 
 
 def save_channels(
-    channels: "ChannelPaths | xr.Dataset",
+    channels: ChannelPaths | xr.Dataset,
     path: str | os.PathLike[str],
     *,
     layout: Layout = "sionna",
@@ -81,6 +79,7 @@ def save_channels(
         if isinstance(channels, xr.Dataset):
             table = _unstacked(channels, options)
         else:
+            require_type("channels", channels, ChannelPaths, "give links, or what their cir, cfr or taps returned.")
             arrays = ArrayPaths.of(channels, **options)
             require(arrays.most > 0, "channels", f"{arrays.links} links", "none has a path: there is nothing to save.")
             table = _computed_later(arrays, report)
@@ -134,7 +133,8 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
     >>> channels.a.dims
     ('rx', 'rx_ant', 'tx', 'tx_ant', 'path', 'time')
     """
-    source, remedy = Path(path), "give a file of save_channels."
+    remedy = "give a file of save_channels."
+    source = input_path(path, "path", SettingsError, remedy)
     require(source.suffix in SUFFIXES, "path", str(path), remedy)
     try:
         if source.suffix == ".zarr":

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.checks import real_array, require, require_number, require_whole
+from sionna_partial.checks import real_array, require, require_bool, require_number, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.tracing.antennas import Antennas
@@ -53,7 +53,7 @@ class ArrayPaths:
     ) -> "ArrayPaths":
         """Check arguments, which are those of `TracedLinks.cir`."""
         for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
-            require(isinstance(value, bool), name, value, "give True or False.")
+            require_bool(name, value)
         require(
             paths.transfer.shape[1:] == (2, 2),
             "transfer",

@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from sionna_partial.checks import shown
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
-from sionna_partial.files import atomic_write, open_regular, read_bytes
+from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
@@ -179,9 +179,8 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
 
 def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read what `dataset.json` of a data set has: settings, homes and versions."""
-    if not isinstance(folder, (str, os.PathLike)):
-        raise PredictorError(f"folder = {folder!r} is no path: give a folder that `sionna-partial dataset` wrote.")
-    path = Path(folder) / INDEX_FILE
+    remedy = "give a folder that `sionna-partial dataset` wrote."
+    path = input_path(folder, "folder", PredictorError, remedy) / INDEX_FILE
     if not os.path.exists(path):
         raise PredictorError(
             f"folder = '{folder}' is no data set, it has no {INDEX_FILE}: give a folder that `sionna-partial dataset` "

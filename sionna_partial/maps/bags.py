@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError, SionnaPartialError
-from sionna_partial.files import open_regular
+from sionna_partial.files import input_path, open_regular
 from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, grid_array
 from sionna_partial.maps.ros_map import states_from_percent, turn_grid
 
@@ -103,9 +103,7 @@ def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    if not isinstance(path, str | os.PathLike):
-        raise error(f"path = {shown(path)} is not a path: give a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder).")
-    source = Path(path)
+    source = input_path(path, "path", error, f"give a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder).")
     for file in source.iterdir() if os.path.isdir(source) else [source]:
         open_regular(file, "path", error, MAX_BAG_BYTES).close()
     store = Stores.ROS1_NOETIC if source.suffix.lower() == ".bag" else Stores.LATEST

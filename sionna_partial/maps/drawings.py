@@ -16,7 +16,7 @@ from scipy import ndimage
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.files import read_bytes
+from sionna_partial.files import input_path, read_bytes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -108,9 +108,7 @@ def map_from_drawing(
     >>> sp.map_from_drawing("plan.dxf").state_at([[2.0, 2.0], [5.02, 2.0], [6.0, 2.0]]).tolist()
     [0, 1, 2]
     """
-    if not isinstance(path, str | os.PathLike):
-        raise MapError(f"path = {shown(path)} is not a path: give a drawing ({', '.join(DRAWING_SUFFIXES)}).")
-    source = Path(path)
+    source = input_path(path, "path", MapError, f"give a drawing ({', '.join(DRAWING_SUFFIXES)}).")
     unit = _given_unit(unit_m)
     names = _given_layers(wall_layers)
     content = read_bytes(source, "path", MapError, MAX_DRAWING_BYTES, "purge it, or delete what is no wall.")

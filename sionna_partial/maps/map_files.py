@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
-from sionna_partial.checks import number_of, require, shown
+from sionna_partial.checks import number_of, require_bool, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import CALIBRATED_FILE, SCENE_FILES, atomic_write, output_path, read_bytes
@@ -106,7 +106,7 @@ def load_map(
     if not isinstance(path, (str, os.PathLike)):
         makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
         raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}. {makers}")
-    require(isinstance(strict, bool), "strict", strict, "give True or False.")
+    require_bool("strict", strict)
     source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
     suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):

@@ -13,13 +13,15 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
+from sionna_partial.checks import require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.errors import MeasurementError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.errors import MeasurementError, PositionError
+from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.settings import FREQUENCIES_HZ
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -149,6 +151,8 @@ class Assimilation:
     ------
     MeasurementError
         If `prior` has another number of links, or there are none.
+    MapError, PositionError, SettingsError
+        For arguments of another kind.
 
     Examples
     --------
@@ -181,12 +185,18 @@ class Assimilation:
         prior: LinkPrediction,
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
     ) -> None:
+        require_map("partial", partial)
+        require_type("measured", measured, Measurements, "give sp.Measurements(...).")
+        require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the measured links.")
+        require_number("frequency_hz", frequency_hz, *FREQUENCIES_HZ)
         if not 0 < len(measured) == len(prior.p_los):
             raise MeasurementError(
                 f"prior has {len(prior.p_los)} links, and measured {len(measured)}: give the same links, at least one."
             )
-        tx_m = np.asarray(tx_m, dtype=np.float64)
-        self._tx_m, self._frequency_hz = tx_m, frequency_hz
+        tx_m = position_array("tx_m", tx_m)
+        if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
+            raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
+        self._tx_m, self._frequency_hz = tx_m, float(frequency_hz)
         rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
         seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
         heard = gain_db > measured.sensitivity_db
@@ -240,8 +250,14 @@ class Assimilation:
         Returns
         -------
         LinkPrediction
+
+        Raises
+        ------
+        PositionError, SettingsError
+            For arguments of another kind.
         """
-        rx_m = np.asarray(rx_m, dtype=np.float64)
+        require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
+        rx_m = np.atleast_2d(position_array("rx_m", rx_m))
         prior = self._shadowed(rx_m, prior)
         across = self._correlation(rx_m, self._reach_m)
         told = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)

@@ -16,8 +16,8 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sionna_partial.checks import require, require_choice
-from sionna_partial.constants import LinkState
+from sionna_partial.checks import require, require_choice, require_number
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage, transmitter_text
 from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade, sheet_columns
@@ -163,8 +163,10 @@ def plot_comparison(
 
 
 def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
+    require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
     known = coverage_layers(threshold_db)
-    require(len(layers) > 0 and not isinstance(layers, str), "layers", layers, f"give some of {', '.join(known)}.")
+    named = isinstance(layers, Sequence) and not isinstance(layers, str) and len(layers) > 0
+    require(named, "layers", layers, f"give some of {', '.join(known)}.")
     for name in layers:
         require_choice("layers", name, known)
     return [known[name] for name in layers]

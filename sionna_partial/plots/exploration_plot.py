@@ -3,7 +3,6 @@
 import io
 import math
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +15,10 @@ from matplotlib.path import Path as MarkerPath
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from sionna_partial.checks import require
+from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
-from sionna_partial.files import atomic_write
+from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import (
@@ -81,7 +80,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     >>> figure = sp.plot_exploration(exploration)
     >>> figure.savefig("exploration.png")
     """
-    _require_exploration(exploration)
+    require_type("exploration", exploration, Exploration, "give what explore_trajectory returned.")
     count = min(len(exploration.steps), MAX_PANELS)
     shown = np.linspace(len(exploration.steps) - 1, 0, count).astype(np.intp)[::-1]
     x0, x1, y0, y1 = _window_m(exploration)
@@ -129,8 +128,9 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], 
     >>> exploration = sp.explore_trajectory(sp.make_home(3), steps=range(0, 21, 10), seed=0)
     >>> sp.animate_exploration(exploration, "exploration.gif")
     """
-    _require_exploration(exploration)
-    require(Path(path).suffix.lower() == ".gif", "path", os.fspath(path), "give a name that ends with .gif.")
+    require_type("exploration", exploration, Exploration, "give what explore_trajectory returned.")
+    target = output_path(path)
+    require(target.suffix.lower() == ".gif", "path", str(target), "give a name that ends with .gif.")
     x0, x1, y0, y1 = _window_m(exploration)
     longest = max(x1 - x0, y1 - y0)
     size = _FRAME_IN * (x1 - x0) / longest + 0.6, _FRAME_IN * (y1 - y0) / longest + 0.7
@@ -143,13 +143,8 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], 
     palette = _palette(frames[-1]) if tx is None else _beside(frames[0], frames[-1]).quantize(256, _MAX_COVERAGE)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     times_ms = [FRAME_MS] * len(others) + [LAST_FRAME_MS]
-    with atomic_write(path) as stream:
+    with atomic_write(target) as stream:
         first.save(stream, format="GIF", save_all=True, append_images=others, duration=times_ms, loop=0)
-
-
-def _require_exploration(value: object) -> None:
-    remedy = "give an Exploration, as explore_trajectory returns it."
-    require(isinstance(value, Exploration), "exploration", type(value).__name__, remedy)
 
 
 def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> Image.Image:

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from sionna_partial.calibration.calibration import MaterialCalibration
+from sionna_partial.checks import require_type
 from sionna_partial.plots.style import BLUE, RED, Figure
 from sionna_partial.settings import Material
 from sionna_partial.tracing.slab import reflection_loss_db
@@ -35,7 +36,13 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     -------
     matplotlib.figure.Figure
         Not registered with pyplot: it need not be closed.
+
+    Raises
+    ------
+    SettingsError
+        For something else than a MaterialCalibration.
     """
+    require_type("calibration", calibration, MaterialCalibration, "give what calibrate_materials returned.")
     count = len(calibration.materials)
     figure = Figure(figsize=(4.2 * (2 + count), 3.9), dpi=150, layout="constrained")
     axes = figure.subplots(1, 2 + count)

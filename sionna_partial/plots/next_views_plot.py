@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Wedge
 
-from sionna_partial.checks import require
+from sionna_partial.checks import require_type
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.plots.map_plot import draw_map
@@ -43,7 +43,7 @@ def plot_next_views(views: NextViews) -> Figure:
     >>> figure = sp.plot_next_views(sp.next_views(partial, goal="area"))
     >>> figure.savefig("next_views.png")
     """
-    require(isinstance(views, NextViews), "views", type(views).__name__, "give what next_views returned.")
+    require_type("views", views, NextViews, "give what next_views returned.")
     partial = views.partial
     known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     low, high = np.array(partial.bounds_m).reshape(2, 2)

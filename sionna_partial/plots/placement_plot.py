@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from matplotlib.ticker import PercentFormatter
 
-from sionna_partial.checks import require
+from sionna_partial.checks import require_type
 from sionna_partial.constants import CellState
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.placement.several import NetworkPlacement
@@ -43,8 +43,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     SettingsError
         For something else than a TransmitterPlacement.
     """
-    kind = type(placement).__name__
-    require(isinstance(placement, TransmitterPlacement), "placement", kind, "give what place_transmitter returned.")
+    require_type("placement", placement, TransmitterPlacement, "give what place_transmitter returned.")
     x0, x1, y0, y1 = _window_m(placement)
     height = min(max((_WIDTH_IN - 1.8) * (y1 - y0) / (x1 - x0), 3.0), 14.0)
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
@@ -88,8 +87,7 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     SettingsError
         For something else than a NetworkPlacement.
     """
-    kind = type(placement).__name__
-    require(isinstance(placement, NetworkPlacement), "placement", kind, "give what place_transmitters returned.")
+    require_type("placement", placement, NetworkPlacement, "give what place_transmitters returned.")
     ny, nx = placement.partial.shape
     figure = Figure(figsize=(_WIDTH_IN, min(max(7.0 * ny / nx, 3.0), 14.0) + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()

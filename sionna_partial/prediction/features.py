@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import require_bool, require_type
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
@@ -148,10 +149,14 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     ------
     MapError
         If `partial` is no PartialMap.
+    SettingsError
+        If `links` are no TracedLinks, or `windows` is no bool.
     PredictorError
         For links that were not traced (``invalid="nan"``).
     """
     require_map("partial", partial)
+    require_type("links", links, TracedLinks, "give what trace_links returned.")
+    require_bool("windows", windows)
     if not links.valid.all():
         count = int((~links.valid).sum())
         raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")

@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
-from sionna_partial.checks import is_whole, require, require_choice, require_number
+from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import HomeKind
@@ -152,7 +152,7 @@ def make_home(
     (True, 0.05)
     """
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
-    require(isinstance(locked_rooms, bool), "locked_rooms", locked_rooms, "give True or False.")
+    require_bool("locked_rooms", locked_rooms)
     if kind is not None:
         require_choice("kind", kind, STYLES)
     if resolution_m is not None:

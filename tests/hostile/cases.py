@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import operator
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -56,16 +57,44 @@ CALLS = {
     "trace_links": {"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]"},
     "gain_gradients": {"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]"},
     "predict_map": {"scene": "room()", "tx": "TX", "spacing_m": "1.0", "predictor": "'paper'"},
-    "save_coverage": {"coverage": "None", "path": "folder / 'coverage.nc'"},
-    "plot_coverage": {"coverage": "None"},
+    "save_coverage": {"coverage": "coverage()", "path": "folder / 'coverage.nc'"},
+    "load_coverage": {"path": "valid('coverage.nc', folder)"},
+    "plot_coverage": {"coverage": "coverage()"},
+    "plot_map": {"partial": "room()"},
+    "Measurements": {"tx": "[TX]", "rx": "[(3.1, 2.5, 1.5)]", "gain_db": "[-70.0]"},
+    "link_features": {"partial": "room()", "links": "links()"},
+    "Assimilation": {"partial": "room()", "tx_m": "TX", "measured": "measured()", "prior": "prediction()"},
+    "TracedLinks.cir": {"self": "links()"},
+    "TracedLinks.cfr": {"self": "links()", "frequencies_hz": "[0.0, 1e6]"},
+    "TracedLinks.taps": {"self": "links()", "bandwidth_hz": "1e8"},
+    "TracedLinks.beam_gains": {"self": "links()", "codebook": "np.ones((1, 1))"},
+    "TracedLinks.to_dataframe": {"self": "links()"},
+    "dft_codebook": {"rows": "4", "columns": "4"},
+    "sample_channels": {"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]", "n": "5", "predictor": "'paper'"},
+    "save_channels": {"channels": "links()", "path": "folder / 'channels.nc'"},
+    "load_channels": {"path": "valid('channels.nc', folder)"},
+    "network_map": {"coverage": "two_coverages()"},
+    "save_network": {"network": "network()", "path": "folder / 'network.nc'"},
+    "plot_network": {"network": "network()"},
     "calibrate_materials": {"scene": "room()", "measurements": "valid('measurements.csv', folder)"},
     "place_transmitter": {"scene": "room()", "predictor": "'paper'"},
+    "place_transmitters": {"scene": "room()", "predictor": "'paper'"},
+    "next_views": {"scene": "room()"},
+    "plot_calibration": {"calibration": "None"},
+    "plot_exploration": {"exploration": "None"},
+    "plot_placement": {"placement": "None"},
+    "plot_network_placement": {"placement": "None"},
+    "plot_next_views": {"views": "None"},
+    "explore_trajectory": {"home": "room()", "steps": "3"},
+    "DifferentiableScene": {"scene": "room()"},
+    "Predictor.predict": {"self": "sp.Predictor.load('paper')", "features": "None"},
+    "animate_exploration": {"exploration": "None", "path": "folder / 'drive.gif'"},
     "build_dataset": {"folder": "folder / 'links'", "homes": "[]"},
     "read_dataset": {"folder": "valid('dataset.json', folder).parent"},
     "train": {"dataset": "valid('dataset.json', folder).parent"},
     "evaluate": {"predictor": "'paper'", "dataset": "valid('dataset.json', folder).parent"},
 }
-"""Public functions, and valid arguments of each."""
+"""Public functions and methods, and valid arguments of each."""
 
 SETTINGS = ("TraceSettings", "SceneSettings", "SensorSettings", "DatasetSettings", "Material")
 
@@ -78,6 +107,9 @@ COMMANDS = {
     "evaluate": "LINKS --predictor paper --out OUT",
     "calibrate": "MAP --measurements CSV --out OUT",
     "place": "MAP --predictor paper --out OUT",
+    "channels": "MAP --tx 1.1 1.1 --spacing 1.0 --array 2x2 --out FILE",
+    "network": "MAP --tx 1.1 1.1 --tx 2.5 2.5 --spacing 1.0 --predictor paper --out OUT",
+    "next": "MAP --tx 1.1 1.1 --out OUT",
     "info": "",
 }
 """Subcommands, and what makes each work."""
@@ -112,7 +144,7 @@ SPOILS = (
 KINDS = (
     *("cloud.las", "cloud.laz", "cloud.pcd", "cloud.xyz", "plan.dxf", "drive.bag", "drive.mcap", "drive.db3"),
     *("map.yaml", "map.pgm", "map.npz", "mesh.ply", "mesh.obj", "scene.xml", "scene folder", "measurements.csv"),
-    *("predictor.keras", "predictor.json", "coverage.nc", "dataset.parquet", "dataset.json"),
+    *("predictor.keras", "predictor.json", "coverage.nc", "channels.nc", "dataset.parquet", "dataset.json"),
 )
 
 STOPPED = COMMANDS | {
@@ -163,8 +195,9 @@ def _arguments(seed: int) -> Iterator[Case]:
     import sionna_partial as sp
 
     for name, base in CALLS.items():
-        every = inspect.signature(getattr(sp, name)).parameters.values()
-        parameters = [each.name for each in every if each.name != "progress" and each.kind != each.VAR_KEYWORD]
+        every = inspect.signature(operator.attrgetter(name)(sp)).parameters.values()
+        left_out = ("self", "progress")
+        parameters = [each.name for each in every if each.name not in left_out and each.kind != each.VAR_KEYWORD]
         for parameter in parameters:
             for odd in ODD:
                 given = ", ".join(f"{key}={value}" for key, value in (base | {parameter: odd}).items())
@@ -209,6 +242,7 @@ def _arguments_of(words: list[str]) -> str:
     made = {
         "MAP": "valid('map.yaml', folder)",
         "OUT": "folder / 'out'",
+        "FILE": "folder / 'channels.nc'",
         "CSV": "valid('measurements.csv', folder)",
         "LINKS": "valid('dataset.json', folder).parent",
     }

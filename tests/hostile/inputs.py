@@ -166,17 +166,54 @@ def _predictor(folder: Path) -> Path:
 
 
 @functools.cache
-def _coverage_bytes() -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "coverage.nc"
-        sp.save_coverage(sp.predict_map(room(), TX, spacing_m=0.5, predictor="paper"), path)
-        return path.read_bytes()
+def coverage() -> Any:
+    """Return the coverage of a transmitter in the room."""
+    return sp.predict_map(room(), TX, spacing_m=0.5, predictor="paper")
+
+
+@functools.cache
+def two_coverages() -> Any:
+    """Return the coverage of two transmitters in the room."""
+    return sp.predict_map(room(), [TX, (2.9, 2.5, 1.5)], spacing_m=0.5, predictor="paper")
+
+
+@functools.cache
+def network() -> Any:
+    """Return the network of these two transmitters."""
+    return sp.network_map(two_coverages(), n=10)
+
+
+@functools.cache
+def links() -> sp.TracedLinks:
+    """Return links traced in the room."""
+    return sp.trace_links(room(), TX, [(3.1, 2.5, 1.5), (0.9, 2.1, 1.5)])
+
+
+def measured() -> sp.Measurements:
+    """Return gains measured on these links."""
+    rx_m = links().rx
+    return sp.Measurements(np.tile(TX, (len(rx_m), 1)), rx_m, np.full(len(rx_m), -70.0))
+
+
+@functools.cache
+def prediction() -> sp.LinkPrediction:
+    """Return what is predicted of these links."""
+    return sp.Predictor.load("paper").predict(sp.link_features(room(), links()))
+
+
+def _channels(folder: Path) -> Path:
+    sp.save_channels(links(), folder / "channels.nc")
+    return folder / "channels.nc"
+
+
+def _read_channels(path: Path) -> None:
+    if not python(f"import h5py; h5py.File({str(path)!r}).visititems(print)").returncode:  # HDF5 may crash, not we
+        sp.load_channels(path).load()
 
 
 def _coverage(folder: Path) -> Path:
-    path = folder / "coverage.nc"
-    path.write_bytes(_coverage_bytes())
-    return path
+    sp.save_coverage(coverage(), folder / "coverage.nc")
+    return folder / "coverage.nc"
 
 
 def _read_coverage(path: Path) -> None:
@@ -184,9 +221,9 @@ def _read_coverage(path: Path) -> None:
 
     if python(f"import xarray; xarray.load_dataset({str(path)!r})").returncode:  # HDF5 reads it, and may crash, not we
         return
-    coverage = xr.load_dataset(path)
-    sp.save_coverage(coverage, path.with_name("again.csv"))
-    sp.plot_coverage(coverage)
+    stored = xr.load_dataset(path)
+    sp.save_coverage(stored, path.with_name("again.csv"))
+    sp.plot_coverage(stored)
 
 
 @functools.cache
@@ -274,6 +311,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
         lambda path: sp.Predictor.load(path.with_suffix(".keras")),
     ),
     "coverage.nc": (_coverage, _read_coverage),
+    "channels.nc": (_channels, _read_channels),
     "dataset.parquet": (_dataset, lambda path: sp.read_dataset(path.parent.parent)),
     "dataset.json": (
         lambda folder: _dataset(folder).parent.parent / "dataset.json",
