@@ -1,14 +1,15 @@
 """Networks of several transmitters: coverage maps -> best server, SINR and rate, with their uncertainty."""
 
 import math
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.channels.joint import JointLatents
-from sionna_partial.checks import real_array, require, require_number, require_whole
+from sionna_partial.checks import Checked, Within, real_array, require, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, TX_COORDINATES, require_coverage
 from sionna_partial.errors import SettingsError
@@ -23,6 +24,30 @@ NOISE_DENSITY_DBM_HZ = -174.0
 MOST_DRAWS = 1_000
 _RECEIVERS_AT_ONCE = 5_000
 _LOWEST_SINR_DB = -60.0
+
+
+@dataclass(frozen=True)
+class LinkBudget(Checked):
+    """What receivers and traffic of a network are like; the fields are arguments of `network_map`."""
+
+    noise_figure_db: Annotated[float, Within(0.0, 100.0)] = 7.0
+    bandwidth_hz: Annotated[float, Within(0.0, 1e12, open_low=True)] = 100e6
+    load: Annotated[float, Within(0.0, 1.0)] = 1.0
+    sinr_threshold_db: Annotated[float, Within(-200.0, 200.0)] = 0.0
+
+    @property
+    def noise_dbm(self) -> float:
+        """Thermal noise and that of the receiver [dBm]."""
+        return NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(self.bandwidth_hz) + self.noise_figure_db
+
+
+def transmit_powers_dbm(tx_power_dbm: ArrayLike, count: int) -> Floats:
+    """Return the powers (count,) of transmitters [dBm], or raise a SettingsError."""
+    remedy = f"give one power [dBm], or one for each of the {count} transmitters."
+    powers_dbm = real_array("tx_power_dbm", tx_power_dbm, SettingsError, remedy)
+    allowed = powers_dbm.shape in ((), (count,)) and bool((np.abs(powers_dbm) <= 200.0).all())
+    require(allowed, "tx_power_dbm", tx_power_dbm, remedy)
+    return np.array(np.broadcast_to(powers_dbm, count), dtype=np.float64)
 
 
 def _described(long_name: str, units: str = "1") -> dict[str, str]:
@@ -100,22 +125,10 @@ def network_map(
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         raise SettingsError("coverage has no dimension tx: give what predict_map returned for several transmitters.")
     require_coverage(coverage.isel(tx=0))
-    count = coverage.sizes["tx"]
-    remedy = f"give one power [dBm], or one for each of the {count} transmitters."
-    power_dbm = real_array("tx_power_dbm", tx_power_dbm, SettingsError, remedy)
-    require(
-        power_dbm.shape in ((), (count,)) and bool((np.abs(power_dbm) <= 200.0).all()),
-        "tx_power_dbm",
-        tx_power_dbm,
-        remedy,
-    )
-    require_number("noise_figure_db", noise_figure_db, 0.0, 100.0)
-    require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
-    require_number("load", load, 0.0, 1.0)
-    require_number("sinr_threshold_db", sinr_threshold_db, -200.0, 200.0)
+    powers_dbm = transmit_powers_dbm(tx_power_dbm, coverage.sizes["tx"])
+    budget = LinkBudget(noise_figure_db, bandwidth_hz, load, sinr_threshold_db)
     require_whole("n", n, 2, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
-    noise_dbm = NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(bandwidth_hz) + noise_figure_db
     valid: NDArray[np.bool_] = np.all(coverage["valid"].to_numpy(), axis=0)
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
     rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
@@ -127,23 +140,10 @@ def network_map(
         here = slice(start, start + _RECEIVERS_AT_ONCE)
         links = LinkPrediction(**{name: values[:, here] for name, values in columns.items()})
         gain_db = latents.draw(links, tx_m, rx_m[here], n, [seed])[1]
-        received_dbm = np.where(gain_db > GAIN_FLOOR_DB, gain_db, -np.inf) + np.broadcast_to(power_dbm, count)[:, None]
-        parts.append(_statistics(received_dbm, noise_dbm, float(load), float(sinr_threshold_db), float(bandwidth_hz)))
+        received_dbm = np.where(gain_db > GAIN_FLOOR_DB, gain_db, -np.inf) + powers_dbm[:, None]
+        parts.append(_statistics(received_dbm, budget))
     found = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in VARIABLES}
-    return _labelled(
-        coverage,
-        found,
-        valid,
-        {
-            "tx_power_dbm": power_dbm,
-            "noise_figure_db": float(noise_figure_db),
-            "bandwidth_hz": float(bandwidth_hz),
-            "load": float(load),
-            "sinr_threshold_db": float(sinr_threshold_db),
-            "draws": n,
-            "seed": seed,
-        },
-    )
+    return _labelled(coverage, found, valid, {"tx_power_dbm": powers_dbm, **asdict(budget), "draws": n, "seed": seed})
 
 
 def require_network(network: xr.Dataset) -> None:
@@ -159,15 +159,13 @@ def _map_of(coverage: xr.Dataset) -> PartialMap:
     return PartialMap(coverage["cell_state"].to_numpy().astype(np.uint8), spacing_m, corner_m)
 
 
-def _statistics(
-    received_dbm: Floats, noise_dbm: float, load: float, threshold_db: float, bandwidth_hz: float
-) -> dict[str, NDArray[Any]]:
+def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[Any]]:
     """Variables of receivers from their draws (n, T, N)."""
     power_mw = 10.0 ** (received_dbm / 10.0)
     best_mw, best = power_mw.max(axis=1), power_mw.argmax(axis=1)
     heard = best_mw > 0.0
-    noise_mw = 10.0 ** (noise_dbm / 10.0)
-    sinr = best_mw / (noise_mw + load * (power_mw.sum(axis=1) - best_mw))
+    noise_mw = 10.0 ** (budget.noise_dbm / 10.0)
+    sinr = best_mw / (noise_mw + budget.load * (power_mw.sum(axis=1) - best_mw))
     with np.errstate(divide="ignore", invalid="ignore"):
         sinr_db = np.maximum(10.0 * np.log10(sinr), _LOWEST_SINR_DB)
         next_mw = np.sort(power_mw, axis=1)[:, -2] if power_mw.shape[1] > 1 else np.zeros_like(best_mw)
@@ -180,8 +178,8 @@ def _statistics(
         "p_all_outage": (~heard).mean(axis=0),
         "sinr_mean_db": sinr_db.mean(axis=0),
         "sinr_p10_db": np.percentile(sinr_db, 10.0, axis=0),
-        "p_sinr_above": (sinr_db > threshold_db).mean(axis=0),
-        "rate_bit_s": bandwidth_hz * np.log2(1.0 + sinr).mean(axis=0),
+        "p_sinr_above": (sinr_db > budget.sinr_threshold_db).mean(axis=0),
+        "rate_bit_s": budget.bandwidth_hz * np.log2(1.0 + sinr).mean(axis=0),
         "handover_margin_db": np.where(heard, np.maximum(margin_db, 0.0), 0.0).mean(axis=0),
     }
 

@@ -1,5 +1,6 @@
 """Subcommand for several transmitters: network."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -38,9 +39,13 @@ def network(
     memory: opt.Memory = MEMORY_GB,
 ) -> None:
     """Predict best server, SINR and rate of several transmitters on a partial map."""
+    from sionna_partial.network import LinkBudget, transmit_powers_dbm
+
     positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
     scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
     partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    powers_dbm = transmit_powers_dbm(tx_power, len(positions))
+    budget = LinkBudget(noise_figure, bandwidth, load, sinr_threshold)
     require_writable(out)
     with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
@@ -56,14 +61,7 @@ def network(
             progress=lambda fraction, message: report(0.8 * fraction, message),
         )
         report(0.8, "drawing links together")
-        found = sp.network_map(
-            coverage,
-            tx_power_dbm=tx_power,
-            noise_figure_db=noise_figure,
-            bandwidth_hz=bandwidth,
-            load=load,
-            sinr_threshold_db=sinr_threshold,
-        )
+        found = sp.network_map(coverage, tx_power_dbm=powers_dbm, **asdict(budget))
         with atomic_files(out) as folder:
             report(0.9, "writing")
             sp.save_coverage(coverage, folder / "coverage.nc")
