@@ -85,6 +85,17 @@ def test_transmitters_and_measurements(hall):
     assert len(told) == len(one)
 
 
+def test_a_transmitter_that_measurements_locate(hall):
+    tx_m = np.add(TX, (-2.0, 4.0, 0.0))
+    rx_m = np.array([[*at(x, y), 1.5] for x in (1.0, 2.0, 3.0) for y in (1.0, 2.0, 3.0)])
+    gains_db = sp.trace_links(hall, tx_m, rx_m).gain_db
+    views = sp.next_views(hall, measurements={"rx": rx_m, "gain_db": gains_db, "std_db": np.full(9, 2.0)}, goal="state")
+    assert np.linalg.norm(views.tx_m - tx_m, axis=1).min() < 1.0
+    assert views.uncertainty.sizes["tx"] == len(views.tx_m)
+    assert 0.0 < float(views.uncertainty.mean("tx").max()) <= math.log2(3.0)
+    assert len(views) == len(sp.next_views(hall, tx_m, goal="state"))
+
+
 def test_gain_is_at_most_the_uncertainty(hall):
     views = sp.next_views(hall, np.add(TX, (-2.0, 4.0, 0.0)), goal="state")
     total = float(views.uncertainty.sum()) * views.uncertainty.attrs["spacing_m"] ** 2
@@ -125,9 +136,9 @@ def test_poses_as_yaml(hall, tmp_path):
         ({"tx": np.tile(at(1.0, 1.9), (21, 1))}, PositionError, "tx has 21 transmitters: give at most 20"),
         ({"tx": at(1.0, 1.9), "measurements": "none.csv"}, MeasurementError, "none.csv' cannot be read"),
         (
-            {"tx": None, "measurements": {"rx": [(1.0, 1.0, 1.5)], "gain_db": [-80.0]}},
+            {"measurements": {"tx": [TX, (math.nan,) * 3], "rx": np.tile(TX, (2, 1)) + 1.0, "gain_db": [-80.0, -70.0]}},
             MeasurementError,
-            "1 of 1 links without the position",
+            "1 of 2 links without the position",
         ),
     ],
 )

@@ -25,13 +25,14 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage import SAME_TX_M, TX_COORDINATES, clear_of_walls, predict_map, probability_above
+from sionna_partial.coverage import POSITIONS, SAME_TX_M, TX_COORDINATES, clear_of_walls, predict_map, probability_above
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.measurements.localisation import TransmitterPosterior
+from sionna_partial.measurements.measurements import Measurements, measurements_of
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import unknown_in_view
@@ -102,7 +103,8 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_n
     tx_m : (T, 3) float64 array
         Transmitters that were predicted [m]; none for the goal "area".
     uncertainty : xarray.DataArray
-        On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors.
+        On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors. Of a transmitter
+        at an unknown position, times the relative probability of each of `tx_m`.
     goal : {"coverage", "state", "area"}
     """
 
@@ -179,8 +181,8 @@ def next_views(
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
-        One or several transmitters [m]. By default those of the measurements or, without, any position: the mean over
-        some free cells.
+        One or several transmitters [m]. By default those of the measurements; where these do not say, one that is
+        located by them; without measurements any position, the mean over some free cells.
     measurements : Measurements, mapping, data frame or path, optional
         Gains that were measured of the transmitters, as for `predict_map`.
     goal : {"coverage", "state", "area"}
@@ -225,8 +227,13 @@ def next_views(
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
     sensor = settings_or_default("sensor", sensor, SensorSettings)
     cell = _start_cell(partial, start)
-    tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measurements)
-    uncertainty = _uncertainty(partial, tx_m, measurements, None if goal == "state" else threshold_db)
+    measured = None if measurements is None else measurements_of(measurements)
+    of = None if goal == "state" else threshold_db
+    if goal != "area" and tx is None and measured is not None and not measured.tx_known.any():
+        tx_m, uncertainty = _located(partial, measured, of)
+    else:
+        tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measured)
+        uncertainty = _uncertainty(partial, tx_m, measured, of)
     none = np.zeros(partial.shape, dtype=bool)
     radius = ROBOT_RADII_M[0] / partial.resolution_m
     frontiers = wide_frontiers(
@@ -320,16 +327,13 @@ def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]
     return int(row), int(column)
 
 
-def _measured_m(measurements: Any) -> NDArray[np.float64]:
-    measured = measurements_of(measurements)
-    measured.require_transmitters()
-    return np.unique(measured.tx, axis=0)
-
-
-def _transmitters(partial: PartialMap, tx: ArrayLike | None, measurements: Any) -> NDArray[np.float64]:
+def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measurements | None) -> NDArray[np.float64]:
     """Return the transmitters (T, 3) to predict [m]."""
-    if tx is None:
-        tx = _possible_m(partial) if measurements is None else _measured_m(measurements)
+    if tx is None and measured is not None:
+        measured.require_transmitters()
+        tx = np.unique(measured.tx, axis=0)
+    elif tx is None:
+        tx = _possible_m(partial)
     tx_m = np.atleast_2d(real_array("tx", tx, PositionError, "give x, y and z in metres, (3,) or (T, 3)."))
     if tx_m.ndim == 2 and tx_m.shape[1] == 2:
         tx_m = np.insert(tx_m.astype(np.float64), 2, DEFAULT_HEIGHT_M, axis=1)
@@ -350,24 +354,51 @@ def _possible_m(partial: PartialMap) -> NDArray[np.float64]:
 
 
 def _uncertainty(
-    partial: PartialMap, tx_m: NDArray[np.float64], measurements: Any, threshold_db: float | None
+    partial: PartialMap, tx_m: NDArray[np.float64], measured: Measurements | None, threshold_db: float | None
 ) -> xr.DataArray:
-    """Predict the uncertainty of links on (tx, y, x) [bit]: of P(gain > threshold), or of the link state."""
+    """Predict the uncertainty of links of given transmitters on (tx, y, x) [bit]."""
+    spacing_m = _spacing_m(partial)
+    if not len(tx_m):
+        none = xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))
+        return _described(none, spacing_m)
+    own = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
+    told = measured if own or len(tx_m) == 1 else None
+    coverage = predict_map(partial, tx_m, spacing_m=spacing_m, measurements=told, progress=False)
+    return _described(_entropy(coverage, threshold_db).drop_vars(("tx", *TX_COORDINATES)), spacing_m)
+
+
+def _located(
+    partial: PartialMap, measured: Measurements, threshold_db: float | None
+) -> tuple[NDArray[np.float64], xr.DataArray]:
+    """Return some positions (T, 3) [m] where the transmitter may be, and the share of each in the uncertainty.
+
+    That is the uncertainty of the coverage averaged over all positions, weighted by the posterior of each.
+    """
+    spacing_m = _spacing_m(partial)
+    coverage = predict_map(partial, None, spacing_m=spacing_m, measurements=measured, progress=False)
+    x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
+    posterior = TransmitterPosterior(x_m, y_m, float(coverage.attrs["transmitter_m"][2]), probability)
+    tx_m, weights = posterior.draw(POSITIONS)
+    shares = xr.DataArray(weights * len(weights), dims="tx")
+    return tx_m, _described(shares * _entropy(coverage, threshold_db), spacing_m)
+
+
+def _entropy(coverage: xr.Dataset, threshold_db: float | None) -> xr.DataArray:
+    """Return the entropy of whether the gain is above a threshold, or of the link state, times P(indoor) [bit]."""
+    if threshold_db is None:
+        p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
+    else:
+        above = probability_above(coverage, threshold_db)
+        p = np.stack([above, 1.0 - above])
+    return (entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0)
+
+
+def _spacing_m(partial: PartialMap) -> float:
     x0, y0, x1, y1 = partial.bounds_m
-    spacing_m = min(max(SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MOST_RECEIVERS)), x1 - x0, y1 - y0)
-    measured = None if measurements is None else measurements_of(measurements)
-    uncertainty = xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))
-    if len(tx_m):
-        own = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
-        told = measured if own or len(tx_m) == 1 else None
-        coverage = predict_map(partial, tx_m, spacing_m=spacing_m, measurements=told, progress=False)
-        if threshold_db is None:
-            p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
-        else:
-            above = probability_above(coverage, threshold_db)
-            p = np.stack([above, 1.0 - above])
-        uncertainty = (entr(p).sum(axis=0) / math.log(2.0) * coverage["p_indoor"]).fillna(0.0)
-        uncertainty = uncertainty.drop_vars(("tx", *TX_COORDINATES))
+    return min(max(SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MOST_RECEIVERS)), x1 - x0, y1 - y0)
+
+
+def _described(uncertainty: xr.DataArray, spacing_m: float) -> xr.DataArray:
     attributes = {"long_name": "uncertainty of the link", "units": "bit", "spacing_m": spacing_m}
     return uncertainty.rename("uncertainty").assign_attrs(attributes)
 
