@@ -244,14 +244,14 @@ def predict_map(
     )
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     unknown = tx is None and measurements is not None
-    names, positions_m = (None, np.empty((0, 3))) if unknown else _transmitters(partial, tx)
+    names, positions_m = (None, np.empty((0, 3))) if unknown else transmitter_positions(partial, tx)
     sources_m = [positions_m] if unknown else [each[None] for each in positions_m]
     grids = [_receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz) for tx_m in sources_m]
     at_once = _receivers_at_once(partial, grids[0], memory_gb)
     complete = partial.is_complete and bool(is_enclosed(partial, positions_m, positions_m).all())
     model = None
     if predictor is not None or not complete:
-        loaded = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+        loaded = Predictor.load(predictor)
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
@@ -398,7 +398,7 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     return clear
 
 
-def _transmitters(
+def transmitter_positions(
     partial: PartialMap, tx: ArrayLike | Mapping[str, ArrayLike] | None
 ) -> tuple[list[str] | None, Floats]:
     """Names of several transmitters, None for one, and positions (T, 3) [m]."""

@@ -95,7 +95,7 @@ class FakePredictor:
 
     @classmethod
     def load(cls, name: object = None) -> "FakePredictor":
-        return cls()
+        return name if isinstance(name, cls) else cls()
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
         leak = np.clip(0.1 * phi.unobserved_distance_m, 0.0, 0.6)

@@ -212,8 +212,7 @@ def sample_channels(
         if bool(is_enclosed(partial, tx_m[:1], tx_m[:1])[0]):
             prediction = LinkPrediction.of_trace(phi)
         else:
-            model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
-            prediction = model.predict(phi)
+            prediction = Predictor.load(predictor).predict(phi)
         report(0.5, "drawing")
         draws = _Draws(partial, traced, prediction, n, seed)
         columns: dict[str, Any] = draws.columns()

@@ -149,7 +149,7 @@ class DifferentiableScene:
     ) -> None:
         self.partial = scene if isinstance(scene, PartialMap) else load_map(scene)
         self.paths = PathScene(self.partial, settings=trace_settings, scene_settings=scene_settings)
-        self.predictor = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+        self.predictor = Predictor.load(predictor)
         self.networks = parts(self.predictor.model)
 
     @property

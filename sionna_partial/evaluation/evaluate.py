@@ -147,7 +147,7 @@ def evaluate(
     >>> row.metrics.links
     4
     """
-    model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+    model = Predictor.load(predictor)
     links, traces = open_links(dataset)
     remedy = "choose another predictor, or build a data set with such traces."
     require_like(

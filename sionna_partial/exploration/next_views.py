@@ -25,7 +25,15 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage import POSITIONS, SAME_TX_M, TX_COORDINATES, clear_of_walls, predict_map, probability_above
+from sionna_partial.coverage import (
+    POSITIONS,
+    SAME_TX_M,
+    TX_COORDINATES,
+    clear_of_walls,
+    predict_map,
+    probability_above,
+    transmitter_positions,
+)
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
@@ -332,14 +340,10 @@ def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measureme
     if tx is None and measured is not None:
         measured.require_transmitters()
         tx = np.unique(measured.tx, axis=0)
-    elif tx is None:
-        tx = _possible_m(partial)
-    tx_m = np.atleast_2d(real_array("tx", tx, PositionError, "give x, y and z in metres, (3,) or (T, 3)."))
-    if tx_m.ndim == 2 and tx_m.shape[1] == 2:
-        tx_m = np.insert(tx_m.astype(np.float64), 2, DEFAULT_HEIGHT_M, axis=1)
+    tx_m = transmitter_positions(partial, _possible_m(partial) if tx is None else tx)[1]
     if len(tx_m) > MOST_TRANSMITTERS:
         raise PositionError(f"tx has {len(tx_m)} transmitters: give at most {MOST_TRANSMITTERS}.")
-    return partial.require_positions("tx", tx_m)
+    return tx_m
 
 
 def _possible_m(partial: PartialMap) -> NDArray[np.float64]:

@@ -242,7 +242,7 @@ class Search:
             require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
         model = None
         if not partial.is_complete:
-            model = predictor if isinstance(predictor, Predictor) else Predictor.load(predictor)
+            model = Predictor.load(predictor)
         area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
         return cls(settings, scene_settings, trace_settings, model, area)
 

@@ -409,13 +409,14 @@ class Predictor(Shown):
         write_files(Path(path), self.archive, card)
 
     @classmethod
-    def load(cls, name_or_path: str | Path | None = None) -> "Predictor":
+    def load(cls, name_or_path: "Predictor | str | PathLike[str] | None" = None) -> "Predictor":
         """Load a predictor; nothing in its files is executed.
 
         Parameters
         ----------
-        name_or_path : None, "map", "paper" or path-like
-            The shipped default, which is "map", the paper's predictor, or the `.keras` file of your own.
+        name_or_path : None, "map", "paper", path-like or Predictor
+            The shipped default, which is "map", the paper's predictor, or the `.keras` file of your own. A Predictor is
+            returned as it is.
 
         Returns
         -------
@@ -426,6 +427,8 @@ class Predictor(Shown):
         PredictorError
             If a file is missing, damaged, changed, or of another kind.
         """
+        if isinstance(name_or_path, Predictor):
+            return name_or_path
         name = SHIPPED[0] if name_or_path is None else name_or_path
         known = " or ".join(map(repr, SHIPPED))
         if not isinstance(name, (str, PathLike)):
