@@ -127,6 +127,16 @@ class TestPaths:
         assert found.indirect_gain_db[0] == pytest.approx([10 * math.log10(5e-4)] * len(ATTENUATION_LENGTHS_M))
         assert found.strongest_unobserved_m.tolist() == [0.0]
 
+    def test_on_a_complete_map_paths_between_unknown_cells_are_unobserved(self):
+        """Their vertices are on known walls, from which nothing unknown can be reached."""
+        partial = drawn("#####????? #...#????? #...#????? #####?????", 1.0)
+        tx, wall, rx = (6.5, 2.5, 1.5), (4.5, 2.0, 1.5), (8.5, 1.5, 1.5)
+        assert partial.is_complete
+        found = link_context(partial, traced(tx, [rx], (0, 0, 0.01, [wall])))
+        crossed_m = 0.75 * math.dist(tx, wall) + 0.875 * math.dist(wall, rx)
+        assert found.strongest_unobserved_m == pytest.approx([crossed_m])
+        assert found.indirect_gain_db[0] == pytest.approx(gains_db([1e-4], [crossed_m]))
+
     @given(st.integers(0, 2**32))
     def test_random_paths_leg_by_leg(self, seed):
         rng = np.random.default_rng(seed)

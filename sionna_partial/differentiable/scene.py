@@ -59,7 +59,7 @@ from sionna_partial.prediction.paper_networks import (
     tf,
 )
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.prediction.unobserved import is_enclosed, lengths_in_unknown_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
@@ -359,7 +359,9 @@ class _Legs:
         same = of_path[:-1] == of_path[1:]
         self._of_path, self._start, self._end = of_path[:-1][same], nodes[:-1][same], nodes[1:][same]
         self._base = nodes_m[self._start], nodes_m[self._end]
-        self._exact_m = unobserved_lengths_m(partial, *self._base)
+        tx_m = np.broadcast_to(paths.base.tx_m, (len(self.rx), 3))
+        open_ended = ~is_enclosed(partial, tx_m, paths.rx_m[self.rx])
+        self._exact_m = lengths_in_unknown_m(partial, *self._base) * open_ended[self._of_path]
         self.unobserved_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
         self.strongest = np.full(len(paths.rx_m), -1)
         weakest_first = np.argsort(paths.power[self.paths], kind="stable")

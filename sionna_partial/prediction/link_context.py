@@ -18,8 +18,8 @@ from sionna_partial.prediction.unobserved import (
     Floats,
     in_cells,
     is_enclosed,
+    lengths_in_unknown_m,
     map_line_fractions,
-    unobserved_lengths_m,
     walled_lengths_m,
 )
 from sionna_partial.prediction.windows import draw_windows, transmitters
@@ -204,9 +204,9 @@ def path_unobserved_m(
     for depth in range(interactions.shape[1] if len(rows) else 0):
         there = interactions[rows, depth] > 0
         there_m = vertices_m[rows[there], depth]
-        total_m[rows[there]] += unobserved_lengths_m(partial, here_m[there], there_m)
+        total_m[rows[there]] += lengths_in_unknown_m(partial, here_m[there], there_m)
         here_m[there] = there_m
-    total_m[rows] += unobserved_lengths_m(partial, here_m, end_m[rows])
+    total_m[rows] += lengths_in_unknown_m(partial, here_m, end_m[rows])
     return total_m
 
 

@@ -38,8 +38,13 @@ def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) ->
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m, open_ended = np.zeros(len(end_m)), ~is_enclosed(partial, start_m, end_m)
-    lengths_m[open_ended] = _lengths_m(partial, CellState.UNKNOWN, start_m[open_ended], end_m[open_ended])
+    lengths_m[open_ended] = lengths_in_unknown_m(partial, start_m[open_ended], end_m[open_ended])
     return lengths_m
+
+
+def lengths_in_unknown_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
+    """Return the same lengths (N,) [m] of segments (N, 3), whether or not the map is complete."""
+    return _lengths_m(partial, CellState.UNKNOWN, start_m, end_m)
 
 
 def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
