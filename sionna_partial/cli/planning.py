@@ -120,7 +120,7 @@ def next_views(
     out: Annotated[Path, typer.Option(help="Folder for the poses and a picture.", show_default=False)],
     tx: Annotated[
         str,
-        typer.Option(metavar="X Y [Z]", help="Transmitter [m]. Default: that of the measurements, or any position."),
+        typer.Option(metavar="X Y [Z]", help="Transmitter [m]. Default: that of the measurements, or any."),
     ] = "",
     measurements: Annotated[Path | None, typer.Option(help="CSV of measured gains.", show_default=False)] = None,
     goal: Annotated[str, typer.Option(metavar="coverage|state|area", help="What is to become known.")] = "coverage",
