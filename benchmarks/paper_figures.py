@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.datasets.home_links import home_links, map_area
+from sionna_partial.datasets.home_links import closed_home, home_links, map_area
 from sionna_partial.datasets.home_sources import home_sources
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
@@ -173,7 +173,9 @@ def read_homes(folder: Path) -> tuple[Homes, Homes]:
     wanted = [*TRAIN, *TEST] if set(TRAIN + TEST) <= sources.keys() else list(sources)[: len(TRAIN) + len(TEST)]
     if len(wanted) < len(TRAIN) + len(TEST):
         raise SystemExit(f"--homes {folder} has {len(wanted)} homes: give a folder with {len(TRAIN) + len(TEST)}.")
-    return split({name: sources[name].load() for name in wanted}, wanted[: len(TRAIN)], wanted[len(TRAIN) :])
+    return split(
+        {name: closed_home(sources[name].load(), name) for name in wanted}, wanted[: len(TRAIN)], wanted[len(TRAIN) :]
+    )
 
 
 def split(homes: Homes, train: list[str], test: list[str]) -> tuple[Homes, Homes]:

@@ -56,7 +56,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     """
     require_map("home", home)
     settings = settings or DatasetSettings()
-    home = map_area(_closed(home, name), settings.margin_m)
+    home = map_area(closed_home(home, name), settings.margin_m)
     rng = np.random.default_rng(_home_seed(name, settings))
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
     maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps
@@ -80,7 +80,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     )
 
 
-def _closed(home: PartialMap, name: str) -> PartialMap:
+def closed_home(home: PartialMap, name: str) -> PartialMap:
     """Return a complete home, with a ring of walls around its grid if it lacks nothing else."""
     if home.is_complete:
         return home
