@@ -10,7 +10,7 @@ from link_tables import assert_same, make_table
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets import home_links as module
-from sionna_partial.datasets.home_links import NEAREST_M, _closed, home_links, home_sensor, map_area
+from sionna_partial.datasets.home_links import NEAREST_M, closed_home, home_links, home_sensor, map_area
 from sionna_partial.datasets.link_table import LinkTable, stage_name
 from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.maps.partial_map import PartialMap
@@ -234,7 +234,7 @@ class TestMapArea:
 class TestRefused:
     def test_home_without_free_cells(self) -> None:
         with pytest.raises(MapError, match=r"home 'block' has no free cell: give maps of whole homes, with rooms"):
-            _closed(PartialMap(np.full((3, 3), CellState.WALL), 0.5), "block")
+            closed_home(PartialMap(np.full((3, 3), CellState.WALL), 0.5), "block")
 
     def test_home_with_a_gap(self, home: PartialMap) -> None:
         state = home.state.copy()
