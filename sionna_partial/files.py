@@ -86,7 +86,7 @@ def read_bytes(
 
 def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:
     """Return a path to read from, or raise an `error` if it is none."""
-    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+    if not isinstance(path, (str, os.PathLike)):
         raise error(f"{field} = {shown(path)} is not a path: {remedy}")
     return Path(path)
 
