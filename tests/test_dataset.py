@@ -180,7 +180,7 @@ def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
     folder = tmp_path_factory.mktemp("poisoned") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
-        return build_dataset(folder, POISONED, SETTINGS, workers=2, home_time_limit_s=12.0)
+        return build_dataset(folder, POISONED, SETTINGS, workers=2, home_time_limit_s=8.0)
 
 
 class TestPoisonedHomes:
@@ -193,7 +193,7 @@ class TestPoisonedHomes:
         ("seed", "words"),
         [
             (KILLS, ("its process died 3 times (SIGKILL)\n", "last words")),
-            (HANGS, ("took longer than 12 s, the time limit of a home\n", "dataset_fakes.py", "in make_home")),
+            (HANGS, ("took longer than 8 s, the time limit of a home\n", "dataset_fakes.py", "in make_home")),
             (RAISES, ("ZeroDivisionError: a fault of this home\nTraceback",)),
         ],
     )
