@@ -770,7 +770,7 @@ def _provenance(
         "map_resolution_m": partial.resolution_m,
         "map_wall_height_m": partial.wall_height_m,
         "map_observed_fraction": partial.observed_fraction,
-        "map_complete": int(partial.is_complete),
+        "map_complete": int(model is None),
         "scene_settings": json.dumps(asdict(scene_settings), sort_keys=True),
         "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
         "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,

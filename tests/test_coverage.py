@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, small_coverage, use_fakes
+from extruded import drawn
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import norm
@@ -170,6 +171,17 @@ def test_on_a_complete_map_the_trace_is_the_answer(fakes, monkeypatch):
     free = (coverage["cell_state"] == CellState.FREE).to_numpy()
     np.testing.assert_array_equal(coverage["p_indoor"].to_numpy()[valid], free[valid])
     assert coverage.attrs["predictor_sha256"] == ""
+
+
+def test_a_transmitter_behind_the_walls_of_a_complete_map_is_predicted():
+    """A room that a robot has finished; the transmitter is in one that it never saw."""
+    partial = drawn("#####????? #...#????? #...#????? #####?????", 1.0)
+    assert partial.is_complete
+    coverage = predict_map(partial, (7.5, 2.5, 1.5), spacing_m=0.5)
+    unseen, seen = coverage.radio.at(6.5, 1.5), coverage.radio.at(2.5, 1.5)
+    assert (coverage.attrs["map_complete"], coverage.attrs["predictor"]) == (0, "map")
+    assert 0.0 < float(unseen.p_los) < 1.0
+    assert float(seen.p_outage) == 1.0
 
 
 def test_a_map_without_walls_and_one_that_is_all_unknown_are_answered(fakes):
