@@ -37,26 +37,39 @@ Floats = NDArray[np.float64]
 
 def main() -> None:
     """Score all homes, print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    scores: dict[tuple[str, str], list[Floats]] = defaultdict(list)
+    joint: list[Floats] = []
+    for seed, (name, home) in enumerate(given_homes(__doc__)):
+        of_home, of_maps = score_home(home, seed)
+        joint.extend(of_maps)
+        for key, mean in of_home.items():
+            scores[key].append(mean)
+        print(f"{name} done", flush=True)
+    print_links(scores)
+    print_joint(np.array(joint))
+
+
+def given_homes(description: str | None) -> list[tuple[str, sp.PartialMap]]:
+    """Return the homes that the command line names, by their names."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", nargs="*", type=Path, help="complete maps")
     parser.add_argument("--made", type=int, default=0, help="number of procedural homes")
     arguments = parser.parse_args()
     homes = [(path.parent.name, sp.load_map(path)) for path in arguments.maps]
-    homes += [(f"make_home({seed})", sp.make_home(seed)) for seed in range(FIRST_SEED, FIRST_SEED + arguments.made)]
+    made = range(FIRST_SEED, FIRST_SEED + arguments.made)
+    return homes + [(f"make_home({seed})", sp.make_home(seed)) for seed in made]
+
+
+def score_home(home: sp.PartialMap, seed: int) -> tuple[dict[tuple[str, str], Floats], list[Floats]]:
+    """Return mean scores over the links of a home by group and method, and the joint scores of its partial maps."""
+    rng = np.random.default_rng(seed)
     scores: dict[tuple[str, str], list[Floats]] = defaultdict(list)
-    joint: list[Floats] = []
-    for seed, (name, home) in enumerate(homes):
-        rng = np.random.default_rng(seed)
-        of_home: dict[tuple[str, str], list[Floats]] = defaultdict(list)
-        for partial in sp.explore(home, STEPS, seed):
-            tx_m, rx_m = (points(home, partial, count, rng) for count in (TRANSMITTERS, RECEIVERS))
-            rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > NEAREST_M]
-            joint.append(score_map(home, partial, tx_m, rx_m, seed, of_home))
-        for key, values in of_home.items():
-            scores[key].append(np.nanmean(np.concatenate(values), axis=0))
-        print(f"{name} done", flush=True)
-    print_links(scores)
-    print_joint(np.array(joint))
+    joint = []
+    for partial in sp.explore(home, STEPS, seed):
+        tx_m, rx_m = (points(home, partial, count, rng) for count in (TRANSMITTERS, RECEIVERS))
+        rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > NEAREST_M]
+        joint.append(score_map(home, partial, tx_m, rx_m, seed, scores))
+    return {key: np.nanmean(np.concatenate(rows), axis=0) for key, rows in scores.items()}, joint
 
 
 def score_map(

@@ -9,17 +9,14 @@ Gaussians of power, delay and angles given the link and the paths before it. Bot
     python benchmarks/path_generator.py --made 12
 """
 
-import argparse
 import dataclasses
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 import keras
 import numpy as np
-from channel_samples import METHODS, NEAREST_M, RECEIVERS, STEPS, TRANSMITTERS, score_map
-from measurements import FIRST_SEED, points
+from channel_samples import METHODS, given_homes, score_home
 from numpy.typing import NDArray
 
 import sionna_partial as sp
@@ -34,47 +31,25 @@ Floats = NDArray[np.float64]
 
 def main() -> None:
     """Train the generator, score both, print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("maps", nargs="*", type=Path, help="complete maps")
-    parser.add_argument("--made", type=int, default=0, help="number of procedural homes")
-    arguments = parser.parse_args()
-    homes = [(path.parent.name, sp.load_map(path)) for path in arguments.maps]
-    homes += [(f"make_home({seed})", sp.make_home(seed)) for seed in range(FIRST_SEED, FIRST_SEED + arguments.made)]
     analogues, generator = PathModel.load(), Generator.fitted(made_examples())
     scores: dict[str, list[Floats]] = {"analogues": [], "generator": []}
     seconds = dict.fromkeys(scores, 0.0)
-    for seed, (name, home) in enumerate(homes):
+    for seed, (name, home) in enumerate(given_homes(__doc__)):
         for method, model in (("analogues", analogues), ("generator", generator)):
             start = time.process_time()
-            scores[method].append(score_home(home, seed, model))
+            scores[method].append(drawn_with(model, home, seed))
             seconds[method] += time.process_time() - start
         print(f"{name} done", flush=True)
     print_scores(scores, seconds)
 
 
-def score_home(home: sp.PartialMap, seed: int, model: PathModel) -> Floats:
+def drawn_with(model: PathModel, home: sp.PartialMap, seed: int) -> Floats:
     """Mean scores of all links of a home, drawn with a model."""
-    rng, of_home = np.random.default_rng(seed), {}
     shipped, PathModel.load = PathModel.load, lambda: model  # type: ignore[method-assign]
     try:
-        for partial in sp.explore(home, STEPS, seed):
-            tx_m, rx_m = (points(home, partial, count, rng) for count in (TRANSMITTERS, RECEIVERS))
-            rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > NEAREST_M]
-            found: dict[tuple[str, str], list[Floats]] = Scores()
-            score_map(home, partial, tx_m, rx_m, seed, found)
-            for key, rows in found.items():
-                of_home.setdefault(key, []).extend(rows)
+        return score_home(home, seed)[0]["all links", METHODS[0]]
     finally:
         PathModel.load = shipped  # type: ignore[method-assign]
-    return np.nanmean(np.concatenate(of_home["all links", METHODS[0]]), axis=0)
-
-
-class Scores(dict[tuple[str, str], list[Floats]]):
-    """Rows of scores by group and method."""
-
-    def __missing__(self, key: tuple[str, str]) -> list[Floats]:
-        """Begin with no rows."""
-        return self.setdefault(key, [])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

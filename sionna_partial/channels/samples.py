@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -252,7 +251,9 @@ class _Draws:
         self._survival_latent = ndtri(of_survival[:, self._uncertain])
         self._analogue_quantile = of_analogue[:, self._uncertain]
         self._model = PathModel.load()
-        self._paths, self._place = self._indirect()
+        self._paths, self._place, power = self._indirect()
+        shape = len(self._paths), len(self._uncertain)
+        self._power = csr_array((power, (np.arange(len(power)), self._place)), shape=shape)
         unobserved_m = traced_unobserved_m(partial, traced, self._paths)
         self._crosses = np.zeros(len(self._link), dtype=bool)
         self._crosses[self._paths] = unobserved_m > 0.0
@@ -278,15 +279,15 @@ class _Draws:
         """Paths of some draws: those of certain links, the surviving and direct ones, and those of analogues."""
         certain, links, place = self._certain_paths, self._uncertain, self._place
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
-        state, power = self.state[draws][:, links], 10.0 ** (self.gain_db[draws][:, links] / 10.0)
+        state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]
         is_los, free_space = state == LinkState.LOS, 10.0 ** (self._geometry.free_space_db[links] / 10.0)
-        rest = np.maximum(power - is_los * free_space, 0.0)
+        rest = np.maximum(10.0 ** (gain_db / 10.0) - is_los * free_space, 0.0)
         latent = self._survival_latent[draws][:, place]
         latent += rng.standard_normal(latent.shape)
         survives = latent < np.where(is_los[:, place], *self._survives_below)
         survives &= (state != LinkState.OUTAGE)[:, place]
         survivors = survives.astype(np.float64) @ self._power
-        analogue = self._analogues(draws, survivors)
+        analogue = self._analogues(draws, state, gain_db, survivors)
         has_paths = (np.diff(self._model.first)[analogue] > 0) & (analogue >= 0)
         # without an analogue's paths the survivors have all of the power
         scale = np.where((survivors > rest) | ~has_paths, rest / np.maximum(survivors, 1e-30), 1.0)
@@ -300,8 +301,8 @@ class _Draws:
         left = np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
         yield self._of_analogues(draws, analogue, left, rng)
 
-    def _indirect(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Indirect traced paths of uncertain links that are not too weak, and the place of the link of each there."""
+    def _indirect(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """Indirect traced paths of uncertain links that are not too weak; the place of each link there, and power."""
         links = self._uncertain
         place = np.full(len(self._geometry.distance_m), -1)
         place[links] = np.arange(len(links))
@@ -310,23 +311,22 @@ class _Draws:
         strongest = np.zeros(len(links))
         np.maximum.at(strongest, at, power)
         kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
-        return paths[kept], at[kept]
+        return paths[kept], at[kept], power[kept]
 
-    @cached_property
-    def _power(self) -> csr_array:
-        """Power of these paths, by which link it belongs to."""
-        power, rows = np.abs(self._traced.a[self._paths]) ** 2, np.arange(len(self._paths))
-        return csr_array((power, (rows, self._place)), shape=(len(rows), len(self._uncertain)))
-
-    def _analogues(self, draws: NDArray[np.intp], survivors: NDArray[np.float64]) -> NDArray[np.intp]:
+    def _analogues(
+        self,
+        draws: NDArray[np.intp],
+        state: NDArray[np.uint8],
+        gain_db: NDArray[np.float64],
+        survivors: NDArray[np.float64],
+    ) -> NDArray[np.intp]:
         """Analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
-        links, analogue = self._uncertain, np.full(survivors.shape, -1)
-        for state in (LinkState.LOS, LinkState.NLOS):
-            row, link = np.nonzero(self.state[draws][:, links] == state)
-            geometry, survivors_db = self._geometry.take(links[link]), path_gain_db(survivors[row, link])
-            keys = geometry.keys(state, self.gain_db[draws[row], links[link]], survivors_db)
-            quantile = self._analogue_quantile[draws[row], link]
-            analogue[row, link] = self._model.analogues(state, keys, quantile)
+        analogue = np.full(survivors.shape, -1)
+        for each in (LinkState.LOS, LinkState.NLOS):
+            row, link = np.nonzero(state == each)
+            geometry, survivors_db = self._geometry.take(self._uncertain[link]), path_gain_db(survivors[row, link])
+            keys = geometry.keys(each, gain_db[row, link], survivors_db)
+            analogue[row, link] = self._model.analogues(each, keys, self._analogue_quantile[draws[row], link])
         return analogue
 
     def _of_analogues(

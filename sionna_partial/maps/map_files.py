@@ -16,7 +16,7 @@ from scipy.ndimage import binary_dilation
 from sionna_partial.checks import number_of, require_bool, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.files import CALIBRATED_FILE, SCENE_FILES, atomic_write, output_path, read_bytes
+from sionna_partial.files import CALIBRATED_FILE, SCENE_FILES, atomic_write, input_path, output_path, read_bytes
 from sionna_partial.maps.bags import BAG_SUFFIXES, is_recording, map_from_bag
 from sionna_partial.maps.drawings import DRAWING_SUFFIXES, map_from_drawing
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, MeshReading, mesh_map
@@ -103,11 +103,10 @@ def load_map(
         If there is no such file, or it is damaged, of another kind or out of range; or if an argument for meshes is
         given and it is none.
     """
-    if not isinstance(path, (str, os.PathLike)):
-        makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
-        raise MapError(f"path = {shown(path)} is not a path: give {ACCEPTED}. {makers}")
+    makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
+    source = input_path(path, "path", MapError, f"give {ACCEPTED}. {makers}")
     require_bool("strict", strict)
-    source, reading = Path(path), MeshReading(height_band_m, observed, resolution_m, up)
+    reading = MeshReading(height_band_m, observed, resolution_m, up)
     suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
