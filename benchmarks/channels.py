@@ -23,7 +23,7 @@ from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.antennas import planar_array
 
 HOME = "house"
-_UNIT = dict.fromkeys(("trace", "sample_channels, 100 draws"), "trace")
+_UNIT = dict.fromkeys(("trace", "sample_channels, 100 draws", "sample_channels, paths of 100 draws"), "trace")
 _UNIT |= dict.fromkeys(("predict_map", "predict_map, three transmitters"), "predict_map")
 
 
@@ -82,9 +82,19 @@ def partial_times(receivers: int, runs: int) -> dict[str, float]:
     partial = sp.load_map(scenes_folder() / HOME / "step150")
     rx = rx[partial.radios_can_stand(rx)]
     model, three = sp.Predictor.load(), tx + np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [-0.2, 0.3, 0.0]])
+
+    def sample() -> sp.ChannelSamples:
+        return sp.sample_channels(partial, tx, rx, n=100, predictor=model)
+
+    def sample_paths() -> None:
+        samples = sample()
+        for draw in range(100):
+            samples.links(draw)
+
     steps: dict[str, Callable[[], object]] = {
         "trace": lambda: sp.trace_links(partial, tx, rx),
-        "sample_channels, 100 draws": lambda: sp.sample_channels(partial, tx, rx, predictor=model, memory_gb=8.0),
+        "sample_channels, 100 draws": sample,
+        "sample_channels, paths of 100 draws": sample_paths,
         "predict_map": lambda: sp.predict_map(partial, tx, spacing_m=0.25, predictor=model),
         "predict_map, three transmitters": lambda: sp.predict_map(partial, three, spacing_m=0.25, predictor=model),
     }

@@ -70,6 +70,16 @@ def test_no_receivers_have_no_paths(partial: sp.PartialMap) -> None:
     assert len(samples.drawn.a) == 0
 
 
+def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+    samples = sp.sample_channels(partial, TX, receivers, n=400, memory_gb=0.05)
+    power = [np.bincount(each.path_rx, np.abs(each.a) ** 2).sum() for each in map(samples.links, (399, 0, 399))]
+    assert power[0] == power[2] != power[1]
+    with pytest.raises(MemoryLimitError, match=r"400 draws take up to .* Use links\(draw\)"):
+        samples.cir()
+    with pytest.raises(IndexError):
+        samples.links(400)
+
+
 def test_equal_seeds_give_equal_draws(
     partial: sp.PartialMap, receivers: np.ndarray[Any, Any], samples: sp.ChannelSamples
 ) -> None:
@@ -112,7 +122,7 @@ def test_a_path_model_learns_what_survives(home: sp.PartialMap, receivers: np.nd
     [
         ({"n": 0}, SettingsError, "n = 0"),
         ({"seed": -1}, SettingsError, "seed"),
-        ({"n": 10_000, "memory_gb": 0.1}, MemoryLimitError, r"10,000 draws of \d+ links take up to .* fewer draws"),
+        ({"n": 10_000, "memory_gb": 0.01}, MemoryLimitError, r"10,000 draws of \d+ links take up to .* fewer draws"),
     ],
 )
 def test_bad_input(

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +44,7 @@ RANGE_DB = 30.0
 _COLUMNS = tuple(name for name in SolvedPaths.__dataclass_fields__ if name != "vertices_m")
 _NO_VERTICES = np.zeros((0, 1, 3))
 _PATHS_AT_ONCE = 100_000
-_PATHS_OF_DRAW, _PATH_BYTES = 20, 300
+_PATHS_OF_DRAW, _PATH_BYTES, _DRAW_BYTES = 20, 300, 130
 _STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
 
 
@@ -52,41 +53,52 @@ class ChannelSamples(Shown):
     """n draws of the channels of links, from `sample_channels`.
 
     Every draw is one building as it may be: links through the same unseen space are alike in it. Powers, delays and
-    angles are drawn; the phase of whatever crosses the unseen is uniform, as 1 mm is 34 degrees at 28 GHz.
+    angles are drawn; the phase of whatever crosses the unseen is uniform, as 1 mm is 34 degrees at 28 GHz. Paths are
+    made when they are asked for, and are the same each time.
 
     Parameters
     ----------
     link_state : (n, N) or (n, T, N) uint8 array of LinkState
     gain_db : (n, N) or (n, T, N) float64 array
         Omnidirectional path gain [dB], -150 in an outage.
-    drawn : TracedLinks
-        All paths: those of draw k and transmitter t are of its transmitter ``k * T + t``. Interactions are 255 where a
-        path was not traced, and there are no vertices.
+    memory_gb : float
+        How much memory all paths of `drawn` may take [GB].
     """
 
     link_state: NDArray[np.uint8]
     gain_db: NDArray[np.float64]
-    drawn: TracedLinks
+    memory_gb: float
+    _draws: "_Draws" = field(repr=False)
 
     def __len__(self) -> int:
         """Return the number of draws n."""
         return len(self.link_state)
 
     def links(self, draw: int) -> TracedLinks:
-        """Return one draw, as `trace_links` returns links."""
-        count = len(self.drawn.tx) // len(self)
-        first = draw * count
-        chosen = np.flatnonzero((self.drawn.path_tx >= first) & (self.drawn.path_tx < first + count))
-        columns = (*_COLUMNS[1:], "vertices_m")
-        one = self.link_state.ndim == 2
-        return replace(
-            self.drawn,
-            tx=self.drawn.tx[first] if one else self.drawn.tx[first : first + count],
-            link_state=self.link_state[draw],
-            gain_db=self.gain_db[draw],
-            path_tx=self.drawn.path_tx[chosen] - first,
-            **{name: getattr(self.drawn, name)[chosen] for name in columns},
-        )
+        """Return one draw, as `trace_links` returns links; interactions are 255 where a path was not traced."""
+        traced = self._draws.traced
+        columns = self._draws.paths_of(range(len(self))[draw])
+        return replace(traced, link_state=self.link_state[draw], gain_db=self.gain_db[draw], **columns)
+
+    @cached_property
+    def drawn(self) -> TracedLinks:
+        """All draws at once: the paths of draw k and transmitter t are of its transmitter ``k * T + t``.
+
+        Raises
+        ------
+        MemoryLimitError
+            If they may take more than `memory_gb`: `links` takes the memory of some draws only.
+        """
+        traced = self._draws.traced
+        tx_m = np.tile(traced.tx.reshape(-1, 3), (len(self), 1))
+        size_gb = self.link_state.size * _PATHS_OF_DRAW * _PATH_BYTES / 1e9
+        if size_gb > self.memory_gb:
+            raise MemoryLimitError(
+                f"memory_gb = {self.memory_gb:g} is too little: all paths of {len(self):,} draws take up to "
+                f"{size_gb:.1f} GB. Use links(draw) for one draw after the other, or give more memory_gb."
+            )
+        states, gains_db = (each.reshape(len(tx_m), -1) for each in (self.link_state, self.gain_db))
+        return replace(traced, tx=tx_m, link_state=states, gain_db=gains_db, **self._draws.all_paths())
 
     def cir(self, **options: Any) -> "xr.Dataset":
         """Return channel impulse responses as `TracedLinks.cir` does, along a first dimension "draw"."""
@@ -160,7 +172,7 @@ def sample_channels(
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     memory_gb : float
-        How much memory the drawn paths may take [GB].
+        How much memory the draws may take, and all their paths together where they are asked for at once [GB].
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
         terminals and notebooks after 2 s.
@@ -172,7 +184,7 @@ def sample_channels(
     Raises
     ------
     MemoryLimitError
-        If the paths may take more than `memory_gb`; nothing was begun.
+        If the draws without their paths may take more than `memory_gb`; nothing was begun.
     MapError, PositionError, SettingsError, PredictorError, BackendError
         As `trace_links` and `predict_map`.
 
@@ -189,7 +201,7 @@ def sample_channels(
     require_whole("seed", seed, 0, 2**63)
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    size_gb = n * np.size(tx) / 3 * np.size(rx) / 3 * _PATHS_OF_DRAW * _PATH_BYTES / 1e9
+    size_gb = n * np.size(tx) / 3 * np.size(rx) / 3 * _DRAW_BYTES / 1e9
     if size_gb > memory_gb:
         raise MemoryLimitError(
             f"memory_gb = {memory_gb:g} is too little: {n:,} draws of {round(np.size(tx) * np.size(rx) / 9):,} links "
@@ -214,18 +226,9 @@ def sample_channels(
             prediction = Predictor.load(predictor).predict(phi)
         report(0.5, "drawing")
         draws = _Draws(partial, traced, prediction, n, seed)
-        columns: dict[str, Any] = draws.columns()
         report(1.0, "done")
     shape = (n, *traced.gain_db.shape)
-    drawn = replace(
-        traced,
-        tx=np.tile(tx_m, (n, 1)),
-        link_state=draws.state.reshape(n * len(tx_m), -1),
-        gain_db=draws.gain_db.reshape(n * len(tx_m), -1),
-        **columns,
-        vertices_m=np.broadcast_to(math.nan, (*columns["interactions"].shape, 3)),
-    )
-    return ChannelSamples(draws.state.reshape(shape), draws.gain_db.reshape(shape), drawn)
+    return ChannelSamples(draws.state.reshape(shape), draws.gain_db.reshape(shape), memory_gb, draws)
 
 
 class _Draws:
@@ -235,7 +238,7 @@ class _Draws:
         self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
     ) -> None:
         tx_m, rx_m = traced.tx.reshape(-1, 3), traced.rx
-        self._traced, self._seed, self._rx_count = traced, seed, len(rx_m)
+        self.traced, self._seed, self._rx_count = traced, seed, len(rx_m)
         self._link = traced.path_link
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
         self._geometry = LinkGeometry.of(partial, *ends, traced.settings.frequency_hz)
@@ -262,12 +265,31 @@ class _Draws:
             math.sqrt(2.0) * ndtri(self._model.survival(inputs, each)) for each in (LinkState.LOS, LinkState.NLOS)
         ]
 
-    def columns(self) -> dict[str, NDArray[Any]]:
-        """Return the paths of all draws, ordered as `TracedLinks` has them, without vertices."""
-        paths = len(self.state) * (len(self._link) + _PATHS_OF_DRAW * len(self._uncertain))
-        blocks = np.array_split(np.arange(len(self.state)), min(len(self.state), 1 + paths // _PATHS_AT_ONCE))
-        ordered = [self._ordered(block) for block in blocks]
-        return {name: np.concatenate([each.pop(name) for each in ordered]) for name in _COLUMNS}
+        paths = count * (len(self._link) + _PATHS_OF_DRAW * len(self._uncertain))
+        self._blocks = np.array_split(np.arange(count), min(count, 1 + paths // _PATHS_AT_ONCE))
+        self._block_of_draw = np.repeat(np.arange(len(self._blocks)), [len(block) for block in self._blocks])
+        self._latest: tuple[int, dict[str, NDArray[Any]]] = -1, {}
+
+    def all_paths(self) -> dict[str, NDArray[Any]]:
+        """Return the columns of `TracedLinks` for the paths of all draws."""
+        ordered = [self._ordered(block) for block in self._blocks]
+        return self._with_vertices({name: np.concatenate([each.pop(name) for each in ordered]) for name in _COLUMNS})
+
+    def paths_of(self, draw: int) -> dict[str, NDArray[Any]]:
+        """Return the columns of `TracedLinks` for the paths of a draw."""
+        number = int(self._block_of_draw[draw])
+        if self._latest[0] != number:
+            self._latest = number, self._ordered(self._blocks[number])
+        columns = self._latest[1]
+        first = draw * self._tx_count
+        start, stop = np.searchsorted(columns["path_tx"], [first, first + self._tx_count])
+        here = {name: values[start:stop] for name, values in columns.items()}
+        return self._with_vertices({**here, "path_tx": here["path_tx"] - np.int32(first)})
+
+    @staticmethod
+    def _with_vertices(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+        """Add vertices, which are not drawn."""
+        return {**columns, "vertices_m": np.broadcast_to(math.nan, (*columns["interactions"].shape, 3))}
 
     def _ordered(self, draws: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
         """Columns of all paths of some draws."""
@@ -306,8 +328,8 @@ class _Draws:
         links = self._uncertain
         place = np.full(len(self._geometry.distance_m), -1)
         place[links] = np.arange(len(links))
-        paths = np.flatnonzero((place[self._link] >= 0) & (self._traced.interactions > 0).any(axis=1))
-        power, at = np.abs(self._traced.a[paths]) ** 2, place[self._link[paths]]
+        paths = np.flatnonzero((place[self._link] >= 0) & (self.traced.interactions > 0).any(axis=1))
+        power, at = np.abs(self.traced.a[paths]) ** 2, place[self._link[paths]]
         strongest = np.zeros(len(links))
         np.maximum.at(strongest, at, power)
         kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
@@ -364,7 +386,7 @@ class _Draws:
         rng: np.random.Generator | None,
     ) -> SolvedPaths:
         """Traced paths in some draws; what crosses the unseen has a random phase."""
-        columns = {name: getattr(self._traced, name).take(paths, axis=0) for name in _COLUMNS}
+        columns = {name: getattr(self.traced, name).take(paths, axis=0) for name in _COLUMNS}
         if rng is not None and scale is not None:
             turn = np.where(self._crosses[paths], rng.uniform(0.0, 2.0 * np.pi, len(paths)), 0.0)
             columns["transfer"] *= (scale * np.exp(1j * turn))[:, None, None]
@@ -383,7 +405,7 @@ class _Draws:
         rng: np.random.Generator,
     ) -> SolvedPaths:
         """Paths that were not traced: angles are those from the direct line, and they keep the polarisation."""
-        geometry, depth = self._geometry, max(1, self._traced.interactions.shape[1])
+        geometry, depth = self._geometry, max(1, self.traced.interactions.shape[1])
         seen = (kind == 0) & (geometry.unobserved_m[link] == 0.0)
         amplitude = np.sqrt(power) * np.exp(2j * np.pi * np.where(seen, 0.0, rng.random(len(link))))
         transfer, interactions = np.zeros((len(link), 2, 2), complex), np.zeros((len(link), depth), np.uint8)
@@ -407,4 +429,4 @@ class _Draws:
 
     @property
     def _tx_count(self) -> int:
-        return len(self._traced.tx.reshape(-1, 3))
+        return len(self.traced.tx.reshape(-1, 3))
