@@ -19,8 +19,8 @@ from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import ChannelPaths
 
-BLOCK_BYTES = 25_000_000
-"""Size of the coefficients that are computed together, which bounds the memory."""
+BLOCK_BYTES = 4_000_000
+"""Size of the coefficients that are computed together, which caches hold."""
 
 UPRIGHT = 1e-3
 """A diffraction is at a vertical edge if it changes the vertical part of the direction by less than this."""

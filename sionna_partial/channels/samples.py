@@ -77,7 +77,7 @@ class ChannelSamples(Shown):
     def links(self, draw: int) -> TracedLinks:
         """Return one draw, as `trace_links` returns links; interactions are 255 where a path was not traced."""
         traced = self._draws.traced
-        columns = self._draws.paths_of(range(len(self))[draw])
+        columns: dict[str, Any] = self._draws.paths_of(range(len(self))[draw])
         return replace(traced, link_state=self.link_state[draw], gain_db=self.gain_db[draw], **columns)
 
     @cached_property
@@ -97,8 +97,9 @@ class ChannelSamples(Shown):
                 f"memory_gb = {self.memory_gb:g} is too little: all paths of {len(self):,} draws take up to "
                 f"{size_gb:.1f} GB. Use links(draw) for one draw after the other, or give more memory_gb."
             )
-        states, gains_db = (each.reshape(len(tx_m), -1) for each in (self.link_state, self.gain_db))
-        return replace(traced, tx=tx_m, link_state=states, gain_db=gains_db, **self._draws.all_paths())
+        columns: dict[str, Any] = self._draws.all_paths()
+        columns |= {name: getattr(self, name).reshape(len(tx_m), -1) for name in ("link_state", "gain_db")}
+        return replace(traced, tx=tx_m, **columns)
 
     def cir(self, **options: Any) -> "xr.Dataset":
         """Return channel impulse responses as `TracedLinks.cir` does, along a first dimension "draw"."""
