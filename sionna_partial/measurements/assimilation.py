@@ -38,7 +38,7 @@ UNSEEN_REACH_M = 14.0
 LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
 """Fraction of the variance of residuals that is correlated over this walk only [m]."""
 
-NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0, 0.4
+NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0, 0.25
 """Standard deviations of measurements that are tried where none is given, and the likeliest before, with the standard
 deviation of its logarithm [dB]."""
 
@@ -55,8 +55,8 @@ class Kind(NamedTuple):
     offset_db: float
     """Standard deviation of an offset that all have in common [dB]."""
 
-    shadow: float
-    """Standard deviation of a factor on what is predicted below the gain in free space [1]."""
+    shadow: tuple[float, float]
+    """Mean and standard deviation of a factor on what is predicted below the gain in free space [1]."""
 
     seen_reach_m: float
     """Walk over which residuals stay correlated where the transmitter is in a cell that was seen [m]."""
@@ -65,8 +65,8 @@ class Kind(NamedTuple):
     """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
 
 
-KINDS = (Kind(0.99, 0.9999, 2.0, 0.0, 0.8, 1.0), Kind(0.01, 0.0001, 40.0, 0.5, 4.0, 3.0))
-"""Path gains as a trace has them, and powers that a real radio received."""
+KINDS = (Kind(0.99, 0.9999, 2.0, (1.0, 0.0), 0.8, 1.0), Kind(0.01, 0.0001, 40.0, (0.5, 0.2), 4.0, 3.0))
+"""Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
 
 MOST_POINTS = 500
 """Number of places with measurements from which on neighbours are averaged."""
@@ -217,8 +217,9 @@ class Assimilation:
         for kind in KINDS:
             reach_m, chance = (kind.seen_reach_m, kind.chance) if seen else (UNSEEN_REACH_M, kind.unseen_chance)
             scale_db = averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
-            residual = averaged(above_db) / scale_db
-            common = np.stack([np.full(len(first), kind.offset_db), kind.shadow * averaged(below_db)]) / scale_db
+            factor, spread = kind.shadow
+            residual = averaged(above_db - (factor - 1.0) * below_db) / scale_db
+            common = np.stack([np.full(len(first), kind.offset_db), spread * averaged(below_db)]) / scale_db
             covariance = _positive(self._correlation(rx_m[first], reach_m)) + common.T @ common
             for noise, noise_db in noises.items():
                 log_chance = math.log(chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
@@ -232,7 +233,7 @@ class Assimilation:
         self._weights, self._precision = _posterior(covariance, residual, heard, noise_db / scale_db)
         in_common = common @ self._weights
         self.offset_db = float(kind.offset_db * in_common[0])
-        self.shadow_scale = float(1.0 + kind.shadow * in_common[1])
+        self.shadow_scale = float(kind.shadow[0] + kind.shadow[1] * in_common[1])
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
         """Return what is predicted of the links to receivers given the measurements, from what was before.
