@@ -1,4 +1,4 @@
-"""Predictors on the links of a data set: all links and short ones, floor by floor, and where the trace is certain.
+"""Predictors on the links of a data set: all and short ones, floor by floor, those in the unseen, and certain ones.
 
 The data set is one of `sionna-partial dataset`, as in docs/results.md. Further predictors are `.keras` files, such as
 the paper's networks that `make predictor` fits to the same data as `map` (build/predictor/paper/predictor.keras). Run
@@ -19,6 +19,9 @@ from sionna_partial.evaluation.metrics import Metrics, measure
 SHORT_M, WRONG_DB = 25.0, 0.5
 """Length of short links [m], and by how much a certain gain may be off [dB]."""
 
+DISTANCES = 30
+"""Number of intervals of distance, of as many links each."""
+
 
 def main() -> None:
     """Print a table for each question."""
@@ -38,6 +41,7 @@ def main() -> None:
             chosen = np.flatnonzero(group & (links.stage == stage))
             row = [text(rated(prediction, links, chosen)) for prediction in found.values()]
             print(f"| {stage:g} | {' | '.join(row)} |")
+    unobserved(found, links)
     certain(found["map"], links)
 
 
@@ -49,6 +53,31 @@ def rated(prediction: sp.LinkPrediction, links: LinkTable, chosen: NDArray[np.in
 def text(metrics: Metrics) -> str:
     """Accuracy, RMSE and calibration error."""
     return f"{metrics.accuracy:.3f}, {metrics.rmse_db:.2f} dB, {metrics.calibration_error:.3f}"
+
+
+def unobserved(found: dict[str, sp.LinkPrediction], links: LinkTable) -> None:
+    """Print the RMSE of links with neither end observed, and over all links if all others were predicted exactly.
+
+    Beside them stands the function of distance that fits the true gains of these links best.
+    """
+    context = links.phi.context
+    assert context is not None
+    neither = ~(context.tx_seen | context.rx_seen)
+    print("\nneither end observed: RMSE [dB]; the RMSE over all links if the others were exact\n")
+    print(f"| stage | fraction of links | {' | '.join(found)} | best of distance |")
+    print("|---" * (3 + len(found)) + "|")
+    for stage in np.unique(links.stage):
+        here = links.stage == stage
+        chosen = neither & here
+        gain_db, fraction = links.gain_db[chosen], chosen.sum() / here.sum()
+        bins = np.array_split(np.argsort(links.phi.distance_m[chosen]), DISTANCES)
+        guesses = [prediction.gain_mean_db[chosen] for prediction in found.values()]
+        guesses.append(np.zeros(len(gain_db)))
+        for each in bins:
+            guesses[-1][each] = gain_db[each].mean()
+        errors = [np.sqrt(np.mean((guess_db - gain_db) ** 2)) for guess_db in guesses]
+        row = [f"{each:.2f}; {np.sqrt(fraction) * each:.2f}" for each in errors]
+        print(f"| {stage:g} | {fraction:.2f} | {' | '.join(row)} |")
 
 
 def certain(prediction: sp.LinkPrediction, links: LinkTable) -> None:
