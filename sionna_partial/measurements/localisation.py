@@ -28,9 +28,9 @@ MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 MOST_PLACES = 25
 """Number of places with measurements from which links are traced."""
 
-REACH_M = 1.5
-"""Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 %
-of the transmitters of procedural homes that some place hears."""
+REACH_M = 3.0
+"""Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 % of the
+transmitters of procedural homes, those included that no place hears."""
 
 TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
