@@ -2,7 +2,6 @@
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
@@ -12,10 +11,9 @@ from numpy.typing import NDArray
 from sionna_partial.coverage import TX_COORDINATES
 from sionna_partial.network import require_network
 from sionna_partial.plots.coverage_plot import extent_m, wall_cells
-from sionna_partial.plots.style import STAR, Figure, legend_below, shade
+from sionna_partial.plots.style import STAR, Figure, legend_below, server_colours, shade
 
 _WIDTH_IN, _DPI = 10.0, 130
-_SERVERS = "tab20"
 
 
 def plot_network(network: xr.Dataset) -> Figure:
@@ -49,7 +47,7 @@ def plot_network(network: xr.Dataset) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, 2 * height + 1.6), dpi=_DPI, layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     names = [str(name) for name in network["tx"].to_numpy()]
-    servers = ListedColormap([colormaps[_SERVERS](number % colormaps[_SERVERS].N) for number in range(len(names))])
+    servers = ListedColormap(server_colours(len(names)))
     best, norm = network["best_server"].to_numpy(), Normalize(-0.5, len(names) - 0.5)
     _draw(axes[0, 0], network, np.where(best >= 0, best, np.nan), servers, norm)
     axes[0, 0].set_title("likeliest best server")
