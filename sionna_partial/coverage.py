@@ -299,7 +299,7 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
     if "tx" in coverage.dims:
         names = ", ".join(map(str, coverage["tx"].to_numpy()))
         raise SettingsError(f"coverage has the transmitters {names}: choose one, as by coverage.isel(tx=0).")
-    if "tx" in coverage.coords:
+    if {"tx", *TX_COORDINATES} <= coverage.coords.keys():
         position_m = np.array([float(coverage[name]) for name in TX_COORDINATES])
         coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
     missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
@@ -314,9 +314,9 @@ def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
     """Return the coverage of each transmitter by name, as `require_coverage` does; "" names a single one."""
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         return {"": require_coverage(coverage)}
-    if not coverage.sizes["tx"]:
-        raise SettingsError("coverage has no transmitter along tx: keep at least one.")
-    return {str(name): require_coverage(coverage.isel(tx=at)) for at, name in enumerate(coverage["tx"].to_numpy())}
+    names = [str(name) for name in coverage["tx"].to_numpy()]
+    require(0 < len(names) == len({*names}), "coverage.tx", names, "keep at least one, each with a name of its own.")
+    return {name: require_coverage(coverage.isel(tx=at)) for at, name in enumerate(names)}
 
 
 def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:

@@ -224,8 +224,9 @@ def _bands(coverage: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray
             layer = layer.where(coverage["valid"])
         if "tx" in layer.dims:
             for at, tx in enumerate(coverage["tx"].to_numpy()):
-                position_m = [float(coverage[axis][at]) for axis in TX_COORDINATES]
-                bands[f"{tx}:{name}"] = layer.isel(tx=at).assign_attrs(transmitter_m=position_m)
+                one = layer.isel(tx=at)
+                position_m = [float(one[axis]) for axis in TX_COORDINATES if axis in one.coords]
+                bands[f"{tx}:{name}"] = one.assign_attrs(transmitter_m=position_m)
         else:
             bands[name] = layer
     return bands

@@ -410,6 +410,7 @@ def test_bad_input_is_refused_before_any_heavy_work(no_work, arguments, error, m
         (lambda data: data.isel(x=slice(0, 0)), "coverage lacks receivers"),
         (lambda data: data.drop_vars("x"), "coverage lacks x:"),
         (lambda data: data["p_los"], "coverage is of type DataArray"),
+        (lambda data: data.drop_attrs().assign_coords(tx="a"), "coverage lacks transmitter_m"),
     ],
 )
 def test_what_is_no_coverage_map_is_named(coverage, spoil, message):

@@ -199,7 +199,8 @@ class TestSeveralTransmitters:
         ("choose", "message"),
         [
             ({}, r"transmitters west, <b>east</b>: choose one, as by coverage\.isel\(tx=0\)"),
-            ({"tx": []}, "coverage has no transmitter along tx: keep at least one"),
+            ({"tx": []}, r"coverage\.tx = \[\] is not allowed: keep at least one, each with a name of its own"),
+            ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: keep at least one, each with a"),
         ],
     )
     def test_a_ros_map_needs_one_transmitter(self, several, tmp_path, choose, message):
