@@ -62,6 +62,15 @@ class ChannelSamples(Shown):
     drawn : TracedLinks
         All paths: those of draw k and transmitter t are of its transmitter ``k * T + t``. Interactions are 255 where a
         path was not traced, and there are no vertices.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> samples = sp.sample_channels(partial, (1.5, 1.5, 1.5), [(4.5, 1.5, 1.5)], n=20)
+    >>> samples.link_state.shape, len(samples.drawn.path_rx) > 0
+    ((20, 1), True)
     """
 
     link_state: NDArray[np.uint8]
