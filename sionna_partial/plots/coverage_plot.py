@@ -31,7 +31,7 @@ from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""
 
-_NARROW_IN, _WIDE_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 170, 3000
+_NARROW_IN, _WIDE_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 0.35, 170, 3000
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
@@ -161,7 +161,7 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
         row[0].set_ylabel(f"{name}\n\ny [m]")
     for column, layer in zip(zip(*axes, strict=True), layers, strict=True):
         column[0].set_title(layer.title)
-        _add_key(column, layer, "bottom")
+        _add_key(column, layer, _KEY_PAD_IN / figure.get_figheight())
     return figure
 
 
@@ -223,15 +223,18 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
     return figure, axes.tolist()
 
 
-def _add_key(axes: Sequence[Axes], layer: Layer, side: str = "right") -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states."""
+def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states.
+
+    They are to the right of the panels, or that fraction of the figure below them.
+    """
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
-        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, extend=_beyond(layer))
+        side, pad = ("bottom", pad_below) if pad_below else ("right", 0.05)
+        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=_beyond(layer))
         bar.set_label(layer.label)
     elif layer.norm is None:
-        below = side == "bottom"
-        _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if below else (1.02, 0.3, 0.36, 0.4)))
+        _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
 
 
 def _beyond(layer: Layer) -> str:
