@@ -47,7 +47,7 @@ COMPLETE = """
 TX = (0.6, 3.6)
 """Where the transmitter stands."""
 
-SEVERAL = {"west": TX, "<b>east</b>": (3.4, 3.1)}
+SEVERAL = {"west": TX, "<b>east$}$": (3.4, 3.1)}
 """Where several stand."""
 
 

@@ -109,7 +109,7 @@ class TestInABrowser:
     def test_one_of_several_transmitters_is_shown_and_the_best_server(self, several, tmp_path):
         found = probe(several, tmp_path / "coverage.html")
         assert found["shown"][0] == ["p_above", [1]]
-        assert found["title"] == "P(path gain > -80 dB): <b>east</b>"
+        assert found["title"] == "P(path gain > -80 dB): <b>east$}$"
         shape, valid = several["p_los"].shape, several["valid"].all("tx").to_numpy()
         west, east, best = np.array(found["p_above"], dtype=float).reshape(3, *shape[1:])
         np.testing.assert_allclose([west, east], probability_above(several, -80.0), atol=0.01)

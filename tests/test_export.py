@@ -198,7 +198,7 @@ class TestSeveralTransmitters:
     @pytest.mark.parametrize(
         ("choose", "message"),
         [
-            ({}, r"transmitters west, <b>east</b>: choose one, as by coverage\.isel\(tx=0\)"),
+            ({}, r"transmitters west, <b>east\$}\$: choose one, as by coverage\.isel\(tx=0\)"),
             ({"tx": []}, r"coverage\.tx = \[\] is not allowed: keep at least one, each with a name of its own"),
             ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: keep at least one, each with a"),
         ],

@@ -158,7 +158,7 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
     for row, (name, coverage) in zip(axes, maps.items(), strict=True):
         for axis, layer in zip(row, layers, strict=True):
             _draw(axis, coverage, layer)
-        row[0].set_ylabel(f"{name}\n\ny [m]")
+        row[0].set_ylabel(f"{name}\n\ny [m]", parse_math=False)
     for column, layer in zip(zip(*axes, strict=True), layers, strict=True):
         column[0].set_title(layer.title)
         _add_key(column, layer, _KEY_PAD_IN / figure.get_figheight())

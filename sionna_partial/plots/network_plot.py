@@ -50,15 +50,15 @@ def plot_network(network: xr.Dataset) -> Figure:
     servers = ListedColormap(server_colours(len(names)))
     best, norm = network["best_server"].to_numpy(), Normalize(-0.5, len(names) - 0.5)
     _draw(axes[0, 0], network, np.where(best >= 0, best, np.nan), servers, norm)
-    axes[0, 0].set_title("likeliest best server")
+    axes[0, 0].set_title("Likeliest best server")
     bar = figure.colorbar(ScalarMappable(norm, servers), ax=axes[0, 0], ticks=range(len(names)))
-    bar.ax.set_yticklabels(names)
+    bar.ax.set_yticklabels(names, parse_math=False)
     threshold_db = float(network.attrs["sinr_threshold_db"])
     top_bit_s = float(np.nanmax(network["rate_bit_s"])) / 1e6 if np.isfinite(network["rate_bit_s"]).any() else 1.0
     layers = (
-        (axes[0, 1], "sinr_mean_db", 1.0, Normalize(-20.0, 40.0), "mean SINR [dB]"),
+        (axes[0, 1], "sinr_mean_db", 1.0, Normalize(-20.0, 40.0), "Mean SINR [dB]"),
         (axes[1, 0], "p_sinr_above", 1.0, Normalize(0.0, 1.0), f"P(SINR > {threshold_db:g} dB)"),
-        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), "mean Shannon rate [Mbit/s]"),
+        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), "Mean Shannon rate [Mbit/s]"),
     )
     for axis, name, scale, norm, title in layers:
         _draw(axis, network, scale * network[name].to_numpy(), "viridis", norm)
