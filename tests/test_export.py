@@ -8,13 +8,15 @@ import pytest
 import rasterio
 import xarray as xr
 import yaml
-from coverage_fakes import SEVERAL, coverage_of_several, small_coverage
+from coverage_fakes import PICTURE, SEVERAL, coverage_of_several, map_of, small_coverage, use_fakes
 from PIL import Image
+from typer.testing import CliRunner
 
+from sionna_partial import cli
 from sionna_partial.constants import CellState
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage, save_network
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.network import network_map
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.style import figure_png
@@ -182,6 +184,18 @@ class TestSeveralTransmitters:
                 np.testing.assert_array_equal(np.flipud(image.read(band)), several["gain_mean_db"].sel(tx=tx))
                 assert image.tags(band)["transmitter_m"] == str([*SEVERAL[tx], 1.5])
                 assert image.units[band - 1] == "dB"
+
+    @pytest.mark.usefixtures("command_line")
+    def test_the_command_network_writes_the_page(self, monkeypatch, tmp_path):
+        use_fakes(monkeypatch)
+        save_map(map_of(PICTURE), tmp_path / "map.yaml")
+        options = [word for x, y in SEVERAL.values() for word in ("--tx", x, y)]
+        words = ["network", tmp_path / "map.yaml", *options, "--spacing", 0.5, "--out", tmp_path / "out"]
+        result = CliRunner().invoke(cli.app, [*map(str, words)])
+        assert result.exit_code == 0, result.output
+        files = ["coverage.nc", "coverage.html", "network.nc", "network.png"]
+        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in files]
+        assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(files)
 
     def test_png_is_the_picture(self, several, tmp_path):
         save_coverage(several, tmp_path / "coverage.png")
