@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, Normalize, to_hex
-from numpy.typing import NDArray
 
 from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, transmitters_of
 from sionna_partial.plots.coverage_plot import (
@@ -172,15 +171,11 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
     return plot
 
 
-def _strongest(maps: Mapping[str, xr.Dataset]) -> NDArray[np.intp]:
-    """Which transmitter has the largest mean path gain (ny, nx)."""
-    gain_db = np.stack([each["gain_mean_db"].to_numpy() for each in maps.values()])
-    return np.nan_to_num(gain_db, nan=-np.inf).argmax(axis=0)
-
-
 def _best_server(maps: Mapping[str, xr.Dataset]) -> Layer:
-    best, colours = _strongest(maps), ListedColormap(server_colours(len(maps)))
-    return Layer("Best server", lambda _: best, Normalize(0, len(maps) - 1), colours)
+    """Number of the transmitter with the largest mean path gain."""
+    gain_db = np.stack([each["gain_mean_db"].to_numpy() for each in maps.values()])
+    best = np.nan_to_num(gain_db, nan=-np.inf).argmax(axis=0)
+    return Layer("Best server", lambda _: best, Normalize(0, len(maps) - 1), ListedColormap(server_colours(len(maps))))
 
 
 def _source(maps: Mapping[str, xr.Dataset], layers: Mapping[str, Layer]) -> Any:
@@ -199,8 +194,8 @@ def _source(maps: Mapping[str, xr.Dataset], layers: Mapping[str, Layer]) -> Any:
         for name, each in values.items():
             rounded = np.round(np.where(valid, each, np.nan) * _STEPS) / _STEPS
             columns.setdefault(name, []).append(rounded.astype(np.float32))
-    if len(maps) > 1:
-        best = _strongest(maps)[None]
+    if "best_server" in layers:
+        best = layers["best_server"].picture(coverage)[None]
         for rows in columns.values():
             rows.append(np.take_along_axis(np.stack(rows), best, axis=0)[0])
     return ColumnDataSource(columns, name="values")
