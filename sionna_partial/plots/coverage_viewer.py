@@ -172,7 +172,7 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
 
 
 def _best_server(maps: Mapping[str, xr.Dataset]) -> Layer:
-    """Number of the transmitter with the largest mean path gain."""
+    """Show the number of the transmitter with the largest mean path gain."""
     gain_db = np.stack([each["gain_mean_db"].to_numpy() for each in maps.values()])
     best = np.nan_to_num(gain_db, nan=-np.inf).argmax(axis=0)
     return Layer("Best server", lambda _: best, Normalize(0, len(maps) - 1), ListedColormap(server_colours(len(maps))))
