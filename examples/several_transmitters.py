@@ -28,3 +28,8 @@ print(f"all fail: {network.p_all_outage.mean().item():.1%}; if they were indepen
 # Best server, SINR, the probability of 10 dB, and the rate.
 
 figure = sp.plot_network(network)
+
+# %%
+# The coverage of each. ``sp.save_coverage(coverage, "coverage.html")`` writes a page with a choice of the transmitter.
+
+coverage_figure = sp.plot_coverage(coverage, layers=("gain_mean_db", "p_outage"))

@@ -5,7 +5,9 @@ used. Importing the package also chooses the LLVM library of Dr.Jit: import it b
 """
 
 import ast
+import sys
 from importlib import import_module
+from importlib.util import find_spec as _find_spec
 from pathlib import Path
 
 from sionna_partial.llvm import choose_llvm as _choose_llvm
@@ -14,6 +16,10 @@ from sionna_partial.process import signals_held as _signals_held
 __version__ = "0.1.0"
 
 _choose_llvm()
+
+if "coverage" not in sys.modules and getattr(_find_spec("coverage"), "origin", "") is None:
+    # a folder of that name, as of results, is no library: numba, which looks for one, would fail on it
+    sys.modules["coverage"] = None  # type: ignore[assignment]
 
 _MODULE_OF = {
     alias.name: str(node.module)

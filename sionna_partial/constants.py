@@ -34,7 +34,14 @@ WALL_THICKNESS_M = 0.1
 
 
 class LinkState(IntEnum):
-    """State of a radio link (paper, Section II-B)."""
+    """State of a radio link (paper, Section II-B).
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.LinkState(1).name
+    'LOS'
+    """
 
     OUTAGE = 0
     LOS = 1
@@ -42,7 +49,14 @@ class LinkState(IntEnum):
 
 
 class CellState(IntEnum):
-    """State of a map cell."""
+    """State of a map cell.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.CellState(2).name
+    'UNKNOWN'
+    """
 
     FREE = 0
     WALL = 1

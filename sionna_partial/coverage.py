@@ -299,7 +299,7 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
     if "tx" in coverage.dims:
         names = ", ".join(map(str, coverage["tx"].to_numpy()))
         raise SettingsError(f"coverage has the transmitters {names}: choose one, as by coverage.isel(tx=0).")
-    if "tx" in coverage.coords:
+    if {"tx", *TX_COORDINATES} <= coverage.coords.keys():
         position_m = np.array([float(coverage[name]) for name in TX_COORDINATES])
         coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
     missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
@@ -310,8 +310,17 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
     return coverage
 
 
+def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return the coverage of each transmitter by name, as `require_coverage` does; "" names a single one."""
+    if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
+        return {"": require_coverage(coverage)}
+    names = [str(name) for name in coverage["tx"].to_numpy()]
+    require(0 < len(names) == len({*names}), "coverage.tx", names, "keep at least one, each with a name of its own.")
+    return {name: require_coverage(coverage.isel(tx=at)) for at, name in enumerate(names)}
+
+
 def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
-    """Return P(path gain > threshold) (ny, nx), NaN where no receiver can stand; threshold in [-150, 0] dB."""
+    """Return P(path gain > threshold) (..., ny, nx), NaN where no receiver can stand; threshold in [-150, 0] dB."""
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
     columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
     return LinkPrediction(**columns).probability_above(threshold_db)
@@ -346,7 +355,7 @@ class CoverageAccessor:
         later("export:save_coverage")(self._coverage, path)
 
     def probability_above(self, threshold_db: float) -> xr.DataArray:
-        """Return the probability (ny, nx) that the path gain exceeds a threshold t [dB].
+        """Return the probability (ny, nx), or (tx, ny, nx), that the path gain exceeds a threshold t [dB].
 
         P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), where m
         and s are `gain_los_mean_db`, `gain_los_std_db` and so on, and Phi is the normal distribution function: an
@@ -357,7 +366,8 @@ class CoverageAccessor:
         SettingsError
             For a threshold that is no number of dB.
         """
-        above = probability_above(require_coverage(self._coverage), threshold_db)
+        transmitters_of(self._coverage)
+        above = probability_above(self._coverage, threshold_db)
         attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
         values = self._coverage["p_los"].copy(data=above.astype(np.float32))
         return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
@@ -370,7 +380,7 @@ class CoverageAccessor:
         PositionError
             If that is not on the map.
         """
-        require_coverage(self._coverage)
+        transmitters_of(self._coverage)
         half_m = float(self._coverage.attrs["spacing_m"]) / 2.0
         for name, value in (("x", x), ("y", y)):
             low_m, high_m = (float(self._coverage[name][end]) for end in (0, -1))
@@ -380,11 +390,10 @@ class CoverageAccessor:
         return self._coverage.sel(x=x, y=y, method="nearest")
 
     def __repr__(self) -> str:
-        coverage = require_coverage(self._coverage)
-        rows, columns = coverage["valid"].shape
-        attributes = coverage.attrs
-        grid = f"{columns} x {rows} receivers, {attributes['spacing_m']:g} m apart"
-        return f"<coverage: {grid}, {transmitter_text(coverage)}, {attributes['frequency_hz'] / 1e9:g} GHz>"
+        maps = transmitters_of(self._coverage)
+        sizes, attributes = self._coverage.sizes, self._coverage.attrs
+        grid = f"{sizes['x']} x {sizes['y']} receivers, {attributes['spacing_m']:g} m apart"
+        return f"<coverage: {grid}, {transmitter_text(maps)}, {attributes['frequency_hz'] / 1e9:g} GHz>"
 
     def _repr_html_(self) -> str:
         return picture_html(repr(self), _PLOT, self._coverage)
@@ -682,8 +691,11 @@ def _with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr
     return coverage.assign_attrs(transmitter_std_m=posterior.std_m)
 
 
-def transmitter_text(coverage: xr.Dataset) -> str:
-    """Say where the transmitter is."""
+def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
+    """Say where the transmitter is, or how many there are."""
+    if len(maps) > 1:
+        return f"{len(maps)} transmitters"
+    (coverage,) = maps.values()
     position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
     if "p_transmitter" in coverage:
         return f"transmitter near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"

@@ -5,6 +5,15 @@ class SionnaPartialError(Exception):
     """Base of every error that this package raises on purpose.
 
     The message names the field, the value that was given and the remedy.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> try:
+    ...     sp.load_map("missing.yaml")
+    ... except sp.SionnaPartialError as error:
+    ...     print(type(error).__name__)
+    MapError
     """
 
 

@@ -12,13 +12,12 @@ import numpy as np
 import xarray as xr
 import yaml
 from h5py import h5f, h5p
-from numpy.typing import NDArray
 from rasterio import Affine
 from rasterio.io import MemoryFile
 from xarray.backends import H5NetCDFStore
 
 from sionna_partial.constants import NO_RECEIVER
-from sionna_partial.coverage import ATTRIBUTES, require_coverage
+from sionna_partial.coverage import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
@@ -41,17 +40,19 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a coverage map, in the format that the suffix names. Equal maps give equal files.
 
     ======== ==========================================================================================
-    `.nc`    NetCDF 4 (CF conventions), everything: `xarray.load_dataset` returns an equal Dataset. The others hold one
-             transmitter.
+    `.nc`    NetCDF 4 (CF conventions), everything: `xarray.load_dataset` returns an equal Dataset.
     `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN where no receiver stands;
-             local metres, no coordinate reference system; the settings as tags.
-    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands.
+             local metres, no coordinate reference system; the settings as tags. Bands of several transmitters are
+             named "transmitter:variable".
+    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands. Several
+             transmitters have a first column tx.
     `.png`   The picture of `plot_coverage`.
     `.html`  A page for the browser, which needs no network: the layers, the values under the pointer, and
-             P(gain > threshold) with a slider.
+             P(gain > threshold) with a slider; of several transmitters a choice, and the best server.
     `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 100,
              is the probability of outage in percent; unknown (-1) where no receiver stands. Nav2 loads it as a
-             layer that keeps a robot where it has a link (static layer, `trinary_costmap: false`).
+             layer that keeps a robot where it has a link (static layer, `trinary_costmap: false`). One transmitter;
+             for several, save `network_map`.
     ======== ==========================================================================================
 
     Parameters
@@ -64,7 +65,7 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     SettingsError
-        For a Dataset that is no coverage map.
+        For a Dataset that is no coverage map, or several transmitters as `.yaml`.
     OutputError
         For another suffix, or if writing fails; nothing half written is left behind.
 
@@ -77,14 +78,12 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     >>> sp.save_coverage(coverage, "coverage.csv")
     """
     target, suffix = _target(path, FORMATS)
-    if suffix == ".nc" and isinstance(coverage, xr.Dataset) and "tx" in coverage.dims:
-        require_coverage(coverage.isel(tx=0))
-    else:
-        coverage = require_coverage(coverage)
+    maps = transmitters_of(coverage)
     if suffix == ".yaml":
-        _write_ros_map(coverage, target)
+        _write_ros_map(require_coverage(coverage), "p_outage", target)
     else:
-        content = _ENCODERS[suffix](coverage)  # complete before the disk is touched
+        one = coverage if "tx" in coverage.dims else maps[""]
+        content = _ENCODERS[suffix](one)  # complete before the disk is touched
         with atomic_write(target) as stream:
             stream.write(content)
 
@@ -119,12 +118,14 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
         coverage = xr.load_dataset(io.BytesIO(content), engine="h5netcdf")
     except Exception as error:
         raise SettingsError(f"path = '{path}' is no NetCDF file ({error}): give one of save_coverage.") from error
-    require_coverage(coverage.isel(tx=0) if "tx" in coverage.dims else coverage)
+    transmitters_of(coverage)
     return coverage
 
 
 def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a network map as `.nc` (everything), `.tif`, `.csv` (both without `p_best`) or `.png`.
+    """Write a network map as `.nc` (everything), `.tif`, `.csv` (both without `p_best`), `.png` or `.yaml`.
+
+    The latter is a ROS map as that of `save_coverage`, of the probability that all transmitters are in outage.
 
     Parameters
     ----------
@@ -155,7 +156,10 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
         ".csv": lambda: _encode_table(network[names].to_dataframe(dim_order=["y", "x"]).reset_index()),
         ".png": lambda: figure_png(plot_network(network)),
     }
-    target, suffix = _target(path, encoders)
+    target, suffix = _target(path, (*encoders, ".yaml"))
+    if suffix == ".yaml":
+        _write_ros_map(network, "p_all_outage", target)
+        return
     content = encoders[suffix]()
     with atomic_write(target) as stream:
         stream.write(content)
@@ -186,12 +190,13 @@ def _encode_netcdf(coverage: xr.Dataset) -> bytes:
 
 
 def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES) -> bytes:
+    bands = _bands(coverage, names)
     step = float(coverage.attrs["spacing_m"])
     left, top = float(coverage["x"][0]) - step / 2, float(coverage["y"][-1]) + step / 2
     profile = {
         "driver": "GTiff",
         "dtype": "float32",
-        "count": len(names),
+        "count": len(bands),
         "height": coverage.sizes["y"],
         "width": coverage.sizes["x"],
         "nodata": np.nan,
@@ -202,24 +207,35 @@ def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES
     with MemoryFile() as memory:
         with memory.open(**profile) as image:
             image.update_tags(units="m", **{name: str(value) for name, value in coverage.attrs.items()})
-            for band, name in enumerate(names, start=1):
-                image.write(np.flipud(_float_layer(coverage, name)), band)
+            for band, (name, layer) in enumerate(bands.items(), start=1):
+                image.write(np.flipud(layer.to_numpy()), band)
                 image.set_band_description(band, name)
-                image.set_band_unit(band, coverage[name].attrs.get("units", ""))
-                image.update_tags(band, **{key: str(value) for key, value in coverage[name].attrs.items()})
+                image.set_band_unit(band, layer.attrs.get("units", ""))
+                image.update_tags(band, **{key: str(value) for key, value in layer.attrs.items()})
         return bytes(memory.read())
 
 
-def _float_layer(coverage: xr.Dataset, name: str) -> NDArray[np.float32]:
-    """Return a variable as it is, with NaN for a link state where no receiver stands."""
-    layer = coverage[name].to_numpy().astype(np.float32)
-    if name in LINK_STATES:
-        layer[~coverage["valid"].to_numpy()] = np.nan
-    return layer
+def _bands(coverage: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray]:
+    """Return variables by name, and by transmitter; link states are NaN where no receiver stands."""
+    bands = {}
+    for name in names:
+        layer = coverage[name].astype(np.float32)
+        if name in LINK_STATES:
+            layer = layer.where(coverage["valid"])
+        if "tx" in layer.dims:
+            for at, tx in enumerate(coverage["tx"].to_numpy()):
+                one = layer.isel(tx=at)
+                position_m = [float(one[axis]) for axis in TX_COORDINATES if axis in one.coords]
+                bands[f"{tx}:{name}"] = one.assign_attrs(transmitter_m=position_m)
+        else:
+            bands[name] = layer
+    return bands
 
 
 def _encode_csv(coverage: xr.Dataset) -> bytes:
-    table = coverage[list(TABLE_VARIABLES)].to_dataframe(dim_order=["y", "x"]).reset_index()
+    dimensions = [name for name in ("tx", "y", "x") if name in coverage.dims]
+    variables = coverage[list(TABLE_VARIABLES)].drop_vars(TX_COORDINATES, errors="ignore")
+    table = variables.to_dataframe(dim_order=dimensions).reset_index()
     for name in LINK_STATES:
         table[name] = table[name].astype("UInt8").where(table["valid"])
     for name in ("observed", "valid"):
@@ -228,13 +244,15 @@ def _encode_csv(coverage: xr.Dataset) -> bytes:
 
 
 def _encode_table(table: Any) -> bytes:
-    for name in ("x", "y"):
-        table.insert(0 if name == "x" else 1, f"{name}_m", table.pop(name).round(6))
+    for name in ("y", "x"):
+        table.insert(0, f"{name}_m", table.pop(name).round(6))
+    if "tx" in table:
+        table.insert(0, "tx", table.pop("tx"))
     return bytes(table.to_csv(index=False, lineterminator="\n"), "utf-8")
 
 
-def _write_ros_map(coverage: xr.Dataset, path: Path) -> None:
-    """Write the YAML and its PGM; if one cannot be written, neither is."""
+def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
+    """Write the YAML and its PGM of a probability; if one cannot be written, neither is."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
     image = path.with_suffix(".pgm")
@@ -248,7 +266,7 @@ def _write_ros_map(coverage: xr.Dataset, path: Path) -> None:
         "free_thresh": FREE_THRESHOLD,
         "quantity": "probability of outage in percent; 255 where no receiver can stand",
     }
-    percent = np.rint(100 * coverage["p_outage"].fillna(NO_RECEIVER / 100).to_numpy()).astype(np.uint8)
+    percent = np.rint(100 * coverage[p_outage].fillna(NO_RECEIVER / 100).to_numpy()).astype(np.uint8)
     header = b"P5\n%d %d\n255\n" % (coverage.sizes["x"], coverage.sizes["y"])
     with atomic_write(path, "w") as text, atomic_write(image) as picture:
         yaml.safe_dump(sheet, text, sort_keys=False, default_flow_style=None)

@@ -374,6 +374,12 @@ class PredictorSettings(Checked):
     ------
     SettingsError
         For a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.PredictorSettings(networks="paper").passes >= 1
+    True
     """
 
     networks: NetworkKind = "paper"
@@ -408,6 +414,12 @@ class PlacementSettings(Checked):
     ------
     SettingsError
         For values outside these ranges.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.PlacementSettings(threshold_db=-90.0).objective
+    'coverage'
     """
 
     objective: Objective = "coverage"

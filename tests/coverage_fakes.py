@@ -47,6 +47,9 @@ COMPLETE = """
 TX = (0.6, 3.6)
 """Where the transmitter stands."""
 
+SEVERAL = {"west": TX, "<b>east$}$": (3.4, 3.1)}
+"""Where several stand."""
+
 
 def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = (-1.0, 2.0)) -> PartialMap:
     """Make a map of a drawing, off the world's origin."""
@@ -127,3 +130,9 @@ def small_coverage(monkeypatch: pytest.MonkeyPatch) -> xr.Dataset:
     """Coverage map of `PICTURE` with receivers 0.25 m apart."""
     use_fakes(monkeypatch)
     return predict_map(map_of(PICTURE), TX, spacing_m=0.25)
+
+
+def coverage_of_several(monkeypatch: pytest.MonkeyPatch) -> xr.Dataset:
+    """As `small_coverage`, of several transmitters."""
+    use_fakes(monkeypatch)
+    return predict_map(map_of(PICTURE), SEVERAL, spacing_m=0.25)

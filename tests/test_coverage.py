@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import xarray as xr
-from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, small_coverage, use_fakes
+from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, coverage_of_several, map_of, small_coverage, use_fakes
 from extruded import drawn
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
@@ -410,6 +410,7 @@ def test_bad_input_is_refused_before_any_heavy_work(no_work, arguments, error, m
         (lambda data: data.isel(x=slice(0, 0)), "coverage lacks receivers"),
         (lambda data: data.drop_vars("x"), "coverage lacks x:"),
         (lambda data: data["p_los"], "coverage is of type DataArray"),
+        (lambda data: data.drop_attrs().assign_coords(tx="a"), "coverage lacks transmitter_m"),
     ],
 )
 def test_what_is_no_coverage_map_is_named(coverage, spoil, message):
@@ -474,6 +475,14 @@ class TestAccessor:
     def test_beyond_the_map(self, coverage, x, y, message):
         with pytest.raises(PositionError, match=message):
             coverage.radio.at(x, y)
+
+    def test_several_transmitters(self, monkeypatch):
+        several = coverage_of_several(monkeypatch)
+        above = several.radio.probability_above(-70.0)
+        for tx in several["tx"]:
+            assert np.array_equal(above.sel(tx=tx), several.sel(tx=tx).radio.probability_above(-70.0), equal_nan=True)
+        assert several.radio.at(0.7, 3.1).p_los.sizes == {"tx": 2}
+        assert repr(several.radio) == "<coverage: 24 x 16 receivers, 0.25 m apart, 2 transmitters, 28 GHz>"
 
     def test_plot_and_save(self, coverage, tmp_path):
         assert len(coverage.radio.plot().axes) > 3

@@ -2,7 +2,7 @@ import io
 
 import numpy as np
 import pytest
-from coverage_fakes import small_coverage
+from coverage_fakes import coverage_of_several, small_coverage
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.path import Path
@@ -148,6 +148,22 @@ def test_the_transmitter_is_marked_in_each_panel(coverage):
         assert (star.get_xdata()[0], star.get_ydata()[0]) == (0.6, 3.6)
         assert panel.get_aspect() == 1.0
         assert panel.get_xlim() == pytest.approx((-1.0, 5.0))
+
+
+def test_several_transmitters_have_a_row_each(coverage, monkeypatch):
+    several = coverage_of_several(monkeypatch)
+    figure = plot_coverage(several, layers=("link_state", "gain_mean_db", "state_mixture"))
+    rows = np.array(panels(figure)).reshape(2, 3)
+    assert [row[0].get_ylabel().split("\n")[0] for row in rows] == [*several["tx"].to_numpy()]
+    assert [panel.get_title() for panel in rows[0]] == ["Likeliest link state", "Mean path gain", "Link state"]
+    for row, tx in zip(rows, several["tx"], strict=True):
+        one = several.sel(tx=tx)
+        expected = one["gain_mean_db"].to_numpy()[one["valid"].to_numpy()]
+        np.testing.assert_array_equal(at_receivers(row[1], one), expected)
+        assert [star.get_xdata()[0] for star in row[1].lines] == [one["tx_x"]]
+        assert row[1].images[0].get_clim() == (-150, -60)
+    assert figure.get_suptitle() == "Coverage: 2 transmitters, 28 GHz"
+    assert legend(figure) == legend(plot_coverage(coverage))
 
 
 def test_the_comparison_has_a_column_for_each_map(coverage):

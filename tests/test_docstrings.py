@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 from predictor_links import QUIET
+from rosbag_files import write_drive
 
 import sionna_partial as sp
 
@@ -23,9 +24,12 @@ ALONE = tuple((name,) for name in sp.__all__ if name not in {*sum(CHAINS, ()), "
 @pytest.mark.parametrize("names", [*CHAINS, *ALONE], ids=lambda names: names[0])
 def test_examples(names: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    write_drive(tmp_path / "drive.bag")
     finder, report = doctest.DocTestFinder(exclude_empty=True), list[str]()
     for name in names:
-        for example in finder.find(getattr(sp, name), name, globs={}):
+        found = finder.find(getattr(sp, name), name, globs={})
+        assert any(each.examples for each in found), f"{name} has no example"
+        for example in found:
             runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
             runner.run(example, out=report.append)
             assert runner.summarize(verbose=False).failed == 0, "".join(report)

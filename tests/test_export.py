@@ -8,13 +8,16 @@ import pytest
 import rasterio
 import xarray as xr
 import yaml
-from coverage_fakes import small_coverage
+from coverage_fakes import PICTURE, SEVERAL, coverage_of_several, map_of, small_coverage, use_fakes
 from PIL import Image
+from typer.testing import CliRunner
 
+from sionna_partial import cli
 from sionna_partial.constants import CellState
 from sionna_partial.errors import OutputError, SettingsError
-from sionna_partial.export import TABLE_VARIABLES, save_coverage
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.export import TABLE_VARIABLES, save_coverage, save_network
+from sionna_partial.maps.map_files import load_map, save_map
+from sionna_partial.network import network_map
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.style import figure_png
 
@@ -151,6 +154,73 @@ def test_equal_maps_give_equal_files(coverage, tmp_path):
         time.sleep(1.1)  # HDF5's time stamps are whole seconds
     assert files[0] == files[1]
     assert len(files[0]) == len(SUFFIXES) + 1
+
+
+class TestSeveralTransmitters:
+    @pytest.fixture
+    def several(self, monkeypatch):
+        return coverage_of_several(monkeypatch)
+
+    def test_csv_has_the_transmitter_first(self, several, tmp_path):
+        save_coverage(several, tmp_path / "coverage.csv")
+        table = pd.read_csv(tmp_path / "coverage.csv")
+        assert list(table.columns) == ["tx", "x_m", "y_m", *TABLE_VARIABLES]
+        for name, rows in table.groupby("tx"):
+            one = several.sel(tx=name)
+            save_coverage(one, tmp_path / "one.csv")
+            alone = pd.read_csv(tmp_path / "one.csv")
+            pd.testing.assert_frame_equal(rows.drop(columns="tx").reset_index(drop=True), alone)
+        assert set(table["tx"]) == {*SEVERAL}
+
+    def test_geotiff_has_a_band_for_each_variable_and_transmitter(self, several, tmp_path):
+        save_coverage(several, tmp_path / "coverage.tif")
+        with rasterio.open(tmp_path / "coverage.tif") as image:
+            names = image.descriptions
+            common = [name for name in names if ":" not in name]
+            assert common == ["observed", "cell_state"]
+            assert len(names) == len(common) + 2 * (len(TABLE_VARIABLES) - len(common))
+            for tx in SEVERAL:
+                band = 1 + names.index(f"{tx}:gain_mean_db")
+                np.testing.assert_array_equal(np.flipud(image.read(band)), several["gain_mean_db"].sel(tx=tx))
+                assert image.tags(band)["transmitter_m"] == str([*SEVERAL[tx], 1.5])
+                assert image.units[band - 1] == "dB"
+
+    @pytest.mark.usefixtures("command_line")
+    def test_the_command_network_writes_the_page(self, monkeypatch, tmp_path):
+        use_fakes(monkeypatch)
+        save_map(map_of(PICTURE), tmp_path / "map.yaml")
+        options = [word for x, y in SEVERAL.values() for word in ("--tx", x, y)]
+        words = ["network", tmp_path / "map.yaml", *options, "--spacing", 0.5, "--out", tmp_path / "out"]
+        result = CliRunner().invoke(cli.app, [*map(str, words)])
+        assert result.exit_code == 0, result.output
+        files = ["coverage.nc", "coverage.html", "network.nc", "network.png"]
+        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in files]
+        assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(files)
+
+    def test_png_is_the_picture(self, several, tmp_path):
+        save_coverage(several, tmp_path / "coverage.png")
+        assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(several))
+
+    def test_the_ros_map_of_a_network_holds_the_outage_of_all(self, several, tmp_path):
+        network = network_map(several, n=50)
+        save_network(network, tmp_path / "outage.yaml")
+        percent = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(float)
+        expected = 100 * network["p_all_outage"].to_numpy()
+        np.testing.assert_allclose(np.where(percent == 255, np.nan, percent), expected, atol=0.5)
+        assert yaml.safe_load((tmp_path / "outage.yaml").read_text())["origin"] == [-1.0, 2.0, 0.0]
+
+    @pytest.mark.parametrize(
+        ("choose", "message"),
+        [
+            ({}, r"transmitters west, <b>east\$}\$: choose one, as by coverage\.isel\(tx=0\)"),
+            ({"tx": []}, r"coverage\.tx = \[\] is not allowed: keep at least one, each with a name of its own"),
+            ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: keep at least one, each with a"),
+        ],
+    )
+    def test_a_ros_map_needs_one_transmitter(self, several, tmp_path, choose, message):
+        with pytest.raises(SettingsError, match=message):
+            save_coverage(several.isel(choose), tmp_path / "outage.yaml")
+        assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["coverage.txt", "coverage", "coverage.nc.gz"])

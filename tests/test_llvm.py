@@ -153,6 +153,11 @@ def test_child_process_takes_the_library_of_its_parent() -> None:
     assert run_python(TRY, **{llvm.PATH_VARIABLE: path}) == f"{llvm.PATH_VARIABLE} {path}\n"
 
 
+def test_folder_named_coverage_is_not_the_library_that_numba_looks_for(tmp_path: Path) -> None:
+    (tmp_path / "coverage").mkdir()
+    assert output(run("import sionna_partial, numba", "print(numba.__name__)", folder=tmp_path)) == "numba\n"
+
+
 def test_library_without_links_to_its_runtime_works_from_a_path_with_spaces(tmp_path: Path) -> None:
     original = load_llvm().path.resolve()
     runtimes = [file for file in original.parent.glob("*-unknown-linux-gnu/*.so.*") if not file.is_symlink()]

@@ -10,7 +10,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import typer
-from rosbag_files import START_S, Messages, write_bag
+from rosbag_files import write_drive
 
 from sionna_partial.cli.app import app
 from sionna_partial.resources import scenes_folder
@@ -40,12 +40,7 @@ def anchors(page: Path) -> set[str]:
 
 def write_scans(folder: Path) -> None:
     """Write the rosbag, the point cloud and the drawing that the blocks read."""
-    make = Messages(1)
-    rows: list[tuple[str, float, object]] = [("/map", 1.0, make.grid([[100, 0, 0, 100]] * 3))]
-    for time_s in range(10):
-        rows.append(("/amcl_pose", time_s, make.pose_stamped(START_S + time_s, 5.0 + 0.2 * time_s, 8.0, 0.0)))
-        rows.append(("/rssi", time_s, make.power(-50.0)))
-    write_bag(folder / "drive.bag", rows)
+    write_drive(folder / "drive.bag")
     rng = np.random.default_rng(0)
     cloud = rng.uniform((0, 0, 0), (5, 3, 2.5), (60_000, 3))
     cloud[:30_000, 2] = np.where(rng.random(30_000) < 0.5, 0.0, 2.5)

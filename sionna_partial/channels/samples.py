@@ -114,7 +114,17 @@ class ChannelSamples(Shown):
         return self._by_draw(self.drawn.beam_gains(codebook, rx_codebook, **self._tiled(options)))
 
     def spreads(self) -> "xr.Dataset":
-        """Return delay and angular spreads as `TracedLinks.spreads` does, along a first dimension "draw"."""
+        """Return delay and angular spreads as `TracedLinks.spreads` does, along a first dimension "draw".
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+        >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+        >>> samples = sp.sample_channels(partial, (1.5, 1.5, 1.5), [(4.5, 1.5, 1.5)], n=20)
+        >>> samples.spreads().delay_spread_s.sizes["draw"]
+        20
+        """
         return self._by_draw(self.drawn.spreads())
 
     def _tiled(self, options: dict[str, Any]) -> dict[str, Any]:

@@ -64,7 +64,8 @@ def network(
         found = sp.network_map(coverage, tx_power_dbm=powers_dbm, **asdict(budget))
         with atomic_files(out) as folder:
             report(0.9, "writing")
-            sp.save_coverage(coverage, folder / "coverage.nc")
+            for name in ("coverage.nc", "coverage.html"):
+                sp.save_coverage(coverage, folder / name)
             sp.save_network(found, folder / "network.nc")
             sp.plot_network(found).savefig(folder / "network.png")
-    opt.print_files(out, ["coverage.nc", "network.nc", "network.png"])
+    opt.print_files(out, ["coverage.nc", "coverage.html", "network.nc", "network.png"])

@@ -86,6 +86,15 @@ class NextView(Shown):
         The path, from the start to the pose [m].
     frontier_m : (F, 2) float64 array
         Centres of the free cells beside unknown ones to which the robot drives [m].
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
+    >>> partial = sp.map_from_array(cells, resolution_m=0.5)
+    >>> best = sp.next_views(partial, goal="area")[0]
+    >>> best.position_m.shape, best.gain > 0.0
+    ((2,), True)
     """
 
     position_m: NDArray[np.float64]
@@ -114,6 +123,15 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_n
         On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors. Of a transmitter
         at an unknown position, times the relative probability of each of `tx_m`.
     goal : {"coverage", "state", "area"}
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
+    >>> partial = sp.map_from_array(cells, resolution_m=0.5)
+    >>> views = sp.next_views(partial, goal="area")
+    >>> [round(view.path_length_m, 1) for view in views]
+    [0.5]
     """
 
     views: tuple[NextView, ...]

@@ -102,6 +102,13 @@ def load_map(
     MapError
         If there is no such file, or it is damaged, of another kind or out of range; or if an argument for meshes is
         given and it is none.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.save_map(sp.map_from_array([[1, 1, 1], [1, 0, 2]], resolution_m=0.1), "home.yaml")
+    >>> sp.load_map("home.yaml").state.tolist()
+    [[1, 1, 1], [1, 0, 2]]
     """
     makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
     source = input_path(path, "path", MapError, f"give {ACCEPTED}. {makers}")
@@ -283,6 +290,12 @@ def map_from_habitat(
     ------
     MapError
         For arrays of other or unequal shapes, or a number out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.map_from_habitat([[0, 1, 1, 1]], [[1, 1, 1, 0]], resolution_m=0.05).state.tolist()
+    [[1, 0, 0, 2]]
     """
     value, seen = grid_array("top_down", top_down, "iu"), grid_array("fog_of_war", fog_of_war, "iub") != 0
     _require_equal_shapes("fog_of_war", seen, "top_down", value)
@@ -330,6 +343,12 @@ def map_from_slam(
     ------
     MapError
         For arrays of other or unequal shapes or with other values, or a number out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.map_from_slam([[1.0, 0.0, 0.0]], [[1.0, 1.0, 0.0]], resolution_m=0.05).state.tolist()
+    [[1, 0, 2]]
     """
     channels = {
         "obstacle": grid_array("obstacle", obstacle, "iubf", "numbers"),

@@ -64,6 +64,13 @@ class Measurements(Shown):
     ------
     MeasurementError
         For arrays of other shapes, values that are not finite, or gains that no link has.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> measured = sp.Measurements((1.0, 2.0, 1.5), [(3.0, 2.0, 1.5), (5.0, 4.0, 1.5)], [-70.2, -150.0], std_db=2.0)
+    >>> len(measured)
+    2
     """
 
     tx: NDArray[np.float64]

@@ -69,6 +69,13 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
     ------
     MeasurementError
         If it is no rosbag or damaged, or there are no such poses.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> poses = sp.poses_from_bag("drive.bag")  # a recording of yours
+    >>> poses.position_m[0].to_numpy().tolist()
+    [5.0, 8.0, 0.0]
     """
     with open_recording(path, MeasurementError) as recording:
         track = _robot_track(recording, topic, frame, stamped=False)
@@ -119,6 +126,13 @@ def measurements_from_bag(
     ------
     MeasurementError
         If it is no rosbag or damaged, there are no such powers or poses, or the gains are none.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> powers = sp.measurements_from_bag("drive.bag", "/rssi", tx=(7.0, 9.8, 1.5), tx_power_dbm=20.0)
+    >>> powers.gain_db.max().item()
+    -70.0
     """
     import xarray as xr
 

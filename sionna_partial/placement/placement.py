@@ -77,6 +77,15 @@ class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement")
     settings : PlacementSettings
     provenance : dict
         Predictor and settings of scene and trace, as plain data.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> found = sp.place_transmitter(partial)
+    >>> found.position_m.shape, found.values.shape == found.weight.shape
+    ((3,), True)
     """
 
     position_m: NDArray[np.float64]

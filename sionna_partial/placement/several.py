@@ -55,6 +55,15 @@ class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placeme
         Distance between receivers [m].
     partial : PartialMap
     settings : PlacementSettings
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> found = sp.place_transmitters(partial, count=2)
+    >>> found.positions_m.shape, 0.0 <= found.score <= 1.0
+    ((2, 3), True)
     """
 
     positions_m: NDArray[np.float64]

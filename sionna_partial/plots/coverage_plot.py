@@ -18,14 +18,20 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.coverage import WALL_PARTS, probability_above, require_coverage, transmitter_text
+from sionna_partial.coverage import (
+    WALL_PARTS,
+    probability_above,
+    require_coverage,
+    transmitter_text,
+    transmitters_of,
+)
 from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade, sheet_columns
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""
 
-_NARROW_IN, _WIDE_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 170, 3000
+_NARROW_IN, _WIDE_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 0.35, 170, 3000
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
@@ -89,6 +95,7 @@ def plot_coverage(
 ) -> Figure:
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
+    Several transmitters have a row each, with the same colour scales.
     Walls are black, the unobserved area is hatched, the transmitter is a star; a line encloses 90 % of where it may be,
     if that is not known. On a complete map the outside is left blank.
 
@@ -121,20 +128,40 @@ def plot_coverage(
     >>> figure.savefig("coverage.png")
     >>> states = sp.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
     """
-    coverage = require_coverage(coverage)
+    maps = transmitters_of(coverage)
     chosen = _choose(layers, threshold_db)
+    figure = _plot_rows(maps, chosen) if len(maps) > 1 else _plot_sheet(next(iter(maps.values())), chosen)
+    figure.suptitle(headline("Coverage", maps))
+    _add_legend(figure, [*maps.values()], chosen)
+    return figure
+
+
+def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
+    """Draw a panel for each layer."""
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
-    columns = sheet_columns(len(chosen), aspect)
-    figure, axes = _panels(math.ceil(len(chosen) / columns), columns, aspect, keys_in=0.95 * columns)
+    columns = sheet_columns(len(layers), aspect)
+    figure, axes = _panels(math.ceil(len(layers) / columns), columns, aspect, keys_in=0.95 * columns)
     panels = list(itertools.chain(*axes))
-    for axis in panels[len(chosen) :]:
+    for axis in panels[len(layers) :]:
         axis.set_axis_off()
-    for axis, layer in zip(panels, chosen, strict=False):
+    for axis, layer in zip(panels, layers, strict=False):
         _draw(axis, coverage, layer)
         axis.set_title(layer.title)
         _add_key([axis], layer)
-    figure.suptitle(headline("Coverage", coverage))
-    _add_legend(figure, [coverage], chosen)
+    return figure
+
+
+def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figure:
+    """Draw a row for each transmitter, a column for each layer, and under it the colour bar."""
+    sizes = next(iter(maps.values())).sizes
+    figure, axes = _panels(len(maps), len(layers), sizes["x"] / sizes["y"], keys_in=0.3)
+    for row, (name, coverage) in zip(axes, maps.items(), strict=True):
+        for axis, layer in zip(row, layers, strict=True):
+            _draw(axis, coverage, layer)
+        row[0].set_ylabel(f"{name}\n\ny [m]", parse_math=False)
+    for column, layer in zip(zip(*axes, strict=True), layers, strict=True):
+        column[0].set_title(layer.title)
+        _add_key(column, layer, _KEY_PAD_IN / figure.get_figheight())
     return figure
 
 
@@ -157,7 +184,7 @@ def plot_comparison(
         _add_key(row, layer)
     for axis, (title, coverage) in zip(axes[0], coverages.items(), strict=True):
         axis.set_title(_heading(title, coverage))
-    figure.suptitle(headline("Coverage by what is observed of the map", first))
+    figure.suptitle(headline("Coverage by what is observed of the map", {"": first}))
     _add_legend(figure, [first, *others], chosen)
     return figure
 
@@ -172,9 +199,9 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
     return [known[name] for name in layers]
 
 
-def headline(what: str, coverage: xr.Dataset) -> str:
-    """Title that names the transmitter's position and the frequency."""
-    return f"{what}: {transmitter_text(coverage)}, {coverage.attrs['frequency_hz'] / 1e9:g} GHz"
+def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
+    """Title that names the transmitter's position, or how many there are, and the frequency."""
+    return f"{what}: {transmitter_text(maps)}, {next(iter(maps.values())).attrs['frequency_hz'] / 1e9:g} GHz"
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:
@@ -196,13 +223,18 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
     return figure, axes.tolist()
 
 
-def _add_key(axes: Sequence[Axes], layer: Layer) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states."""
+def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states.
+
+    They are to the right of the panels, or that fraction of the figure below them.
+    """
     if layer.label:
-        bar = axes[0].figure.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axes, extend=_beyond(layer))
+        colours = ScalarMappable(layer.norm, layer.cmap)
+        side, pad = ("bottom", pad_below) if pad_below else ("right", 0.05)
+        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=_beyond(layer))
         bar.set_label(layer.label)
     elif layer.norm is None:
-        _draw_triangle(axes[-1].inset_axes((1.02, 0.3, 0.36, 0.4)))
+        _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
 
 
 def _beyond(layer: Layer) -> str:

@@ -1,17 +1,17 @@
-"""A coverage map as one HTML page: its layers, the values under the pointer, and P(gain > threshold) by a slider."""
+"""A coverage map as one HTML page: its transmitters and layers, the values under the pointer, P(gain > threshold)."""
 
 import html
 import json
 import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib import colormaps
-from matplotlib.colors import to_hex
+from matplotlib.colors import ListedColormap, Normalize, to_hex
 
-from sionna_partial.constants import LinkState
-from sionna_partial.coverage import COMPONENTS, DISTRIBUTION
+from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, transmitters_of
 from sionna_partial.plots.coverage_plot import (
     Layer,
     coverage_layers,
@@ -22,13 +22,15 @@ from sionna_partial.plots.coverage_plot import (
     unobserved_area,
     wall_cells,
 )
+from sionna_partial.plots.style import server_colours
 
 THRESHOLD_DB = -100.0
 """Threshold of P(gain > threshold) before the slider is moved [dB]."""
 
-_WIDTH, _HEIGHT, _SHORTEST, _COLOURS = 760, 1000, 60, 256
-_LAYERS = ("link_state", "p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db", "p_above")
-_STATES = {LinkState.OUTAGE: "outage", LinkState.LOS: "LOS", LinkState.NLOS: "NLOS"}
+_WIDTH, _HEIGHT, _SHORTEST, _COLOURS, _STEPS = 760, 1000, 60, 256, 1024
+_LAYERS = ("link_state", "p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db", "p_above", "best_server")
+_STATES = ["outage", "LOS", "NLOS"]
+_STRONGEST = "best server"
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
     ("likeliest state", "@link_state{custom}"),
@@ -38,11 +40,16 @@ _TOOLTIPS = (
     ("unobserved distance", "@unobserved_distance_m{0.00} m"),
 )
 
+_SEVERAL = "The best server of a receiver is the transmitter with the largest mean path gain."
+
 _SHOW = """
 for (const [name, parts] of Object.entries(layers)) for (const part of parts) part.visible = name == choice.value
-const option = choice.options.find(([name, _]) => name == choice.value)
-title.text = option[1].replace("threshold", `${slider.value} dB`)
+const label = select => select.options.find(([name, _]) => name == select.value)[1]
+title.text = label(choice).replace("threshold", `${slider.value} dB`)
+if (server && choice.value != "best_server") title.text += `: ${label(server)}`
 """
+
+_SERVE = "shown.indices = [Number(server.value)]"
 
 _THRESHOLD = """
 const above = (mean, std) => {
@@ -52,11 +59,13 @@ const above = (mean, std) => {
     const tail = 0.5 * sum * Math.exp(-z * z)
     return z > 0 ? 1 - tail : tail
 }
-const [p_los, p_nlos, los, los_std, nlos, nlos_std, out] =
-    ["p_los", "p_nlos", "gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db", "p_above"]
-    .map(name => source.data[name][0])
-for (let i = 0; i < out.length; i++)
-    out[i] = p_los[i] * above(los[i], los_std[i]) + p_nlos[i] * above(nlos[i], nlos_std[i])
+for (const tx of source.data.p_above.keys()) {
+    const [p_los, p_nlos, los, los_std, nlos, nlos_std, out] =
+        ["p_los", "p_nlos", "gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db", "p_above"]
+        .map(name => source.data[name][tx])
+    for (let i = 0; i < out.length; i++)
+        out[i] = p_los[i] * above(los[i], los_std[i]) + p_nlos[i] * above(nlos[i], nlos_std[i])
+}
 source.change.emit()
 """
 """The error function is that of Abramowitz and Stegun, 7.1.26, with an error below 1.5e-7."""
@@ -75,8 +84,8 @@ _PAGE = """<!doctype html>
 <h1>{headline}</h1>
 <div id="viewer"></div>
 <p>Star: transmitter; a line encloses 90 % of where an unknown one may be. Black: walls. Hatched: not observed. Grey: no
-receiver can stand there. In mean and standard deviation of the path gain, an outage counts &minus;150 dB. Predictor:
-{predictor}.</p>
+receiver can stand there. In mean and standard deviation of the path gain, an outage counts &minus;150 dB. {several}
+Predictor: {predictor}.</p>
 <script>Bokeh.embed.embed_item({item}, "viewer")</script>
 </body>
 </html>
@@ -88,39 +97,53 @@ def coverage_page(coverage: xr.Dataset) -> bytes:
     from bokeh.embed import json_item
     from bokeh.resources import Resources
 
-    item = json.dumps(json_item(_viewer(coverage))).replace("</", "<\\/")
+    maps = transmitters_of(coverage)
+    item = json.dumps(json_item(_viewer(maps))).replace("<", "\\u003c")
     numbers: dict[str, str] = {}
-    item = re.sub(r'"p\d+"', lambda name: numbers.setdefault(name[0], f'"p{len(numbers)}"'), item)
+    item = re.sub(r'(?<=id": )"p\d+"', lambda name: numbers.setdefault(name[0], f'"p{len(numbers)}"'), item)
     scripts = Resources(mode="inline", components=["bokeh", "bokeh-widgets"]).js_raw
     page = _PAGE.format(
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
-        headline=html.escape(headline("Coverage", coverage)),
+        headline=html.escape(headline("Coverage", maps)),
+        several=_SEVERAL * (len(maps) > 1),
         predictor=html.escape(str(coverage.attrs.get("predictor", "unknown"))),
         item=item,
     )
     return page.encode()
 
 
-def _viewer(coverage: xr.Dataset) -> Any:
+def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
     from bokeh.layouts import column, row
-    from bokeh.models import CustomJS
+    from bokeh.models import CDSView, CustomJS, IndexFilter
     from bokeh.models.widgets.inputs import Select
     from bokeh.models.widgets.sliders import Slider
 
     layers = {name: layer for name, layer in coverage_layers(THRESHOLD_DB).items() if name in _LAYERS}
-    plot = _empty_plot(coverage)
-    source = _source(coverage, layers)
-    parts = {name: _add_layer(plot, source, coverage, name, layer) for name, layer in layers.items()}
-    _add_hover(plot, [images[0] for images in parts.values()])
-    _add_map(plot, coverage)
-    titles = {name: layers[name].title for name in _LAYERS} | {"p_above": "P(path gain > threshold)"}
-    options: list[str | tuple[Any, str]] = [*titles.items()]
-    choice = Select(title="Layer", value=_LAYERS[0], options=options, name="layer")
+    words, one = {"link_state": _STATES}, next(iter(maps.values()))
+    if len(maps) > 1:
+        layers["best_server"] = _best_server(maps)
+        words["best_server"] = [*maps]
+    source, shown, plot = _source(maps, layers), IndexFilter(indices=[0]), _empty_plot(one)
+    place = {"source": source, "view": CDSView(filter=shown)} | _rectangle(one)
+    parts = {name: _add_layer(plot, place, name, layer, words.get(name, ())) for name, layer in layers.items()}
+    _add_hover(plot, [images[0] for images in parts.values()], words)
+    _add_map(plot, maps)
+    titles = {name: layers[name].title for name in _LAYERS if name in layers}
+    titles["p_above"] = "P(path gain > threshold)"
+    choice = Select(title="Layer", value=_LAYERS[0], options=list[Any](titles.items()), name="layer")
     slider = Slider(title="Threshold [dB]", start=-150, end=-40, step=1, value=THRESHOLD_DB, name="threshold")
-    show = CustomJS(args={"layers": parts, "choice": choice, "slider": slider, "title": plot.title}, code=_SHOW)
+    servers: list[Any] = [(str(at), name) for at, name in enumerate([*maps, _STRONGEST])]
+    server = Select(title="Transmitter", value="0", options=servers, name="transmitter") if len(maps) > 1 else None
+    show = CustomJS(
+        args={"layers": parts, "choice": choice, "slider": slider, "server": server, "title": plot.title}, code=_SHOW
+    )
     choice.js_on_change("value", show)
     slider.js_on_change("value", CustomJS(args={"source": source, "slider": slider}, code=_THRESHOLD), show)
-    return column(row(choice, slider), plot)
+    if server is None:
+        return column(row(choice, slider), plot)
+    plot.title.text += f": {servers[0][1]}"
+    server.js_on_change("value", CustomJS(args={"shown": shown, "server": server}, code=_SERVE), show)
+    return column(row(server, choice, slider), plot)
 
 
 def _empty_plot(coverage: xr.Dataset) -> Any:
@@ -148,55 +171,78 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
     return plot
 
 
-def _source(coverage: xr.Dataset, layers: dict[str, Layer]) -> Any:
-    """Values (ny, nx) in one row; NaN where no receiver can stand, and outside a complete map."""
+def _best_server(maps: Mapping[str, xr.Dataset]) -> Layer:
+    """Show the number of the transmitter with the largest mean path gain."""
+    gain_db = np.stack([each["gain_mean_db"].to_numpy() for each in maps.values()])
+    best = np.nan_to_num(gain_db, nan=-np.inf).argmax(axis=0)
+    return Layer("Best server", lambda _: best, Normalize(0, len(maps) - 1), ListedColormap(server_colours(len(maps))))
+
+
+def _source(maps: Mapping[str, xr.Dataset], layers: Mapping[str, Layer]) -> Any:
+    """Values (ny, nx) in a row for each transmitter, and in one for the best server.
+
+    They are NaN where no receiver can stand, and outside a complete map; rounding them halves the page.
+    """
     from bokeh.models import ColumnDataSource
 
-    values = {name: layer.picture(coverage) for name, layer in layers.items()}
-    others = {*DISTRIBUTION, *COMPONENTS, "unobserved_distance_m"} - values.keys()
-    values |= {name: coverage[name].to_numpy() for name in sorted(others)}
-    valid = coverage["valid"].to_numpy() & ~outside(coverage)
-    columns = {name: [np.where(valid, each, np.nan).astype(np.float32)] for name, each in values.items()}
+    columns: dict[str, Any] = {name: [] for name in layers}
+    for coverage in maps.values():
+        values = {name: layer.picture(coverage) for name, layer in layers.items()}
+        others = {*DISTRIBUTION, *COMPONENTS, "unobserved_distance_m"} - values.keys()
+        values |= {name: coverage[name].to_numpy() for name in sorted(others)}
+        valid = coverage["valid"].to_numpy() & ~outside(coverage)
+        for name, each in values.items():
+            rounded = np.round(np.where(valid, each, np.nan) * _STEPS) / _STEPS
+            columns.setdefault(name, []).append(rounded.astype(np.float32))
+    if "best_server" in layers:
+        best = layers["best_server"].picture(coverage)[None]
+        for rows in columns.values():
+            rows.append(np.take_along_axis(np.stack(rows), best, axis=0)[0])
     return ColumnDataSource(columns, name="values")
 
 
-def _add_layer(plot: Any, source: Any, coverage: xr.Dataset, name: str, layer: Layer) -> list[Any]:
-    """Draw a layer with its colour bar, and return both; the first layer alone is visible."""
+def _rectangle(coverage: xr.Dataset) -> dict[str, float]:
+    x0, x1, y0, y1 = extent_m(coverage)
+    return {"x": x0, "y": y0, "dw": x1 - x0, "dh": y1 - y0}
+
+
+def _add_layer(plot: Any, place: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str]) -> list[Any]:
+    """Draw a layer, of numbers or of words, with its colour bar, and return both; the first layer alone is visible."""
     from bokeh.models import FixedTicker, LinearColorMapper
     from bokeh.models.annotations.legends import ColorBar
 
     assert layer.norm
     assert layer.cmap
-    listed = name == "link_state"
-    cmap, half = colormaps.get_cmap(layer.cmap), 0.5 * listed
-    palette = [to_hex(colour) for colour in cmap(np.linspace(0.0, 1.0, len(_STATES) if listed else _COLOURS))]
+    cmap, half = colormaps.get_cmap(layer.cmap), 0.5 * bool(words)
+    palette = [to_hex(colour) for colour in cmap(np.linspace(0.0, 1.0, len(words) or _COLOURS))]
     low, high = float(layer.norm.vmin or 0.0) - half, float(layer.norm.vmax or 0.0) + half
     colours = LinearColorMapper(palette=palette, low=low, high=high, nan_color="#00000000")
-    x0, x1, y0, y1 = extent_m(coverage)
     visible = name == _LAYERS[0]
-    place = {"x": x0, "y": y0, "dw": x1 - x0, "dh": y1 - y0}
-    image = plot.image(image=name, source=source, color_mapper=colours, visible=visible, **place)
+    image = plot.image(image=name, color_mapper=colours, visible=visible, **place)
     bar = ColorBar(color_mapper=colours, title=layer.label, visible=visible)
-    if listed:
-        bar.ticker = FixedTicker(ticks=[int(state) for state in _STATES])
-        bar.major_label_overrides = {int(state): text for state, text in _STATES.items()}
+    if words:
+        bar.ticker = FixedTicker(ticks=[*range(len(words))])
+        bar.major_label_overrides = dict(enumerate(words))
     plot.add_layout(bar, "right")
     return [image, bar]
 
 
-def _add_hover(plot: Any, images: list[Any]) -> None:
+def _add_hover(plot: Any, images: list[Any], words: Mapping[str, Sequence[str]]) -> None:
     from bokeh.models import CustomJSHover, HoverTool
 
-    words = [text for _, text in sorted(_STATES.items())]
-    state = CustomJSHover(code=f"return {json.dumps(words)}[value] ?? 'no receiver'")
-    plot.add_tools(HoverTool(renderers=images, tooltips=list(_TOOLTIPS), formatters={"@link_state": state}))
+    formatters: dict[str, Any] = {
+        f"@{name}": CustomJSHover(code=f"return {json.dumps(each)}[value] ?? 'no receiver'")
+        for name, each in words.items()
+    }
+    best = [("best server", "@best_server{custom}")] if "best_server" in words else []
+    plot.add_tools(HoverTool(renderers=images, tooltips=[*_TOOLTIPS, *best], formatters=formatters))
 
 
-def _add_map(plot: Any, coverage: xr.Dataset) -> None:
-    """Draw the unobserved area hatched, the walls black, and the transmitter."""
+def _add_map(plot: Any, maps: Mapping[str, xr.Dataset]) -> None:
+    """Draw the unobserved area hatched, the walls black, and the transmitters; several with their names."""
     from bokeh.models import LinearColorMapper
 
-    x0, x1, y0, y1 = extent_m(coverage)
+    coverage = next(iter(maps.values()))
     x, y, unknown = unobserved_area(coverage)
     if unknown.any():
         plot.contour(
@@ -213,9 +259,20 @@ def _add_map(plot: Any, coverage: xr.Dataset) -> None:
         )
     wall = wall_cells(coverage).astype(np.uint8)
     black = LinearColorMapper(palette=["#00000000", "#000000"], low=0, high=1)
-    plot.image(image=[wall], x=x0, y=y0, dw=x1 - x0, dh=y1 - y0, color_mapper=black)
+    plot.image(image=[wall], color_mapper=black, **_rectangle(coverage))
     for x, y, inside in likely_area(coverage):
         plot.contour(x, y, inside, levels=[0.5], line_color="white", line_width=3)
         plot.contour(x, y, inside, levels=[0.5], line_color="black", line_width=1.5)
-    x_tx, y_tx, _ = coverage.attrs["transmitter_m"]
-    plot.scatter([x_tx], [y_tx], marker="star", size=18, fill_color="white", line_color="black")
+    x_tx, y_tx, _ = np.transpose([each.attrs["transmitter_m"] for each in maps.values()])
+    plot.scatter(x_tx, y_tx, marker="star", size=18, fill_color="white", line_color="black")
+    if len(maps) > 1:
+        plot.text(
+            x_tx,
+            y_tx,
+            text=[*maps],
+            x_offset=11,
+            text_baseline="middle",
+            text_font_size="12px",
+            background_fill_color="white",
+            background_fill_alpha=0.7,
+        )

@@ -41,6 +41,16 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     ------
     SettingsError
         For something else than a MaterialCalibration.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
+    >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
+    >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
+    >>> found = sp.calibrate_materials(room, measured)
+    >>> sp.plot_calibration(found).savefig("calibration.png")
     """
     require_type("calibration", calibration, MaterialCalibration, "give what calibrate_materials returned.")
     count = len(calibration.materials)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import xarray as xr
-from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
@@ -12,10 +11,9 @@ from numpy.typing import NDArray
 from sionna_partial.coverage import TX_COORDINATES
 from sionna_partial.network import require_network
 from sionna_partial.plots.coverage_plot import extent_m, wall_cells
-from sionna_partial.plots.style import STAR, Figure, legend_below, shade
+from sionna_partial.plots.style import STAR, Figure, legend_below, server_colours, shade
 
 _WIDTH_IN, _DPI = 10.0, 130
-_SERVERS = "tab20"
 
 
 def plot_network(network: xr.Dataset) -> Figure:
@@ -49,18 +47,18 @@ def plot_network(network: xr.Dataset) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, 2 * height + 1.6), dpi=_DPI, layout="constrained")
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     names = [str(name) for name in network["tx"].to_numpy()]
-    servers = ListedColormap([colormaps[_SERVERS](number % colormaps[_SERVERS].N) for number in range(len(names))])
+    servers = ListedColormap(server_colours(len(names)))
     best, norm = network["best_server"].to_numpy(), Normalize(-0.5, len(names) - 0.5)
     _draw(axes[0, 0], network, np.where(best >= 0, best, np.nan), servers, norm)
-    axes[0, 0].set_title("likeliest best server")
+    axes[0, 0].set_title("Likeliest best server")
     bar = figure.colorbar(ScalarMappable(norm, servers), ax=axes[0, 0], ticks=range(len(names)))
-    bar.ax.set_yticklabels(names)
+    bar.ax.set_yticklabels(names, parse_math=False)
     threshold_db = float(network.attrs["sinr_threshold_db"])
     top_bit_s = float(np.nanmax(network["rate_bit_s"])) / 1e6 if np.isfinite(network["rate_bit_s"]).any() else 1.0
     layers = (
-        (axes[0, 1], "sinr_mean_db", 1.0, Normalize(-20.0, 40.0), "mean SINR [dB]"),
+        (axes[0, 1], "sinr_mean_db", 1.0, Normalize(-20.0, 40.0), "Mean SINR [dB]"),
         (axes[1, 0], "p_sinr_above", 1.0, Normalize(0.0, 1.0), f"P(SINR > {threshold_db:g} dB)"),
-        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), "mean Shannon rate [Mbit/s]"),
+        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), "Mean Shannon rate [Mbit/s]"),
     )
     for axis, name, scale, norm, title in layers:
         _draw(axis, network, scale * network[name].to_numpy(), "viridis", norm)

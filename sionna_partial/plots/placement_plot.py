@@ -42,6 +42,14 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     ------
     SettingsError
         For something else than a TransmitterPlacement.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> figure = sp.plot_placement(sp.place_transmitter(partial))
+    >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, TransmitterPlacement, "give what place_transmitter returned.")
     x0, x1, y0, y1 = _window_m(placement)
@@ -86,6 +94,14 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     ------
     SettingsError
         For something else than a NetworkPlacement.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> figure = sp.plot_network_placement(sp.place_transmitters(partial, count=2))
+    >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, NetworkPlacement, "give what place_transmitters returned.")
     ny, nx = placement.partial.shape

@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib.figure
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ _SHEET_ASPECT = 1.5
 
 WALL, UNKNOWN = "black", "0.86"
 """Colours of cells on maps; free ones are white."""
+
+_SERVERS = "tab20"
 
 _POINTS = 72
 """Pixels of a notebook for each inch of a figure."""
@@ -78,6 +81,12 @@ def sheet_columns(count: int, aspect: float) -> int:
         return abs(math.log(columns * aspect / rows / _SHEET_ASPECT)) + 4 * (rows * columns - count) / count
 
     return min(range(1, count + 1), key=fault)
+
+
+def server_colours(count: int) -> list[tuple[float, ...]]:
+    """Colours of so many transmitters, which repeat beyond 20."""
+    cmap = colormaps[_SERVERS]
+    return [cmap(number % cmap.N) for number in range(count)]
 
 
 def legend_below(figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None) -> None:

@@ -153,6 +153,16 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
         If `links` are no TracedLinks, or `windows` is no bool.
     PredictorError
         For links that were not traced (``invalid="nan"``).
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> links = sp.trace_links(partial, (1.5, 1.5, 1.5), [(4.5, 1.5, 1.5)])
+    >>> phi = sp.link_features(partial, links)
+    >>> phi.distance_m.tolist(), phi.unobserved_distance_m.round(3).tolist()
+    ([3.0], [0.5])
     """
     require_map("partial", partial)
     require_type("links", links, TracedLinks, "give what trace_links returned.")

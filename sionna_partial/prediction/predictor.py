@@ -59,6 +59,16 @@ class LinkPrediction(Shown):
         Mean and standard deviation of the whole distribution, an outage counting -150 dB [dB].
     gain_los_mean_db, gain_los_std_db, gain_nlos_mean_db, gain_nlos_std_db : arrays
         The same given line of sight, and given paths without it [dB].
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> links = sp.trace_links(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5)])
+    >>> prediction = sp.Predictor.load().predict(sp.link_features(partial, links))
+    >>> prediction.p_los.tolist()
+    [1.0]
     """
 
     p_los: Floats

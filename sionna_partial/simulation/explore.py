@@ -53,6 +53,13 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
         towards y [degree].
     believed_poses : (N, 3) array
         Where it believed to be. It differs from `poses` only with drift.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> found = sp.explore_trajectory(sp.make_home(3), steps=(20, 60))
+    >>> len(found.maps), found.poses.shape
+    (2, (61, 3))
     """
 
     home: PartialMap
@@ -182,6 +189,13 @@ def explore_trajectory(
     ------
     MapError, SettingsError, PositionError
         As `explore` does.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> found = sp.explore_trajectory(sp.make_home(3), steps=(20, 60))
+    >>> found.maps[-1].observed_fraction > found.maps[0].observed_fraction
+    True
     """
     remedy = (
         f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200), or increasing fractions "

@@ -243,6 +243,15 @@ class TracedLinks(ChannelPaths, Shown):
         With `diffraction` True or False.
     scene_settings : SceneSettings
         With the map's material, if it has one.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> links = sp.trace_links(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5), (3.5, 1.5, 1.5)])
+    >>> links.link_state.tolist(), links.path_rx.max().item()
+    ([1, 1], 1)
     """
 
     tx: NDArray[np.float64]

@@ -390,6 +390,15 @@ class GainGradients(Shown):
         name, which it does for all but `vacuum`.
     settings : TraceSettings
     scene_settings : SceneSettings
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> found = sp.gain_gradients(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5)])
+    >>> found.tx_db_per_m.shape, found.frequency_db_per_hz.shape
+    ((1, 3), (1,))
     """
 
     tx: NDArray[np.float64]
