@@ -26,12 +26,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.coverage import clear_of_walls
 from sionna_partial.evaluation.baselines import Baselines, nothing_seen
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import likely_region, locate_transmitter
 from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.tracing.trace import clear_of_walls
 
 Predict = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[sp.LinkPrediction, NDArray[np.float64]]]
 Links = tuple[sp.LinkPrediction, NDArray[np.uint8], NDArray[np.float64]]

@@ -1,6 +1,5 @@
 """Coverage: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
 
-import itertools
 import json
 import logging
 import math
@@ -8,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -20,50 +18,41 @@ from scipy.spatial import cKDTree
 from sionna_partial.checks import (
     Progress,
     no_progress,
-    number_of,
     real_array,
     require,
     require_choice,
     require_number,
     settings_or_default,
-    shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, CellState, LinkState
-from sionna_partial.display import later, picture_html
-from sionna_partial.errors import MeasurementError, MemoryLimitError, PositionError, SettingsError
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState
+from sionna_partial.coverage_map import (
+    COMPONENTS,
+    DISTRIBUTION,
+    Receivers,
+    coverage_map,
+    join_transmitters,
+    with_posterior,
+)
+from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
-from sionna_partial.measurements.measurements import Measurements, measurements_of
+from sionna_partial.measurements.measurements import Measurements, measurements_of_each
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
 from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.finder import part_of
-from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, nearest_m
+from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, clear_of_walls, nearest_m
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
 
-WALL_PARTS = 6
-"""`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
-
-DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
-COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
-
 RECEIVERS = ("indoor", "anywhere")
 """Whose probabilities and gains they are; the first is the default."""
-
-TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
-"""Positions [m] along the dimension "tx" of the maps of several transmitters."""
-
-_OF_ALL = ("observed", "cell_state", "wall_parts")
-"""Variables that do not depend on the transmitter."""
-
-_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _LIBRARIES_GB, _CELL_BYTES, _RECEIVER_BYTES, _WORK_BYTES = 1.0, 40, 400, 120_000
 """Memory of the process with all libraries [GB], of each cell of the map, of each receiver, and of each of those that
@@ -72,14 +61,8 @@ are predicted together [bytes]; `benchmarks/scale.py` measures it."""
 _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 """Number of receivers that are predicted together."""
 
-SAME_TX_M = 0.5
-"""Distance within which measured links are of the same transmitter [m]."""
-
 LARGE_OFFSET_DB = 15.0
 """Offset of measurements from which on they are no path gains, but powers [dB]."""
-
-MOST_MEASUREMENTS = 20_000
-"""Number of measurements that are held against predictions."""
 
 POSITIONS = 8
 """Number of positions of an unknown transmitter over which coverage is averaged."""
@@ -87,59 +70,10 @@ POSITIONS = 8
 _LOCATING = 0.3
 """Fraction of the progress that finding a transmitter takes."""
 
-_PLOT = "plots.coverage_plot:plot_coverage"
-
 _LEAST_DEPTH = 2
 """Interactions from which on a trace is like those of the training."""
 
 _log = logging.getLogger(__name__)
-
-
-def _flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
-    return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
-
-
-_LINK_FLAGS = _flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
-_CELL_FLAGS = _flags({state.name.lower(): state for state in CellState})
-_YES_NO = _flags({"no": 0, "yes": 1}, np.int8)
-
-ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
-    "p_los": {"long_name": "probability of line of sight", "units": "1"},
-    "p_nlos": {"long_name": "probability of paths without line of sight", "units": "1"},
-    "p_outage": {"long_name": "probability of outage", "units": "1"},
-    "link_state": {"long_name": "likeliest link state", **_LINK_FLAGS},
-    "gain_mean_db": {"long_name": "mean omnidirectional path gain, an outage counting -150 dB", "units": "dB"},
-    "gain_std_db": {"long_name": "standard deviation of the omnidirectional path gain", "units": "dB"},
-    "gain_los_mean_db": {"long_name": "mean path gain given line of sight", "units": "dB"},
-    "gain_los_std_db": {"long_name": "standard deviation of the path gain given line of sight", "units": "dB"},
-    "gain_nlos_mean_db": {"long_name": "mean path gain given no line of sight", "units": "dB"},
-    "gain_nlos_std_db": {"long_name": "standard deviation of the path gain given no line of sight", "units": "dB"},
-    "p_indoor": {"long_name": "probability that the receiver is indoors", "units": "1"},
-    "partial_link_state": {"long_name": "link state traced on the known part of the map", **_LINK_FLAGS},
-    "partial_gain_db": {"long_name": "path gain traced on the known part of the map", "units": "dB"},
-    "unobserved_distance_m": {"long_name": "length of the direct line in unknown cells", "units": "m"},
-    "distance_m": {"long_name": "distance from the transmitter", "units": "m"},
-    "observed": {"long_name": "whether this cell was observed", **_YES_NO},
-    "valid": {"long_name": "whether a receiver can stand here", **_YES_NO},
-    "cell_state": {"long_name": "state of the map at the receiver", **_CELL_FLAGS},
-    "wall_parts": {
-        "long_name": "walls within the cell",
-        "comment": f"Bit {WALL_PARTS} * row + column is set where that one of {WALL_PARTS} x {WALL_PARTS} parts of "
-        "the cell holds a wall; row 0 has the smallest y, column 0 the smallest x.",
-    },
-}
-"""The variables of a coverage map on (y, x), and their CF attributes."""
-
-
-@dataclass(frozen=True)
-class _Receivers:
-    """Receivers at the centres of a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
-
-    x_m: Floats
-    y_m: Floats
-    cell_state: NDArray[np.uint8]
-    valid: Bools
-    rx_m: Floats
 
 
 def predict_map(
@@ -255,7 +189,7 @@ def predict_map(
         model = None if complete else loaded
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    measured = _measured_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
+    measured = measurements_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
     provenance = _provenance(partial, model, scene_settings, trace_settings)
     maps = []
     with reporting(progress) as report, temporary_folder() as work:
@@ -271,10 +205,6 @@ def predict_map(
                 _columns(*block, anywhere=receivers == "anywhere")
                 for block in _predictions(links, source, grid.rx_m, part)
             ]
-            variables = _variables(
-                grid, {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
-            )
-            variables["wall_parts"] = _wall_parts(partial, grid, spacing_m)
             attributes = {
                 **provenance,
                 "transmitter_m": source.position_m,
@@ -284,127 +214,11 @@ def predict_map(
             }
             if known is not None:
                 attributes |= _of_measurements(known, source)
-            coverage = _label(grid, variables, attributes)
-            maps.append(coverage if posterior is None else _with_posterior(coverage, posterior))
+            values = {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
+            coverage = coverage_map(partial, grid, values, attributes)
+            maps.append(coverage if posterior is None else with_posterior(coverage, posterior))
         report(1.0, "done")
-    return maps[0] if names is None else _together(maps, names)
-
-
-def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
-    """Return the coverage of one transmitter, `transmitter_m` in its attributes; a SettingsError for anything else."""
-    remedy = "give the xarray.Dataset that predict_map returned, or load it from its .nc file."
-    kind = type(coverage).__name__
-    if not isinstance(coverage, xr.Dataset):
-        raise SettingsError(f"coverage is of type {kind}: {remedy}")
-    if "tx" in coverage.dims:
-        names = ", ".join(map(str, coverage["tx"].to_numpy()))
-        raise SettingsError(f"coverage has the transmitters {names}: choose one, as by coverage.isel(tx=0).")
-    if {"tx", *TX_COORDINATES} <= coverage.coords.keys():
-        position_m = np.array([float(coverage[name]) for name in TX_COORDINATES])
-        coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
-    missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
-    missing += [name for name in ("x", "y") if name not in coverage.coords]
-    missing += [name for name in ("transmitter_m", "spacing_m", "frequency_hz") if name not in coverage.attrs]
-    if missing or not coverage["valid"].size:
-        raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
-    return coverage
-
-
-def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the coverage of each transmitter by name, as `require_coverage` does; "" names a single one."""
-    if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
-        return {"": require_coverage(coverage)}
-    names = [str(name) for name in coverage["tx"].to_numpy()]
-    require(0 < len(names) == len({*names}), "coverage.tx", names, "keep at least one, each with a name of its own.")
-    return {name: require_coverage(coverage.isel(tx=at)) for at, name in enumerate(names)}
-
-
-def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
-    """Return P(path gain > threshold) (..., ny, nx), NaN where no receiver can stand; threshold in [-150, 0] dB."""
-    require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
-    columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
-    return LinkPrediction(**columns).probability_above(threshold_db)
-
-
-@xr.register_dataset_accessor("radio")
-class CoverageAccessor:
-    """What can be asked of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
-
-    Every method raises a SettingsError for a Dataset that is no coverage map.
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
-    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
-    >>> float(coverage.radio.at(2.4, 2.4).p_los)
-    1.0
-    >>> float(coverage.radio.probability_above(-60.0).sel(x=2.25, y=2.25))
-    0.0
-    """
-
-    def __init__(self, coverage: xr.Dataset) -> None:
-        self._coverage = coverage
-
-    def plot(self) -> Any:
-        """Return the figure of `plot_coverage`."""
-        return later(_PLOT)(self._coverage)
-
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the map as `save_coverage` does."""
-        later("export:save_coverage")(self._coverage, path)
-
-    def probability_above(self, threshold_db: float) -> xr.DataArray:
-        """Return the probability (ny, nx), or (tx, ny, nx), that the path gain exceeds a threshold t [dB].
-
-        P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), where m
-        and s are `gain_los_mean_db`, `gain_los_std_db` and so on, and Phi is the normal distribution function: an
-        outage has a gain of -150 dB. It is NaN where no receiver can stand.
-
-        Raises
-        ------
-        SettingsError
-            For a threshold that is no number of dB.
-        """
-        transmitters_of(self._coverage)
-        above = probability_above(self._coverage, threshold_db)
-        attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
-        values = self._coverage["p_los"].copy(data=above.astype(np.float32))
-        return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
-
-    def at(self, x: float, y: float) -> xr.Dataset:
-        """Return all variables at the receiver nearest to world x and y [m].
-
-        Raises
-        ------
-        PositionError
-            If that is not on the map.
-        """
-        transmitters_of(self._coverage)
-        half_m = float(self._coverage.attrs["spacing_m"]) / 2.0
-        for name, value in (("x", x), ("y", y)):
-            low_m, high_m = (float(self._coverage[name][end]) for end in (0, -1))
-            if not low_m - half_m <= number_of(value) <= high_m + half_m:
-                span = f"{low_m - half_m:g} to {high_m + half_m:g} m"
-                raise PositionError(f"{name} = {shown(value)} is not on the map: give a number of metres in {span}.")
-        return self._coverage.sel(x=x, y=y, method="nearest")
-
-    def __repr__(self) -> str:
-        maps = transmitters_of(self._coverage)
-        sizes, attributes = self._coverage.sizes, self._coverage.attrs
-        grid = f"{sizes['x']} x {sizes['y']} receivers, {attributes['spacing_m']:g} m apart"
-        return f"<coverage: {grid}, {transmitter_text(maps)}, {attributes['frequency_hz'] / 1e9:g} GHz>"
-
-    def _repr_html_(self) -> str:
-        return picture_html(repr(self), _PLOT, self._coverage)
-
-
-def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
-    """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
-    clear: Bools = partial.state_at(points_m) != CellState.WALL
-    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
-        clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
-    return clear
+    return maps[0] if names is None else join_transmitters(maps, names)
 
 
 def transmitter_positions(
@@ -443,7 +257,7 @@ def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_setti
 
 def _receivers(
     partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
-) -> _Receivers:
+) -> Receivers:
     """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
     low_m, high_m = partial.height_range_m
     require_number("rx_height_m", rx_height_m, low_m, high_m, open_low=True)
@@ -466,7 +280,7 @@ def _receivers(
             "no receiver can stand anywhere, all are inside walls or at the transmitter: "
             f"spacing_m = {spacing_m:g}, give a smaller one."
         )
-    return _Receivers(x_m, y_m, cell_state, valid, points[valid])
+    return Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
 def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
@@ -484,7 +298,7 @@ def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
     return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
 
 
-def _receivers_at_once(partial: PartialMap, receivers: _Receivers, memory_gb: float) -> int:
+def _receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: float) -> int:
     """Return how many receivers are predicted together, or raise a MemoryLimitError if the limit is too low."""
     count = len(receivers.rx_m)
     kept_gb = _LIBRARIES_GB + (_CELL_BYTES * partial.state.size + _RECEIVER_BYTES * receivers.valid.size) / 1e9
@@ -535,25 +349,6 @@ class _Links:
         return np.where(free, 1.0, 0.0 if self.model is None else self.model.predict_indoor(phi))
 
 
-def _measured_of_each(
-    partial: PartialMap, sources_m: Sequence[Floats], measurements: Any, frequency_hz: float
-) -> list[Measurements | None]:
-    """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
-    if measurements is None:
-        return [None] * len(sources_m)
-    measured = measurements_of(measurements)
-    if len(sources_m) > 1:
-        apart_m = [np.linalg.norm(measured.tx - tx_m, axis=1) for tx_m in sources_m]
-        near = [bool((each <= SAME_TX_M).any()) for each in apart_m]
-    else:
-        near = [True]
-    near[0] |= not any(near)
-    return [
-        _measured(partial, tx_m, measured, frequency_hz) if is_near else None
-        for tx_m, is_near in zip(sources_m, near, strict=True)
-    ]
-
-
 @dataclass(frozen=True)
 class _Transmitter:
     """Positions (T, 3) [m] with weights (T,), what measurements tell of the links of each, and the best estimate."""
@@ -584,56 +379,6 @@ def _predictions(
             found.append((phi, prediction, links.p_indoor(block_m, phi)))
         mixture = LinkPrediction.mixture([prediction for _, prediction, _ in found], transmitter.weights)
         yield found[nearest][0], mixture, transmitter.weights @ [indoor for _, _, indoor in found]
-
-
-def _measured(partial: PartialMap, tx_m: Floats, measurements: Any, frequency_hz: float) -> Measurements:
-    """Read the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
-    measured = measurements_of(measurements)
-    measured = _of_transmitter(measured, tx_m[0]) if len(tx_m) else _of_unknown(measured)
-    if len(measured) > MOST_MEASUREMENTS:
-        raise MeasurementError(
-            f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
-            "those that are near each other."
-        )
-    usable = clear_of_walls(partial, measured.rx)
-    for each_m in tx_m:
-        usable &= np.linalg.norm(measured.rx - each_m, axis=1) >= nearest_m(frequency_hz)
-    if not usable.any():
-        raise MeasurementError(
-            f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
-            "frame is that of the map."
-        )
-    if not usable.all():
-        message = "%d of %d measurements are not used: their receivers are in walls or at the transmitter"
-        _log.warning(message, int((~usable).sum()), len(usable))
-    measured = measured.take(usable)
-    partial.require_positions("rx of the measurements", measured.rx)
-    return measured
-
-
-def _of_transmitter(measured: Measurements, tx_m: Floats) -> Measurements:
-    """Return the measurements of a transmitter (3,) [m]."""
-    measured.require_transmitters()
-    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
-    if not (apart_m <= SAME_TX_M).any():
-        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
-        raise MeasurementError(
-            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
-            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
-            "the transmitter that is predicted, in the frame of the map."
-        )
-    return measured.take(apart_m <= SAME_TX_M)
-
-
-def _of_unknown(measured: Measurements) -> Measurements:
-    """Return the measurements of a transmitter at an unknown position."""
-    known = measured.tx_known
-    if not known.all():
-        return measured.take(~known)
-    if len(measured) and np.linalg.norm(measured.tx - measured.tx[0], axis=1).max() > SAME_TX_M:
-        raise MeasurementError("tx = None, and measurements are of several transmitters: give those of one, or its tx.")
-    _log.warning("tx = None: the position of the transmitter in the measurements is not used")
-    return measured
 
 
 def _located(links: _Links, measured: Measurements, report: Progress) -> TransmitterPosterior:
@@ -679,29 +424,6 @@ def _of_measurements(measured: Measurements, source: _Transmitter) -> dict[str, 
     }
 
 
-def _with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
-    """Add where the transmitter may be."""
-    axes = {
-        f"tx_{name}": (f"tx_{name}", values, {"long_name": f"{name} of the transmitter", "units": "m"})
-        for name, values in (("x", posterior.x_m), ("y", posterior.y_m))
-    }
-    attributes = {"long_name": "probability of the transmitter's position", "units": "1"}
-    coverage = coverage.assign_coords(axes)
-    coverage["p_transmitter"] = ("tx_y", "tx_x"), posterior.probability, attributes
-    return coverage.assign_attrs(transmitter_std_m=posterior.std_m)
-
-
-def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
-    """Say where the transmitter is, or how many there are."""
-    if len(maps) > 1:
-        return f"{len(maps)} transmitters"
-    (coverage,) = maps.values()
-    position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
-    if "p_transmitter" in coverage:
-        return f"transmitter near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"
-    return f"transmitter at ({position}) m"
-
-
 def _columns(
     phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
@@ -716,50 +438,6 @@ def _columns(
     }
     columns = {name: values.astype(np.float32) for name, values in columns.items()}
     return columns | {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
-
-
-def _variables(receivers: _Receivers, columns: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    """Return all results on the grid."""
-    variables = {
-        "observed": receivers.cell_state != CellState.UNKNOWN,
-        "valid": receivers.valid,
-        "cell_state": receivers.cell_state,
-    }
-    for name, values in columns.items():
-        fill = np.uint8(NO_RECEIVER) if name.endswith("link_state") else np.float32(np.nan)
-        variables[name] = np.full(receivers.valid.shape, fill)
-        variables[name][receivers.valid] = values
-    return variables
-
-
-def _wall_parts(partial: PartialMap, receivers: _Receivers, spacing_m: float) -> NDArray[np.int64]:
-    """Return, bit by bit, which parts of each receiver's cell hold a wall."""
-    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
-    walls = walls.cumsum(axis=1, dtype=np.int32)
-    ny, nx = partial.shape
-    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
-    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
-    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
-    for row, (bottom, top) in enumerate(rows):
-        strip = walls[top] - walls[bottom]
-        for column, (left, right) in enumerate(columns):
-            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
-    return bits
-
-
-def _part_spans(
-    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
-) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
-    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
-    step = spacing_m / resolution_m / WALL_PARTS
-    return [
-        (
-            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
-            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
-        )
-        for part in range(WALL_PARTS)
-    ]
 
 
 def _provenance(
@@ -788,29 +466,3 @@ def _provenance(
         "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
         "predictor_sha256": "" if model is None else model.fingerprint,
     }
-
-
-def _together(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
-    """Join the maps of several transmitters along a dimension "tx"."""
-    positions_m = np.array([each.attrs.pop("transmitter_m") for each in maps])
-    coordinates = {
-        name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
-    }
-    joined = xr.concat([each.drop_vars(_OF_ALL) for each in maps], "tx", combine_attrs="drop_conflicts")
-    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords({"tx": names, **coordinates})
-
-
-def _label(receivers: _Receivers, variables: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> xr.Dataset:
-    axes = {
-        name: (
-            name,
-            values,
-            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
-            {"_FillValue": None},
-        )
-        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
-    }
-    layers = {name: (("y", "x"), variables[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
-    for name in (*DISTRIBUTION, "link_state"):
-        layers[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
-    return xr.Dataset(layers, coords=axes, attrs=dict(attributes))

@@ -17,7 +17,7 @@ from rasterio.io import MemoryFile
 from xarray.backends import H5NetCDFStore
 
 from sionna_partial.constants import NO_RECEIVER
-from sionna_partial.coverage import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
+from sionna_partial.coverage_map import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Checked, Within, real_array, require, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, TX_COORDINATES, require_coverage
+from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES, require_coverage
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction

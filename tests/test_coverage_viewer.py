@@ -17,7 +17,8 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage import COMPONENTS, DISTRIBUTION, predict_map, probability_above
+from sionna_partial.coverage import predict_map
+from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, probability_above
 from sionna_partial.export import save_coverage
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.style import STATE_COLOURS

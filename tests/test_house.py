@@ -46,7 +46,7 @@ ROOMS = {
         *("responses", "beams", "spreads", "files"),
         *("joint", "path_model", "path_training", "samples"),
     ),
-    "coverage": ("coverage", "network"),
+    "coverage": ("coverage_map", "coverage", "network"),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),

@@ -25,27 +25,21 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage import (
-    POSITIONS,
-    SAME_TX_M,
-    TX_COORDINATES,
-    clear_of_walls,
-    predict_map,
-    probability_above,
-    transmitter_positions,
-)
+from sionna_partial.coverage import POSITIONS, predict_map, transmitter_positions
+from sionna_partial.coverage_map import TX_COORDINATES, probability_above
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import TransmitterPosterior
-from sionna_partial.measurements.measurements import Measurements, measurements_of
+from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import unknown_in_view
 from sionna_partial.simulation.frontiers import Frontier, find_frontiers, wide_frontiers
 from sionna_partial.simulation.robot import FORWARD_M, ROBOT_RADII_M, Choice, Robot
+from sionna_partial.tracing.trace import clear_of_walls
 
 GOALS = ("coverage", "state", "area")
 """What is to become known; the first is the default."""

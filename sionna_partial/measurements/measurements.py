@@ -2,8 +2,10 @@
 
 import csv
 import io
+import logging
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,8 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
 from sionna_partial.files import read_bytes
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.trace import clear_of_walls, nearest_m
 
 LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
 """Gains beyond these are in another unit, or of another sign [dB]. Noise may take an outage below the floor."""
@@ -33,6 +37,14 @@ HIGHEST_STD_DB = 30.0
 
 FEW_REPEATS = 10
 """Number of repetitions from which their scatter is believed rather than not."""
+
+SAME_TX_M = 0.5
+"""Distance within which measured links are of the same transmitter [m]."""
+
+MOST_MEASUREMENTS = 20_000
+"""Number of measurements that are held against predictions."""
+
+_log = logging.getLogger(__name__)
 
 _CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
 _STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
@@ -305,3 +317,72 @@ def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], re
         raise MeasurementError(
             f"{name}[{', '.join(map(str, first))}] = {values[first]:g}{more} is not allowed: {remedy}"
         )
+
+
+def measurements_of_each(
+    partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
+) -> list[Measurements | None]:
+    """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
+    if measurements is None:
+        return [None] * len(sources_m)
+    measured = measurements_of(measurements)
+    if len(sources_m) > 1:
+        apart_m = [np.linalg.norm(measured.tx - tx_m, axis=1) for tx_m in sources_m]
+        near = [bool((each <= SAME_TX_M).any()) for each in apart_m]
+    else:
+        near = [True]
+    near[0] |= not any(near)
+    return [
+        _measured(partial, tx_m, measured, frequency_hz) if is_near else None
+        for tx_m, is_near in zip(sources_m, near, strict=True)
+    ]
+
+
+def _measured(partial: PartialMap, tx_m: NDArray[np.float64], measurements: Any, frequency_hz: float) -> Measurements:
+    """Read the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
+    measured = measurements_of(measurements)
+    measured = _of_transmitter(measured, tx_m[0]) if len(tx_m) else _of_unknown(measured)
+    if len(measured) > MOST_MEASUREMENTS:
+        raise MeasurementError(
+            f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
+            "those that are near each other."
+        )
+    usable = clear_of_walls(partial, measured.rx)
+    for each_m in tx_m:
+        usable &= np.linalg.norm(measured.rx - each_m, axis=1) >= nearest_m(frequency_hz)
+    if not usable.any():
+        raise MeasurementError(
+            f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
+            "frame is that of the map."
+        )
+    if not usable.all():
+        message = "%d of %d measurements are not used: their receivers are in walls or at the transmitter"
+        _log.warning(message, int((~usable).sum()), len(usable))
+    measured = measured.take(usable)
+    partial.require_positions("rx of the measurements", measured.rx)
+    return measured
+
+
+def _of_transmitter(measured: Measurements, tx_m: NDArray[np.float64]) -> Measurements:
+    """Return the measurements of a transmitter (3,) [m]."""
+    measured.require_transmitters()
+    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
+    if not (apart_m <= SAME_TX_M).any():
+        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
+        raise MeasurementError(
+            f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
+            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
+            "the transmitter that is predicted, in the frame of the map."
+        )
+    return measured.take(apart_m <= SAME_TX_M)
+
+
+def _of_unknown(measured: Measurements) -> Measurements:
+    """Return the measurements of a transmitter at an unknown position."""
+    known = measured.tx_known
+    if not known.all():
+        return measured.take(~known)
+    if len(measured) and np.linalg.norm(measured.tx - measured.tx[0], axis=1).max() > SAME_TX_M:
+        raise MeasurementError("tx = None, and measurements are of several transmitters: give those of one, or its tx.")
+    _log.warning("tx = None: the position of the transmitter in the measurements is not used")
+    return measured

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.coverage import clear_of_walls
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
+from sionna_partial.tracing.trace import clear_of_walls
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
 """Least distance of a transmitter from known walls [m], and the largest cells in which it is kept [m]."""

@@ -18,7 +18,7 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.coverage import (
+from sionna_partial.coverage_map import (
     WALL_PARTS,
     probability_above,
     require_coverage,

@@ -8,7 +8,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
-from sionna_partial.coverage import TX_COORDINATES
+from sionna_partial.coverage_map import TX_COORDINATES
 from sionna_partial.network import require_network
 from sionna_partial.plots.coverage_plot import extent_m, wall_cells
 from sionna_partial.plots.style import STAR, Figure, legend_below, server_colours, shade

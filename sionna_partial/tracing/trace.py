@@ -1,5 +1,6 @@
 """Scene + transmitters + receivers -> TracedLinks."""
 
+import itertools
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from sionna_partial.checks import Progress, no_progress, require_choice, settings_or_default
-from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -331,6 +332,14 @@ def checked_settings(
 def nearest_m(frequency_hz: float) -> float:
     """Shortest distance of a link [m]: Sionna RT takes none of 1 cm, and Friis' formula is above 0 dB nearer by."""
     return max(SHORTEST_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi))
+
+
+def clear_of_walls(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
+    clear: NDArray[np.bool_] = partial.state_at(points_m) != CellState.WALL
+    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
+        clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
+    return clear
 
 
 def checked_positions(

@@ -1,0 +1,286 @@
+"""Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and what can be asked of one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from sionna_partial.checks import number_of, require, require_number, shown
+from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
+from sionna_partial.display import later, picture_html
+from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.measurements.localisation import TransmitterPosterior
+from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.unobserved import Bools, Floats
+
+WALL_PARTS = 6
+"""`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
+
+DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
+COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
+
+TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
+"""Positions [m] along the dimension "tx" of the maps of several transmitters."""
+
+_OF_ALL = ("observed", "cell_state", "wall_parts")
+"""Variables that do not depend on the transmitter."""
+
+_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
+
+_PLOT = "plots.coverage_plot:plot_coverage"
+
+
+def _flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+    return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
+
+
+_LINK_FLAGS = _flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
+_CELL_FLAGS = _flags({state.name.lower(): state for state in CellState})
+_YES_NO = _flags({"no": 0, "yes": 1}, np.int8)
+
+ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
+    "p_los": {"long_name": "probability of line of sight", "units": "1"},
+    "p_nlos": {"long_name": "probability of paths without line of sight", "units": "1"},
+    "p_outage": {"long_name": "probability of outage", "units": "1"},
+    "link_state": {"long_name": "likeliest link state", **_LINK_FLAGS},
+    "gain_mean_db": {"long_name": "mean omnidirectional path gain, an outage counting -150 dB", "units": "dB"},
+    "gain_std_db": {"long_name": "standard deviation of the omnidirectional path gain", "units": "dB"},
+    "gain_los_mean_db": {"long_name": "mean path gain given line of sight", "units": "dB"},
+    "gain_los_std_db": {"long_name": "standard deviation of the path gain given line of sight", "units": "dB"},
+    "gain_nlos_mean_db": {"long_name": "mean path gain given no line of sight", "units": "dB"},
+    "gain_nlos_std_db": {"long_name": "standard deviation of the path gain given no line of sight", "units": "dB"},
+    "p_indoor": {"long_name": "probability that the receiver is indoors", "units": "1"},
+    "partial_link_state": {"long_name": "link state traced on the known part of the map", **_LINK_FLAGS},
+    "partial_gain_db": {"long_name": "path gain traced on the known part of the map", "units": "dB"},
+    "unobserved_distance_m": {"long_name": "length of the direct line in unknown cells", "units": "m"},
+    "distance_m": {"long_name": "distance from the transmitter", "units": "m"},
+    "observed": {"long_name": "whether this cell was observed", **_YES_NO},
+    "valid": {"long_name": "whether a receiver can stand here", **_YES_NO},
+    "cell_state": {"long_name": "state of the map at the receiver", **_CELL_FLAGS},
+    "wall_parts": {
+        "long_name": "walls within the cell",
+        "comment": f"Bit {WALL_PARTS} * row + column is set where that one of {WALL_PARTS} x {WALL_PARTS} parts of "
+        "the cell holds a wall; row 0 has the smallest y, column 0 the smallest x.",
+    },
+}
+"""The variables of a coverage map on (y, x), and their CF attributes."""
+
+
+@dataclass(frozen=True)
+class Receivers:
+    """Receivers at the centres of a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
+
+    x_m: Floats
+    y_m: Floats
+    cell_state: NDArray[np.uint8]
+    valid: Bools
+    rx_m: Floats
+
+
+def coverage_map(
+    partial: PartialMap,
+    receivers: Receivers,
+    columns: Mapping[str, NDArray[Any]],
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Put the values (N,) of the valid receivers, by name, on their grid, with what the map shows there."""
+    layers: dict[str, NDArray[Any]] = {
+        "observed": receivers.cell_state != CellState.UNKNOWN,
+        "valid": receivers.valid,
+        "cell_state": receivers.cell_state,
+        "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
+    }
+    for name, values in columns.items():
+        fill = np.uint8(NO_RECEIVER) if name.endswith("link_state") else np.float32(np.nan)
+        layers[name] = np.full(receivers.valid.shape, fill)
+        layers[name][receivers.valid] = values
+    axes = {
+        name: (
+            name,
+            values,
+            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
+            {"_FillValue": None},
+        )
+        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
+    }
+    variables = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    for name in (*DISTRIBUTION, "link_state"):
+        variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
+    return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
+
+
+def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
+    """Add where the transmitter may be."""
+    axes = {
+        f"tx_{name}": (f"tx_{name}", values, {"long_name": f"{name} of the transmitter", "units": "m"})
+        for name, values in (("x", posterior.x_m), ("y", posterior.y_m))
+    }
+    attributes = {"long_name": "probability of the transmitter's position", "units": "1"}
+    coverage = coverage.assign_coords(axes)
+    coverage["p_transmitter"] = ("tx_y", "tx_x"), posterior.probability, attributes
+    return coverage.assign_attrs(transmitter_std_m=posterior.std_m)
+
+
+def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
+    """Join the maps of several transmitters along a dimension "tx"."""
+    positions_m = np.array([each.attrs.pop("transmitter_m") for each in maps])
+    coordinates = {
+        name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
+    }
+    joined = xr.concat([each.drop_vars(_OF_ALL) for each in maps], "tx", combine_attrs="drop_conflicts")
+    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords({"tx": names, **coordinates})
+
+
+def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
+    """Return the coverage of one transmitter, `transmitter_m` in its attributes; a SettingsError for anything else."""
+    remedy = "give the xarray.Dataset that predict_map returned, or load it from its .nc file."
+    kind = type(coverage).__name__
+    if not isinstance(coverage, xr.Dataset):
+        raise SettingsError(f"coverage is of type {kind}: {remedy}")
+    if "tx" in coverage.dims:
+        names = ", ".join(map(str, coverage["tx"].to_numpy()))
+        raise SettingsError(f"coverage has the transmitters {names}: choose one, as by coverage.isel(tx=0).")
+    if {"tx", *TX_COORDINATES} <= coverage.coords.keys():
+        position_m = np.array([float(coverage[name]) for name in TX_COORDINATES])
+        coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
+    missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
+    missing += [name for name in ("x", "y") if name not in coverage.coords]
+    missing += [name for name in ("transmitter_m", "spacing_m", "frequency_hz") if name not in coverage.attrs]
+    if missing or not coverage["valid"].size:
+        raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
+    return coverage
+
+
+def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
+    """Return the coverage of each transmitter by name, as `require_coverage` does; "" names a single one."""
+    if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
+        return {"": require_coverage(coverage)}
+    names = [str(name) for name in coverage["tx"].to_numpy()]
+    require(0 < len(names) == len({*names}), "coverage.tx", names, "keep at least one, each with a name of its own.")
+    return {name: require_coverage(coverage.isel(tx=at)) for at, name in enumerate(names)}
+
+
+def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
+    """Return P(path gain > threshold) (..., ny, nx), NaN where no receiver can stand; threshold in [-150, 0] dB."""
+    require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
+    columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
+    return LinkPrediction(**columns).probability_above(threshold_db)
+
+
+@xr.register_dataset_accessor("radio")
+class CoverageAccessor:
+    """What can be asked of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
+
+    Every method raises a SettingsError for a Dataset that is no coverage map.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> float(coverage.radio.at(2.4, 2.4).p_los)
+    1.0
+    >>> float(coverage.radio.probability_above(-60.0).sel(x=2.25, y=2.25))
+    0.0
+    """
+
+    def __init__(self, coverage: xr.Dataset) -> None:
+        self._coverage = coverage
+
+    def plot(self) -> Any:
+        """Return the figure of `plot_coverage`."""
+        return later(_PLOT)(self._coverage)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the map as `save_coverage` does."""
+        later("export:save_coverage")(self._coverage, path)
+
+    def probability_above(self, threshold_db: float) -> xr.DataArray:
+        """Return the probability (ny, nx), or (tx, ny, nx), that the path gain exceeds a threshold t [dB].
+
+        P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), where m
+        and s are `gain_los_mean_db`, `gain_los_std_db` and so on, and Phi is the normal distribution function: an
+        outage has a gain of -150 dB. It is NaN where no receiver can stand.
+
+        Raises
+        ------
+        SettingsError
+            For a threshold that is no number of dB.
+        """
+        transmitters_of(self._coverage)
+        above = probability_above(self._coverage, threshold_db)
+        attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
+        values = self._coverage["p_los"].copy(data=above.astype(np.float32))
+        return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
+
+    def at(self, x: float, y: float) -> xr.Dataset:
+        """Return all variables at the receiver nearest to world x and y [m].
+
+        Raises
+        ------
+        PositionError
+            If that is not on the map.
+        """
+        transmitters_of(self._coverage)
+        half_m = float(self._coverage.attrs["spacing_m"]) / 2.0
+        for name, value in (("x", x), ("y", y)):
+            low_m, high_m = (float(self._coverage[name][end]) for end in (0, -1))
+            if not low_m - half_m <= number_of(value) <= high_m + half_m:
+                span = f"{low_m - half_m:g} to {high_m + half_m:g} m"
+                raise PositionError(f"{name} = {shown(value)} is not on the map: give a number of metres in {span}.")
+        return self._coverage.sel(x=x, y=y, method="nearest")
+
+    def __repr__(self) -> str:
+        maps = transmitters_of(self._coverage)
+        sizes, attributes = self._coverage.sizes, self._coverage.attrs
+        grid = f"{sizes['x']} x {sizes['y']} receivers, {attributes['spacing_m']:g} m apart"
+        return f"<coverage: {grid}, {transmitter_text(maps)}, {attributes['frequency_hz'] / 1e9:g} GHz>"
+
+    def _repr_html_(self) -> str:
+        return picture_html(repr(self), _PLOT, self._coverage)
+
+
+def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
+    """Say where the transmitter is, or how many there are."""
+    if len(maps) > 1:
+        return f"{len(maps)} transmitters"
+    (coverage,) = maps.values()
+    position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
+    if "p_transmitter" in coverage:
+        return f"transmitter near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"
+    return f"transmitter at ({position}) m"
+
+
+def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
+    """Return, bit by bit, which parts of each receiver's cell hold a wall."""
+    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
+    walls = walls.cumsum(axis=1, dtype=np.int32)
+    ny, nx = partial.shape
+    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
+    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
+    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
+    for row, (bottom, top) in enumerate(rows):
+        strip = walls[top] - walls[bottom]
+        for column, (left, right) in enumerate(columns):
+            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
+    return bits
+
+
+def _part_spans(
+    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
+) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Return the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
+    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
+    step = spacing_m / resolution_m / WALL_PARTS
+    return [
+        (
+            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
+            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
+        )
+        for part in range(WALL_PARTS)
+    ]
