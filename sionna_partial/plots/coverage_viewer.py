@@ -41,6 +41,7 @@ _TOOLTIPS = (
 )
 
 _SEVERAL = "The best server of a receiver is the transmitter with the largest mean path gain."
+_UNKNOWN = "; a line encloses 90 % of where it may be"
 
 _SHOW = """
 for (const [name, parts] of Object.entries(layers)) for (const part of parts) part.visible = name == choice.value
@@ -83,9 +84,8 @@ _PAGE = """<!doctype html>
 <body>
 <h1>{headline}</h1>
 <div id="viewer"></div>
-<p>Star: transmitter; a line encloses 90 % of where an unknown one may be. Black: walls. Hatched: not observed. Grey: no
-receiver can stand there. In mean and standard deviation of the path gain, an outage counts &minus;150 dB. {several}
-Predictor: {predictor}.</p>
+<p>Star: transmitter{unknown}. Black: walls. Hatched: not observed. Grey: no receiver can stand there. In mean and
+standard deviation of the path gain, an outage counts &minus;150 dB. {several} Predictor: {predictor}.</p>
 <script>Bokeh.embed.embed_item({item}, "viewer")</script>
 </body>
 </html>
@@ -106,6 +106,7 @@ def coverage_page(coverage: xr.Dataset) -> bytes:
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         headline=html.escape(headline("Coverage", maps)),
         several=_SEVERAL * (len(maps) > 1),
+        unknown=_UNKNOWN * ("p_transmitter" in coverage),
         predictor=html.escape(str(coverage.attrs.get("predictor", "unknown"))),
         item=item,
     )
