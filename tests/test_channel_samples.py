@@ -76,7 +76,7 @@ def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: n
     assert power[0] == power[2] != power[1]
     with pytest.raises(MemoryLimitError, match=r"400 draws take up to .* Use links\(draw\)"):
         samples.cir()
-    with pytest.raises(IndexError):
+    with pytest.raises(SettingsError, match="draw = 400"):
         samples.links(400)
 
 

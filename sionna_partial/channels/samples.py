@@ -75,9 +75,16 @@ class ChannelSamples(Shown):
         return len(self.link_state)
 
     def links(self, draw: int) -> TracedLinks:
-        """Return one draw, as `trace_links` returns links; interactions are 255 where a path was not traced."""
+        """Return one draw, as `trace_links` returns links; interactions are 255 where a path was not traced.
+
+        Raises
+        ------
+        SettingsError
+            If there is no such draw.
+        """
+        require_whole("draw", draw, 0, len(self) - 1)
         traced = self._draws.traced
-        columns: dict[str, Any] = self._draws.paths_of(range(len(self))[draw])
+        columns: dict[str, Any] = self._draws.paths_of(draw)
         return replace(traced, link_state=self.link_state[draw], gain_db=self.gain_db[draw], **columns)
 
     @cached_property

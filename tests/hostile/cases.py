@@ -71,6 +71,7 @@ CALLS = {
     "TracedLinks.to_dataframe": {"self": "links()"},
     "dft_codebook": {"rows": "4", "columns": "4"},
     "sample_channels": {"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]", "n": "5", "predictor": "'paper'"},
+    "ChannelSamples.links": {"self": "samples()", "draw": "0"},
     "save_channels": {"channels": "links()", "path": "folder / 'channels.nc'"},
     "load_channels": {"path": "valid('channels.nc', folder)"},
     "network_map": {"coverage": "two_coverages()"},

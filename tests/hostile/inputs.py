@@ -189,6 +189,12 @@ def links() -> sp.TracedLinks:
     return sp.trace_links(room(), TX, [(3.1, 2.5, 1.5), (0.9, 2.1, 1.5)])
 
 
+@functools.cache
+def samples() -> sp.ChannelSamples:
+    """Return draws of links in the room."""
+    return sp.sample_channels(room(), TX, [(3.1, 2.5, 1.5)], n=3, predictor="paper")
+
+
 def measured() -> sp.Measurements:
     """Return gains measured on these links."""
     rx_m = links().rx
