@@ -14,7 +14,7 @@ import sionna_partial.cli.options as opt
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_files, read_bytes, require_writable
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 
 MAX_BYTES = 100_000_000
 """Largest file of receivers that is read [bytes]."""
@@ -62,7 +62,7 @@ def network(
             predictor=predictor or None,
             **settings,
             memory_gb=memory,
-            progress=lambda fraction, message: report(0.8 * fraction, message),
+            progress=part_of(report, 0.0, 0.8),
         )
         report(0.8, "drawing links together")
         found = sp.network_map(coverage, tx_power_dbm=powers_dbm, **asdict(budget))
@@ -127,13 +127,13 @@ def channels(
             receivers_m,
             **settings,
             memory_gb=memory,
-            progress=lambda fraction, message: report(0.5 * fraction, message),
+            progress=part_of(report, 0.0, 0.5),
         )
         sp.save_channels(
             links,
             out,
             layout=layout,  # type: ignore[arg-type]
-            progress=lambda fraction, message: report(0.5 + 0.5 * fraction, message),
+            progress=part_of(report, 0.5, 1.0),
             tx_array=arrays[0],
             rx_array=arrays[1],
             tx_orientation_rad=orientation,

@@ -9,7 +9,7 @@ import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
 from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
@@ -56,7 +56,7 @@ def predict(
             measurements=measurements,
             receivers=receivers,
             memory_gb=memory,
-            progress=lambda fraction, message: report(0.9 * fraction, message),
+            progress=part_of(report, 0.0, 0.9),
         )
         names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
         with atomic_files(out) as folder:
@@ -113,7 +113,7 @@ def explore(
             sensor=sensor,
             policy=policy,
             tx=position,
-            progress=lambda fraction, message: report(0.1 + 0.4 * fraction, message),
+            progress=part_of(report, 0.1, 0.5),
         )
         asked, suffix = exploration.at(steps), ".yaml" if complete.mesh is None else ".npz"
         maps = {f"steps_{count:03d}{suffix}": partial for count, partial in zip(asked.steps, asked.maps, strict=True)}
