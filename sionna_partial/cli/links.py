@@ -1,7 +1,5 @@
 """Subcommands from a map to links of several transmitters, and of antenna arrays: network, channels."""
 
-import csv
-import io
 import re
 from dataclasses import asdict
 from pathlib import Path
@@ -13,11 +11,8 @@ import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.errors import PositionError
-from sionna_partial.files import atomic_files, read_bytes, require_writable
+from sionna_partial.files import atomic_files, read_columns, require_writable
 from sionna_partial.progress import part_of, reporting
-
-MAX_BYTES = 100_000_000
-"""Largest file of receivers that is read [bytes]."""
 
 COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
 """Columns of positions, by any of these names."""
@@ -163,19 +158,11 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     return grid_m[partial.state_at(grid_m) == CellState.FREE]
 
 
-def _read_positions(path: Path) -> list[list[float]]:
+def _read_positions(path: Path) -> list[tuple[float, ...]]:
     """Read positions [m] from a CSV."""
     remedy = "give a CSV with the columns x,y,z in metres."
-    text = read_bytes(path, "--rx", PositionError, MAX_BYTES).decode("utf-8-sig", errors="replace")
-    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    header = [name.strip() for name in next(rows, [])]
-    names = next((names for names in COLUMNS if set(names) <= {*header}), None)
+    found = read_columns(path, "--rx", PositionError, sum(COLUMNS, ()), remedy)
+    names = next((names for names in COLUMNS if found.keys() >= {*names}), None)
     if names is None:
-        raise PositionError(f"--rx '{path}' has the columns {', '.join(header)[:80] or 'none'}: {remedy}")
-    columns, found = [header.index(name) for name in names], list[list[float]]()
-    for row in filter(None, rows):
-        try:
-            found.append([float(row[column]) for column in columns])
-        except (ValueError, IndexError) as error:
-            raise PositionError(f"--rx '{path}', line {rows.line_num} is no position ({error}): {remedy}") from error
-    return found
+        raise PositionError(f"--rx = '{path}' has no positions: {remedy}")
+    return [*zip(*(found[name] for name in names), strict=True)]
