@@ -135,6 +135,20 @@ def _columns(given: str, rows: Any, error: type[SionnaPartialError], names: Coll
     return found
 
 
+@contextmanager
+def decoding(
+    path: Path, fault: str, error: type[SionnaPartialError], remedy: str = "export it again."
+) -> Iterator[None]:
+    """Turn whatever decoders raise on damaged files, which is of many types, into an `error`; our own errors pass."""
+    try:
+        yield
+    except (SionnaPartialError, Warning):
+        raise
+    except Exception as cause:
+        reason = " ".join(f"{cause or type(cause).__name__}".split())[:200]
+        raise error(f"path = '{path}' is damaged or {fault} ({reason}): {remedy}") from cause
+
+
 def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:
     """Return a path to read from, or raise an `error` if it is none."""
     if not isinstance(path, (str, os.PathLike)):
