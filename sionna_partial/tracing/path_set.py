@@ -205,7 +205,7 @@ class PathSet:
             rx=self.rx_m,
             link_state=link_state.reshape(shape),
             gain_db=gain_db.reshape(shape),
-            **{field.name: getattr(paths, field.name) for field in fields(SolvedPaths)},
+            **vars(paths),
             settings=self._scene.settings,
             scene_settings=self._scene.scene_settings,
         )

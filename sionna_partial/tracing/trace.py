@@ -225,7 +225,7 @@ class Tracer:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
         columns = PathColumns(max(1, self.settings.max_depth), self.polarisations)
         link_state, gain_db = self.fill(columns, tx_m, rx_m, report, valid)
-        found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
+        found = vars(columns.paths())
         return TracedLinks(
             tx_m, rx_m, link_state, gain_db, **found, settings=self.settings, scene_settings=self.scene_settings
         )
