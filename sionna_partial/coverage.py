@@ -43,9 +43,8 @@ from sionna_partial.measurements.measurements import Measurements, measurements_
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.finder import part_of
 from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, clear_of_walls, nearest_m
 
 MAX_RECEIVERS = 2_000_000

@@ -1,13 +1,15 @@
 """Files: input of bounded size; output that is written whole or not at all, and by one run at a time."""
 
+import csv
 import errno
 import fcntl
+import io
 import os
 import shutil
 import socket
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -21,6 +23,9 @@ SCENE_FILES = ("scene.xml", "map.yaml")
 
 CALIBRATED_FILE = "calibrated.npz"
 """File with the map in a folder of `sionna-partial calibrate`."""
+
+MAX_CSV_BYTES = 100_000_000
+"""Largest CSV that is read."""
 
 LOCK_FILE = ".lock"
 """File in a locked folder that names the process that writes there."""
@@ -82,6 +87,66 @@ def read_bytes(
             return stream.read(os.fstat(stream.fileno()).st_size + 1)
         except OSError as cause:
             raise error(f"{field} = '{path}' cannot be read ({cause.strerror}): check the disk.") from cause
+
+
+def read_columns(
+    path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Collection[str], remedy: str
+) -> dict[str, list[float]]:
+    """Return those columns of a CSV with a header that have one of the names, or raise an `error`."""
+    given = f"{field} = '{path}'"
+    try:
+        text = read_bytes(path, field, error, MAX_CSV_BYTES, "leave lines out.").decode("utf-8-sig")
+    except UnicodeDecodeError as cause:
+        raise error(f"{given} cannot be read ({cause}): {remedy}") from cause
+    if text and text[-1] not in "\r\n":
+        last = text.splitlines()[-1][-40:]
+        raise error(
+            f"{given} ends in {last!r}, without a line end: the file may be cut. Copy it again, or add a line end."
+        )
+    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+    try:
+        return _columns(given, rows, error, names)
+    except csv.Error as cause:
+        raise error(f"{given}, line {rows.line_num} cannot be read ({cause}): {remedy}") from cause
+
+
+def _columns(given: str, rows: Any, error: type[SionnaPartialError], names: Collection[str]) -> dict[str, list[float]]:
+    header = [name.strip() for name in next(rows, [])]
+    commas = "separate columns by commas, and write decimal points."
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        raise error(f"{given} has the header {header[0][:80]!r}: {commas}")
+    found: dict[str, list[float]] = {name: [] for name in header if name in names}
+    columns = [(column, name) for column, name in enumerate(header) if name in found]
+    if len(columns) > len(found):
+        twice = next(name for name in found if header.count(name) > 1)
+        raise error(f"{given} has {header.count(twice)} columns {twice}: keep one of them.")
+    for row in rows:
+        if len(row) > len(header):
+            raise error(f"{given}, line {rows.line_num} has {len(row)} cells for {len(header)} columns: {commas}")
+        for column, name in columns if row else ():
+            text = row[column] if column < len(row) else ""
+            try:
+                found[name].append(float(text))
+            except ValueError as cause:
+                meant = "write decimal points." if "," in text else "correct the line, or leave it out."
+                raise error(
+                    f"{given}, line {rows.line_num}: {name} = {text[:80]!r} is not a number: {meant}"
+                ) from cause
+    return found
+
+
+@contextmanager
+def decoding(
+    path: Path, fault: str, error: type[SionnaPartialError], remedy: str = "export it again."
+) -> Iterator[None]:
+    """Turn whatever decoders raise on damaged files, which is of many types, into an `error`; our own errors pass."""
+    try:
+        yield
+    except (SionnaPartialError, Warning):
+        raise
+    except Exception as cause:
+        reason = " ".join(f"{cause or type(cause).__name__}".split())[:200]
+        raise error(f"path = '{path}' is damaged or {fault} ({reason}): {remedy}") from cause
 
 
 def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:

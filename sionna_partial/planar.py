@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from sionna_partial.process import njit
 
@@ -11,6 +12,12 @@ from sionna_partial.process import njit
 def cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     """Cross products of vectors (..., 2)."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
+def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Cells (ny, nx) of the largest part of a mask whose cells touch by edges."""
+    labels, _ = ndimage.label(mask)
+    return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))
 
 
 def grid_edges(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:

@@ -58,6 +58,11 @@ def counting(progress: CountProgress | bool | None, unit: str, *, command: bool 
         yield report
 
 
+def part_of(report: Progress, low: float, high: float) -> Progress:
+    """Return what reports a part of the work, from one fraction to another."""
+    return lambda fraction, message: report(low + (high - low) * fraction, message)
+
+
 def rate_and_rest(done: int, rest: int, elapsed_s: float) -> str:
     """Return how many a minute were done, and how long the rest takes at that rate; "" where nothing was done."""
     if not done or elapsed_s <= 0.0:

@@ -16,7 +16,7 @@ from sionna_partial.evaluation.baselines import Baselines
 from sionna_partial.evaluation.evaluate import Evaluation, evaluate
 from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import PredictorSettings
 
 PREDICTOR_FILE, SPLIT_FILE = "predictor.keras", "split.json"
@@ -142,7 +142,7 @@ def train(
             indoors.gain_db,
             homes=train_homes,
             settings=settings,
-            progress=lambda done, message: report(0.6 * done, message),
+            progress=part_of(report, 0.0, 0.6),
         )
         predictor = predictor.fit_indoor(unsure.features, unsure.inside)
         report(0.6, "training the baselines")
@@ -151,9 +151,7 @@ def train(
         if not test_homes:
             return run
         tests = table.take(np.isin(table.home, test_homes))
-        result = evaluate(
-            predictor, tests, baselines=baselines, progress=lambda done, message: report(0.7 + 0.3 * done, message)
-        )
+        result = evaluate(predictor, tests, baselines=baselines, progress=part_of(report, 0.7, 1.0))
     return replace(run, predictor=replace(predictor, metrics=_card_metrics(result)), evaluation=result)
 
 

@@ -67,8 +67,8 @@ def test_grid(map_path: Path, tmp_path: Path) -> None:
         (["--out", "channels.mat"], "has the suffix '.mat': choose one of .zarr, .nc, .h5."),
         (["--spacing", "0"], "--spacing 0 is too small: give 0.01 or more."),
         (["--rx", "none.csv"], "--rx = 'none.csv' cannot be read"),
-        (["--rx", "bad.csv"], "has the columns a, b: give a CSV with the columns x,y,z in metres."),
-        (["--rx", "cut.csv"], "cut.csv', line 3 is no position"),
+        (["--rx", "bad.csv"], "bad.csv' has no positions: give a CSV with the columns x,y,z in metres."),
+        (["--rx", "cut.csv"], "cut.csv', line 3: z = '' is not a number: correct the line"),
         (["--rx", "wall.csv"], "rx[0] ="),
     ],
 )

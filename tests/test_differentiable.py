@@ -40,8 +40,17 @@ def partial_room():
     return replace(whole, state=np.where(x + 0.5 * y > 33, CellState.UNKNOWN, whole.state).astype(np.uint8))
 
 
+def finished_map():
+    """Return a complete map: the robot has finished a room beside the small one, and never saw that."""
+    whole = small_room()
+    state = np.where(whole.state == CellState.FREE, CellState.UNKNOWN, whole.state)
+    beside = np.pad(np.full((30, 9), CellState.FREE), ((1, 1), (0, 1)), constant_values=CellState.WALL)
+    return replace(whole, state=np.hstack([state, beside]).astype(np.uint8))
+
+
 MAPS = {
     "partial": partial_room(),
+    "finished": finished_map(),
     "empty": sp.PartialMap(np.full((32, 42), CellState.UNKNOWN), 0.1),
     "complete": small_room(),
 }
@@ -81,10 +90,10 @@ def assert_same(found, expected, **tolerance):
 
 class TestValues:
     @pytest.mark.parametrize("predictor", ["paper", "map"])
-    @pytest.mark.parametrize("kind", ["partial", "empty"])
+    @pytest.mark.parametrize("kind", ["partial", "finished", "empty"])
     def test_unmoved_as_predictor(self, kind, predictor, links_of):
         expected, links = predicted(kind, predictor)
-        assert (links.link_state == sp.LinkState.NLOS).any() == (kind == "partial")
+        assert (links.link_state == sp.LinkState.NLOS).any() == (kind != "empty")
         assert_same(links_of(kind, predictor)(), expected, rtol=1e-6, atol=1e-9)
 
     def test_complete_map_is_the_trace(self, links_of):

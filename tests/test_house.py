@@ -59,7 +59,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "network_plot", "next_views_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("options", "prediction", "channels", "network", "learning", "planning", "app"),
+    "cli": ("options", "prediction", "links", "learning", "planning", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""

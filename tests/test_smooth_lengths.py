@@ -72,11 +72,10 @@ def one(smooth, start, end):
 
 
 class TestLengths:
-    def test_nothing_unknown_on_a_complete_map(self):
+    def test_what_a_complete_map_has_not_seen(self):
         partial = PartialMap(np.pad([[FREE]], 1, constant_values=WALL), RESOLUTION_M, ORIGIN_M)
         assert partial.is_complete
-        assert not SmoothLengths(partial, UNKNOWN)(*ends_around(partial, 100)).any()
-        assert SmoothLengths(partial, WALL)(*ends_around(partial, 100)).any()
+        assert one(SmoothLengths(partial, UNKNOWN), (100.0, 0.0, 1.0), (102.0, 0.0, 1.0))[0] == 2.0
 
     def test_half_plane_by_hand(self):
         partial = half_plane(5.0)

@@ -34,7 +34,7 @@ from sionna_partial.display import Pictured
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 from sionna_partial.tracing.trace import checked_settings
@@ -298,12 +298,9 @@ def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float,
     posteriors: dict[int, Posterior] = {}
     best = [begin]
     for number, which in enumerate(rounds):
-
-        def advance(fraction: float, message: str, number: int = number) -> None:
-            report(0.3 + 0.6 * (number + fraction) / len(rounds), message)
-
+        advance = part_of(report, *(0.3 + 0.6 * each / len(rounds) for each in (number, number + 1)))
         best, posteriors[which] = search(target, best[0], which, start[which].thickness_m, frequency_hz, advance)
-    descents = [descend(target, each, lambda part, message: report(0.9 + 0.1 * part, message)) for each in best]
+    descents = [descend(target, each, part_of(report, 0.9, 1.0)) for each in best]
     steps, curvature = min(descents, key=lambda found: found[0][-1].loss)
     ordered = [posteriors[which] for which in range(len(start))]
     typical = [each.typical(material.thickness_m, frequency_hz) for each, material in zip(ordered, start, strict=True)]

@@ -11,6 +11,7 @@ from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.link_context import SEEN_M, path_unobserved_m
+from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import itu_constants
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathScene, PathSet
@@ -137,7 +138,7 @@ class MeasuredBuilding:
             paths = PathSet.joined(new)
             return PathSet.joined([kept, paths.kept(link_paths(paths).strong())])
 
-        for block in scene.blocks(tx_m, rx, lambda fraction, what: report(0.02 + 0.28 * fraction, what), links):
+        for block in scene.blocks(tx_m, rx, part_of(report, 0.02, 0.3), links):
             new.append(block)
             if sum(map(len, new)) > PATHS_PER_BLOCK:
                 kept, new = strong(), [nothing]

@@ -11,9 +11,8 @@ import typer
 from typer.core import TyperGroup
 
 from sionna_partial import __version__
-from sionna_partial.cli.channels import channels
 from sionna_partial.cli.learning import dataset, evaluate, train
-from sionna_partial.cli.network import network
+from sionna_partial.cli.links import channels, network
 from sionna_partial.cli.options import TransmitterCommand
 from sionna_partial.cli.planning import calibrate, next_views, place
 from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict

@@ -20,7 +20,6 @@ from sionna_partial.settings import (
     NetworkKind,
     PredictorSettings,
     SceneSettings,
-    SensorSettings,
     TraceSettings,
 )
 
@@ -37,7 +36,9 @@ _NETWORKS_HELP = "Its input: the paper's features, what each path crosses, and t
 Datasets = Annotated[list[Path], typer.Argument(metavar="DATASET", help=_DATASET_HELP, show_default=False)]
 
 
+@opt.with_options
 def dataset(
+    *,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the data set.", show_default=False)],
     homes: Annotated[
         int | None, typer.Option(min=0, help=f"Homes to make. Default: {DEFAULT_HOMES}, or 0 with --map.")
@@ -60,11 +61,7 @@ def dataset(
     transmitters: Annotated[int, typer.Option(help="Transmitters of a home.")] = DatasetSettings.transmitters_per_home,
     stages: Annotated[list[float], typer.Option("--stage", help=_STAGE_HELP)] = list(DatasetSettings.stages),  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of positions and robots.")] = DatasetSettings.seed,
-    field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
-    range_m: opt.Range = SensorSettings.range_m,
-    range_noise: opt.RangeNoise = SensorSettings.range_noise_m,
-    drift: opt.Drift = SensorSettings.drift_m_per_m,
-    missed_walls: opt.MissedWalls = SensorSettings.missed_wall_fraction,
+    sensor: opt.Sensor,
     mixed_sensors: Annotated[
         bool, typer.Option("--mixed-sensors", help="Draw a sensor for each home, in place of the five options above.")
     ] = False,
@@ -85,7 +82,6 @@ def dataset(
 
     OUT gets the links of each home. Stop it at any time, and give the same command, or one with more homes, again.
     """
-    sensor = SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
     settings = DatasetSettings(
         links_per_home=links,
         transmitters_per_home=transmitters,

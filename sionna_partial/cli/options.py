@@ -1,14 +1,18 @@
-"""Options that subcommands share, and numbers and materials that are parsed from text."""
+"""Options that subcommands share, what is made of them, and numbers and materials that are parsed from text."""
 
+import functools
+import inspect
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from sionna_partial.settings import Material, SceneSettings, TraceSettings
+import sionna_partial as sp
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ
+from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
 _MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
 _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
@@ -89,11 +93,64 @@ def parse_material(text: str) -> Material:
 
 
 def settings_of(
-    material: str, frequency_hz: float, max_depth: int, diffraction: bool
-) -> tuple[SceneSettings, TraceSettings]:
-    """Return settings of scene and trace; with diffraction where it is the default."""
-    trace = TraceSettings(frequency_hz, max_depth, diffraction=None if diffraction else False)
-    return SceneSettings(material=parse_material(material)), trace
+    frequency: Frequency = CARRIER_FREQUENCY_HZ,
+    material: MaterialText = "",
+    max_depth: MaxDepth = 6,
+    diffraction: Diffraction = True,
+) -> dict[str, Any]:
+    """Return settings of scene and trace by the names of arguments; with diffraction where it is the default."""
+    trace = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
+    return {"scene_settings": SceneSettings(material=parse_material(material)), "trace_settings": trace}
+
+
+def _read_map(
+    map_path: Map,
+    strict: Strict = False,
+    height_band: HeightBand = None,
+    up: Up = None,
+    wall_height: WallHeight = None,
+) -> Any:
+    return sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+
+
+def _sensor(
+    field_of_view: FieldOfView = SensorSettings.field_of_view_deg,
+    range_m: Range = SensorSettings.range_m,
+    range_noise: RangeNoise = SensorSettings.range_noise_m,
+    drift: Drift = SensorSettings.drift_m_per_m,
+    missed_walls: MissedWalls = SensorSettings.missed_wall_fraction,
+) -> SensorSettings:
+    return SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
+
+
+Settings = Annotated[dict[str, Any], settings_of]
+PartialMap = Annotated[Any, _read_map]
+Sensor = Annotated[SensorSettings, _sensor]
+"""Parameters of commands that are made of options, see `with_options`."""
+
+
+def with_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Put the options of functions, as `Annotated[..., function]`, in place of parameters that these make."""
+    options: dict[str, inspect.Parameter] = {}
+    makers: dict[str, Callable[..., Any]] = {}
+    for name, parameter in inspect.signature(command).parameters.items():
+        maker = getattr(parameter.annotation, "__metadata__", [None])[0]
+        if inspect.isfunction(maker):
+            makers[name] = maker
+            options |= inspect.signature(maker).parameters
+        else:
+            options[name] = parameter
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        for name, maker in makers.items():
+            given[name] = maker(**{option: given.pop(option) for option in inspect.signature(maker).parameters})
+        command(**given)
+
+    keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in options.values()]
+    run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
+    run.__annotations__ = {name: parameter.annotation for name, parameter in options.items()}
+    return run
 
 
 def _is_number(text: str) -> bool:

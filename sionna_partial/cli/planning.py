@@ -20,8 +20,9 @@ _CSV_HELP = "Columns tx_x,tx_y,tx_z,rx_x,rx_y,rx_z [m], gain_db [dB]."
 _OBJECTIVE_HELP = "Mean predicted coverage, or the gain of the worst tenth of the receivers."
 
 
+@opt.with_options
 def calibrate(
-    map_path: opt.Map,
+    *,
     measurements: Annotated[Path, typer.Option(metavar="CSV", help=_CSV_HELP, show_default=False)],
     out: Annotated[
         Path, typer.Option(help="Folder for the calibrated map, the numbers and a picture.", show_default=False)
@@ -30,30 +31,25 @@ def calibrate(
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     max_depth: opt.MaxDepth = 6,
     diffraction: opt.Diffraction = True,
-    strict: opt.Strict = False,
-    height_band: opt.HeightBand = None,
-    up: opt.Up = None,
-    wall_height: opt.WallHeight = None,
+    partial: opt.PartialMap,
 ) -> None:
     """Find the material of a building from measured path gains.
 
     The folder --out gets the map with the calibrated material, the numbers as JSON, and a picture. predict takes the
     folder as a map.
     """
-    scene_settings, settings = opt.settings_of(material, frequency, max_depth, diffraction)
+    settings = opt.settings_of(frequency, material, max_depth, diffraction)
     from sionna_partial.measurements.measurements import measurements_of
 
     measured = measurements_of(measurements)
-    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with reporting(None, command=True) as report:
         report(0.0, "loading Sionna RT")
         result = sp.calibrate_materials(
             partial,
             measured,
-            start=scene_settings.material if material else None,
-            trace_settings=settings,
-            scene_settings=scene_settings,
+            start=settings["scene_settings"].material if material else None,
+            **settings,
             progress=report,
         )
         with atomic_files(out) as folder:
@@ -64,30 +60,23 @@ def calibrate(
     opt.print_files(out, [CALIBRATED_FILE, "calibration.json", "calibration.png"])
 
 
+@opt.with_options
 def place(
-    map_path: opt.Map,
+    *,
     out: Annotated[Path, typer.Option(help="Folder for the numbers and a picture.", show_default=False)],
     objective: Annotated[Objective, typer.Option(help=_OBJECTIVE_HELP)] = "coverage",
     threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
     height: Annotated[float, typer.Option(help="Height of the transmitter [m].")] = DEFAULT_HEIGHT_M,
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     seed: Annotated[int, typer.Option(help="Seed of the positions that are compared.")] = 0,
-    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
-    material: opt.MaterialText = "",
-    max_depth: opt.MaxDepth = 6,
-    diffraction: opt.Diffraction = True,
+    settings: opt.Settings,
     predictor: opt.PredictorName = "",
-    strict: opt.Strict = False,
-    height_band: opt.HeightBand = None,
-    up: opt.Up = None,
-    wall_height: opt.WallHeight = None,
+    partial: opt.PartialMap,
 ) -> None:
     """Find a good position for a transmitter on a partial map.
 
     The folder --out gets the position and the search as JSON, and a picture.
     """
-    scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
-    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
@@ -99,8 +88,7 @@ def place(
             seed=seed,
             rx_height_m=rx_height,
             predictor=predictor or None,
-            scene_settings=scene_settings,
-            trace_settings=trace_settings,
+            **settings,
             progress=report,
         )
         with atomic_files(out) as folder:
@@ -115,8 +103,9 @@ def place(
     opt.print_files(out, ["placement.json", "placement.png"])
 
 
+@opt.with_options
 def next_views(
-    map_path: opt.Map,
+    *,
     out: Annotated[Path, typer.Option(help="Folder for the poses and a picture.", show_default=False)],
     tx: Annotated[
         str,
@@ -132,16 +121,12 @@ def next_views(
     threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
     field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
     range_m: opt.Range = SensorSettings.range_m,
-    strict: opt.Strict = False,
-    height_band: opt.HeightBand = None,
-    up: opt.Up = None,
-    wall_height: opt.WallHeight = None,
+    partial: opt.PartialMap,
 ) -> None:
     """Rank poses where a robot learns most about the coverage per metre driven.
 
     The folder --out gets the poses as YAML, as in a geometry_msgs/PoseArray, and a picture.
     """
-    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with reporting(None, command=True) as report:
         report(0.0, "predicting")

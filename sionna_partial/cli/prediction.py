@@ -9,8 +9,8 @@ import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
 from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.progress import reporting
-from sionna_partial.settings import Policy, SceneSettings, SensorSettings
+from sionna_partial.progress import part_of, reporting
+from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 """Formats of a coverage map."""
@@ -19,18 +19,16 @@ FRAMES = 50
 """About the number of frames in an animation."""
 
 
+@opt.with_options
 def predict(
-    map_path: opt.Map,
+    *,
     out: Annotated[Path, typer.Option(help="Folder for the coverage files.", show_default=False)],
     tx: Annotated[
         str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given.")
     ] = "",
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
-    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
-    material: opt.MaterialText = "",
-    max_depth: opt.MaxDepth = 6,
-    diffraction: opt.Diffraction = True,
+    settings: opt.Settings,
     predictor: opt.PredictorName = "",
     measurements: Annotated[
         Path | None, typer.Option(help="CSV of gains measured of this transmitter.", show_default=False)
@@ -38,18 +36,13 @@ def predict(
     receivers: Annotated[
         str, typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage.")
     ] = "indoor",
-    strict: opt.Strict = False,
-    height_band: opt.HeightBand = None,
-    up: opt.Up = None,
-    wall_height: opt.WallHeight = None,
+    partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
     position = opt.parse_position(tx) if tx else None
     suffixes = [_parse_format(name) for name in formats]
-    scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
-    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out)
     with reporting(None, command=True) as report:
         report(0.0, "loading the predictor")
@@ -59,12 +52,11 @@ def predict(
             rx_height_m=rx_height,
             spacing_m=spacing,
             predictor=predictor or None,
-            scene_settings=scene_settings,
-            trace_settings=trace_settings,
+            **settings,
             measurements=measurements,
             receivers=receivers,
             memory_gb=memory,
-            progress=lambda fraction, message: report(0.9 * fraction, message),
+            progress=part_of(report, 0.0, 0.9),
         )
         names = [f"coverage{suffix}" for suffix in dict.fromkeys(suffixes)]
         with atomic_files(out) as folder:
@@ -74,34 +66,29 @@ def predict(
     opt.print_files(out, names)
 
 
+@opt.with_options
 def export_scene(
-    map_path: opt.Map,
+    *,
     out: Annotated[Path, typer.Option(help="New or empty folder for the scene.", show_default=False)],
     material: opt.MaterialText = "",
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
-    strict: opt.Strict = False,
-    height_band: opt.HeightBand = None,
-    up: opt.Up = None,
-    wall_height: opt.WallHeight = None,
+    partial: opt.PartialMap,
 ) -> None:
     """Write a map as a scene folder that stock Sionna RT loads."""
     settings = SceneSettings(material=opt.parse_material(material))
     settings.material.require_frequency(frequency)
-    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     scene = sp.export_scene(partial, out, settings, frequency_hz=frequency)
     opt.print_files(scene.parent, [scene.name])
 
 
+@opt.with_options
 def explore(
+    *,
     out: Annotated[Path, typer.Option(help="Folder for the maps.", show_default=False)],
     home: Annotated[Path | None, typer.Option(help="Map of a complete home. Default: one made from --seed.")] = None,
     steps: Annotated[list[int], typer.Option(help="Robot steps, such as --steps 9 --steps 99.")] = [50, 100, 150, 200],  # noqa: B006
     seed: Annotated[int, typer.Option(help="Seed of the robot, and of the home that is made.")] = 0,
-    field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
-    range_m: opt.Range = SensorSettings.range_m,
-    range_noise: opt.RangeNoise = SensorSettings.range_noise_m,
-    drift: opt.Drift = SensorSettings.drift_m_per_m,
-    missed_walls: opt.MissedWalls = SensorSettings.missed_wall_fraction,
+    sensor: opt.Sensor,
     policy: Annotated[Policy, typer.Option(help="Choice of frontiers: at random, or for the coverage.")] = "random",
     tx: Annotated[
         str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]: of the policy, and predicted in the animation.")
@@ -113,7 +100,6 @@ def explore(
 
     The folder --out gets the partial maps, the complete one, a picture and an animation.
     """
-    sensor = SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
     position = opt.parse_position(tx) if tx else None
     require_writable(out)
     with reporting(None, command=True) as report:
@@ -127,7 +113,7 @@ def explore(
             sensor=sensor,
             policy=policy,
             tx=position,
-            progress=lambda fraction, message: report(0.1 + 0.4 * fraction, message),
+            progress=part_of(report, 0.1, 0.5),
         )
         asked, suffix = exploration.at(steps), ".yaml" if complete.mesh is None else ".npz"
         maps = {f"steps_{count:03d}{suffix}": partial for count, partial in zip(asked.steps, asked.maps, strict=True)}

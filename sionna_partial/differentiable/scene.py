@@ -59,7 +59,7 @@ from sionna_partial.prediction.paper_networks import (
     tf,
 )
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.unobserved import is_enclosed, lengths_in_unknown_m
+from sionna_partial.prediction.unobserved import lengths_in_unknown_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
@@ -342,8 +342,9 @@ class _Legs:
     """The straight legs of the Q indirect paths: what moves with the transmitter, and how much of it is unobserved.
 
     `paths` are their numbers (Q,), `rx` their receivers (Q,), `unobserved_m` their lengths in unknown cells as traced
-    (Q,) [m], and `strongest` is the strongest of them to each receiver (N,), -1 where there is none. Legs join nodes,
-    which are numbered in this order: the transmitter, the receivers, and all vertices, path by path.
+    (Q,) [m], also of links that a complete map encloses, which nobody asks for, and `strongest` is the strongest of
+    them to each receiver (N,), -1 where there is none. Legs join nodes, which are numbered in this order: the
+    transmitter, the receivers, and all vertices, path by path.
     """
 
     def __init__(self, partial: PartialMap, paths: PathSet) -> None:
@@ -359,9 +360,7 @@ class _Legs:
         same = of_path[:-1] == of_path[1:]
         self._of_path, self._start, self._end = of_path[:-1][same], nodes[:-1][same], nodes[1:][same]
         self._base = nodes_m[self._start], nodes_m[self._end]
-        tx_m = np.broadcast_to(paths.base.tx_m, (len(self.rx), 3))
-        open_ended = ~is_enclosed(partial, tx_m, paths.rx_m[self.rx])
-        self._exact_m = lengths_in_unknown_m(partial, *self._base) * open_ended[self._of_path]
+        self._exact_m = lengths_in_unknown_m(partial, *self._base)
         self.unobserved_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
         self.strongest = np.full(len(paths.rx_m), -1)
         weakest_first = np.argsort(paths.power[self.paths], kind="stable")

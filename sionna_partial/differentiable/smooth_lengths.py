@@ -25,14 +25,11 @@ class SmoothLengths:
     on which it runs along an edge. The first derivatives are continuous, and exact to rounding, except for segments
     that run along a line through the centres of cells, or are upright above one: there they are the mean of both sides.
 
-    Everything outside the grid is unknown. On a complete map nothing unknown can be reached, and lengths in unknown
-    cells are 0 by definition.
+    Everything outside the grid is unknown. Lengths are those in the cells, also on a complete map.
     """
 
     def __init__(self, partial: PartialMap, kind: CellState) -> None:
         mask = np.pad(partial.state == kind, 1, constant_values=kind == CellState.UNKNOWN)
-        if kind == CellState.UNKNOWN and partial.is_complete:
-            mask[:] = False
         self._mask = mask.astype(np.int8)
         self._even = _even_patches(mask)
         self._first_centre_m = np.array(partial.origin_m) - 0.5 * partial.resolution_m

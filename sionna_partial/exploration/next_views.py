@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 import yaml
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 from scipy.special import entr
@@ -34,6 +33,7 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
+from sionna_partial.planar import largest_part
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import unknown_in_view
@@ -332,8 +332,7 @@ def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]
     if not free.any():
         raise MapError("the map has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
     if start is None:
-        labels, _ = ndimage.label(free)
-        cells = np.argwhere(labels == np.bincount(labels[free]).argmax())
+        cells = np.argwhere(largest_part(free))
         near = cells - cells.mean(axis=0)
     else:
         remedy = "give x and y of the robot in metres, in a free cell."

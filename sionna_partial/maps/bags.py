@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError, SionnaPartialError
-from sionna_partial.files import input_path, open_regular
-from sionna_partial.maps.partial_map import MAX_CELLS, MapWarning, PartialMap, grid_array
+from sionna_partial.files import decoding, input_path, open_regular
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array
 from sionna_partial.maps.ros_map import states_from_percent, turn_grid
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -107,15 +107,12 @@ def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]
     for file in source.iterdir() if os.path.isdir(source) else [source]:
         open_regular(file, "path", error, MAX_BAG_BYTES).close()
     store = Stores.ROS1_NOETIC if source.suffix.lower() == ".bag" else Stores.LATEST
-    try:
-        with AnyReader([source], default_typestore=get_typestore(store)) as reader:
-            yield Recording(source, reader, error)
-    except (SionnaPartialError, MapWarning):
-        raise
-    except Exception as cause:  # the reader fails in many ways on damaged files
-        reason = " ".join(f"{type(cause).__name__}: {cause}".split())[:200]
-        remedy = "record it again, or repair it with rosbag reindex (ROS 1) or ros2 bag reindex."
-        raise error(f"path = '{source}' is damaged or no rosbag ({reason}): {remedy}") from cause
+    remedy = "record it again, or repair it with rosbag reindex (ROS 1) or ros2 bag reindex."
+    with (
+        decoding(source, "no rosbag", error, remedy),
+        AnyReader([source], default_typestore=get_typestore(store)) as reader,
+    ):
+        yield Recording(source, reader, error)
 
 
 def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time_s: float | None = None) -> PartialMap:

@@ -16,7 +16,7 @@ from scipy import ndimage
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.files import input_path, read_bytes
+from sionna_partial.files import decoding, input_path, read_bytes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -112,16 +112,11 @@ def map_from_drawing(
     unit = _given_unit(unit_m)
     names = _given_layers(wall_layers)
     content = read_bytes(source, "path", MapError, MAX_DRAWING_BYTES, "purge it, or delete what is no wall.")
-    try:
+    with decoding(source, "no DXF", MapError):
         drawing = _opened(content)
         layers = _wall_layers(source, drawing, names)
         segments = _segments(source, drawing, layers)
         unit = unit or _unit(source, drawing, segments)
-    except (MapError, MapWarning):
-        raise
-    except Exception as error:  # decoders fail in many ways on damaged files
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise MapError(f"path = '{source}' is damaged or no DXF ({reason}): export it again.") from error
     segments = segments * unit
     extent = np.ptp(segments.reshape(-1, 2), axis=0)
     if not POSSIBLE_M[0] <= extent.max() <= POSSIBLE_M[1]:

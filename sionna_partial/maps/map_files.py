@@ -16,7 +16,15 @@ from scipy.ndimage import binary_dilation
 from sionna_partial.checks import number_of, require_bool, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.files import CALIBRATED_FILE, SCENE_FILES, atomic_write, input_path, output_path, read_bytes
+from sionna_partial.files import (
+    CALIBRATED_FILE,
+    SCENE_FILES,
+    atomic_write,
+    decoding,
+    input_path,
+    output_path,
+    read_bytes,
+)
 from sionna_partial.maps.bags import BAG_SUFFIXES, is_recording, map_from_bag
 from sionna_partial.maps.drawings import DRAWING_SUFFIXES, map_from_drawing
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, MeshReading, mesh_map
@@ -387,7 +395,7 @@ def _read_scene(source: Path, reading: MeshReading) -> PartialMap:
 
 
 def _read_npz(source: Path) -> PartialMap:
-    try:
+    with decoding(source, "was not written by save_map", MapError, "save it again."):
         content = io.BytesIO(read_bytes(source, "path", MapError, MAX_MESH_BYTES))
         with zipfile.ZipFile(content) as archive:
             sizes = {entry.filename: entry.file_size for entry in archive.infolist()}
@@ -407,9 +415,4 @@ def _read_npz(source: Path) -> PartialMap:
                 materials = tuple(None if record is None else Material(**record) for record in records)
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
-    except MapError:
-        raise
-    except Exception as error:  # zip, zlib and NumPy fail in many ways on damaged files
-        what = f"is damaged or was not written by save_map ({error})"
-        raise MapError(f"path = '{source}' {what}: save it again.") from error
     return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material)

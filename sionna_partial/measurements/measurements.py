@@ -1,13 +1,10 @@
 """Measured path gains at known positions: mappings, data frames and CSV files -> Measurements."""
 
-import csv
-import io
 import logging
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
-from sionna_partial.files import read_bytes
+from sionna_partial.files import read_columns
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.tracing.trace import clear_of_walls, nearest_m
 
@@ -25,9 +22,6 @@ LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
 
 OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 """Up to this gain, noise included, a link counts as an outage [dB]."""
-
-MOST_BYTES = 50_000_000
-"""Largest CSV that is read."""
 
 SAME_M, MOST_LINKS = 0.01, 3000
 """Links whose ends lie in the same cubes are one link [m]; number of links that are evaluated at most."""
@@ -168,7 +162,8 @@ def measurements_of(source: Any) -> Measurements:
         return source
     given = f"measurements of type {type(source).__name__}"
     if isinstance(source, str | os.PathLike):
-        given, source = f"measurements '{source}'", _read_csv(Path(source))
+        given = f"measurements '{source}'"
+        source = read_columns(source, "measurements", MeasurementError, _CSV_COLUMNS, _GIVE)
     gain_db = _field(source, "gain_db")
     if gain_db is None:
         raise MeasurementError(f"gain_db is missing from {given}: {_GIVE}")
@@ -234,52 +229,6 @@ def _ends(source: Any, name: str) -> Any:
         shapes = ", ".join(str(column.shape) for column in columns)
         raise MeasurementError(f"{name}_x, {name}_y and {name}_z have shapes {shapes}: give one value for each link.")
     return np.stack(columns, axis=-1)
-
-
-def _read_csv(path: Path) -> dict[str, list[float]]:
-    """Read those columns of a CSV that measurements have."""
-    given = f"measurements = '{path}'"
-    try:
-        text = read_bytes(path, "measurements", MeasurementError, MOST_BYTES, "average links.").decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise MeasurementError(f"{given} cannot be read ({error}): {_GIVE}") from error
-    if text and text[-1] not in "\r\n":
-        last = text.splitlines()[-1][-40:]
-        raise MeasurementError(
-            f"{given} ends in {last!r}, without a line end: the file may be cut. Copy it again, or add a line end."
-        )
-    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    try:
-        return _columns(given, rows)
-    except csv.Error as error:
-        raise MeasurementError(f"{given}, line {rows.line_num} cannot be read ({error}): {_GIVE}") from error
-
-
-def _columns(given: str, rows: Any) -> dict[str, list[float]]:
-    header = [name.strip() for name in next(rows, [])]
-    commas = "separate columns by commas, and write decimal points."
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise MeasurementError(f"{given} has the header {header[0][:80]!r}: {commas}")
-    found: dict[str, list[float]] = {name: [] for name in header if name in _CSV_COLUMNS}
-    columns = [(column, name) for column, name in enumerate(header) if name in found]
-    if len(columns) > len(found):
-        twice = next(name for name in found if header.count(name) > 1)
-        raise MeasurementError(f"{given} has {header.count(twice)} columns {twice}: keep one of them.")
-    for row in rows:
-        if len(row) > len(header):
-            raise MeasurementError(
-                f"{given}, line {rows.line_num} has {len(row)} cells for {len(header)} columns: {commas}"
-            )
-        for column, name in columns if row else ():
-            text = row[column] if column < len(row) else ""
-            try:
-                found[name].append(float(text))
-            except ValueError as error:
-                remedy = "write decimal points." if "," in text else "correct the line, or leave it out."
-                raise MeasurementError(
-                    f"{given}, line {rows.line_num}: {name} = {text[:80]!r} is not a number: {remedy}"
-                ) from error
-    return found
 
 
 def _numbers(name: str, values: ArrayLike, *, known: bool = True) -> NDArray[np.float64]:

@@ -93,10 +93,8 @@ class PlacementArea:
 
     def visibility(self, positions_m: NDArray[np.float64], range_m: float = math.inf) -> NDArray[np.float64]:
         """How well positions (C, 3) see each receiver, without tracing: (C, N) in [0, 1], 0 beyond `range_m`."""
-        start_m, end_m = _pairs(positions_m, self.rx_m)
-        walled = walled_lengths_m(self.partial, start_m, end_m) > 1e-6
-        distance_m = np.linalg.norm(end_m - start_m, axis=1)
-        seen = np.exp(-unobserved_lengths_m(self.partial, start_m, end_m) / _UNSEEN_LENGTH_M)
+        walled, unobserved_m, distance_m = _lines(self.partial, positions_m, self.rx_m)
+        seen = np.exp(-unobserved_m / _UNSEEN_LENGTH_M)
         seen *= np.where(walled, _WALL_FACTOR * np.exp(-distance_m / _WALL_LENGTH_M), distance_m <= range_m)
         return seen.reshape(len(positions_m), len(self.rx_m))
 
@@ -148,12 +146,10 @@ def _weights(area: PlacementArea, model: Predictor | None) -> NDArray[np.float64
         return weight
     positions_m = area.positions(0)
     some_m = positions_m[np.unique(np.linspace(0, len(positions_m) - 1, _INDOOR_POSITIONS).astype(np.intp))]
-    start_m, end_m = _pairs(some_m, area.rx_m[weight == 0.0])
-    walled = walled_lengths_m(area.partial, start_m, end_m) > 1e-6
-    distance_m = np.linalg.norm(end_m - start_m, axis=1)
+    walled, unobserved_m, distance_m = _lines(area.partial, some_m, area.rx_m[weight == 0.0])
     phi = LinkFeatures(
         link_state=np.where(walled, LinkState.NLOS, LinkState.LOS).astype(np.uint8),
-        unobserved_distance_m=np.minimum(unobserved_lengths_m(area.partial, start_m, end_m), distance_m),
+        unobserved_distance_m=np.minimum(unobserved_m, distance_m),
         distance_m=distance_m,
         gain_db=np.full(len(distance_m), GAIN_FLOOR_DB),
     )
@@ -166,9 +162,13 @@ def _grid(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, 
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z_m)])
 
 
-def _pairs(start_m: NDArray[np.float64], end_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the ends (A B, 3) of the lines from each of A points to each of B others."""
-    return np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
+def _lines(
+    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Whether each line (A B,) from A points to B others meets a wall, its unobserved length, and its length [m]."""
+    start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
+    walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
+    return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)
 
 
 def _boustrophedon(points_m: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.checks import Progress, no_progress, require, require_number, settings_or_default
+from sionna_partial.checks import Progress, no_progress, require, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write, temporary_folder
@@ -184,19 +184,18 @@ def place_transmitter(
     """
     settings = PlacementSettings(**options)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
-    area, model = search.area, search.model
-    thinned = area.thinned(RECEIVERS)
-    with reporting(progress) as report, temporary_folder() as folder:
-        report(0.0, "building the scene")
-        objective = _Objective(search, Tracer(partial, folder, search.trace_settings, search.scene_settings))
-        report(0.1, "comparing positions")
-        starts_m = search.starts(thinned, _per_area(thinned, *STARTS))
-        start_scores = objective.scores(starts_m, thinned)
-        routes = _refined(objective, thinned, starts_m, start_scores, report)
-        report(0.9, "evaluating the best positions")
-        values = [objective.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
-        report(1.0, "done")
+    with temporary_folder() as folder:
+        search = Search.on(partial, folder, settings, predictor, scene_settings, trace_settings)
+        area, model = search.area, search.model
+        thinned = area.thinned(RECEIVERS)
+        with reporting(progress) as report:
+            report(0.0, "comparing positions")
+            starts_m = search.starts(thinned, _per_area(thinned, *STARTS))
+            start_scores = search.scores(starts_m, thinned)
+            routes = _refined(search, thinned, starts_m, start_scores, report)
+            report(0.9, "evaluating the best positions")
+            values = [search.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
+            report(1.0, "done")
     scores = [placement_score(each, area.weight, settings) for each in values]
     best = int(np.argmax(scores))
     return TransmitterPlacement(
@@ -215,19 +214,18 @@ def place_transmitter(
         provenance={
             "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
             "predictor_sha256": "" if model is None else model.fingerprint,
-            "scene_settings": asdict(search.scene_settings),
-            "trace_settings": asdict(search.trace_settings),
+            "scene_settings": asdict(search.tracer.scene_settings),
+            "trace_settings": asdict(search.tracer.settings),
         },
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search for transmitters needs: checked settings, predictor (None on a complete map) and area."""
+    """What a search for transmitters needs: settings, tracer, predictor (None on a complete map) and area."""
 
     settings: PlacementSettings
-    scene_settings: SceneSettings
-    trace_settings: TraceSettings
+    tracer: Tracer
     model: Predictor | None
     area: PlacementArea
 
@@ -235,32 +233,29 @@ class Search:
     def on(
         cls,
         partial: PartialMap,
+        folder: Path,
         settings: PlacementSettings,
         predictor: Predictor | str | Path | None,
         scene_settings: SceneSettings | None,
         trace_settings: TraceSettings | None,
     ) -> "Search":
-        """Check the settings against a map."""
-        trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
-        scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
-        trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
+        """Check the settings against a map, whose scene will be written to an existing folder."""
+        tracer = Tracer(partial, folder, *checked_settings(partial, trace_settings, scene_settings))
         low_m, high_m = partial.height_range_m
         for name in ("tx_height_m", "rx_height_m"):
             height_m = getattr(settings, name)
             require_number(name, height_m, low_m, high_m, open_low=True)
             require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
-        model = None
-        if not partial.is_complete:
-            model = Predictor.load(predictor)
+        model = None if partial.is_complete else Predictor.load(predictor)
         area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
-        return cls(settings, scene_settings, trace_settings, model, area)
+        return cls(settings, tracer, model, area)
 
     def starts(self, area: PlacementArea, count: int) -> NDArray[np.float64]:
         """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
         positions_m, range_m = area.positions(int(self.settings.seed)), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
             loss = 10.0 ** (-self.settings.threshold_db / 20.0)
-            range_m = SPEED_OF_LIGHT_M_S / self.trace_settings.frequency_hz / (4.0 * math.pi) * loss
+            range_m = SPEED_OF_LIGHT_M_S / self.tracer.settings.frequency_hz / (4.0 * math.pi) * loss
         seen = area.visibility(positions_m, range_m)
         scores = np.array([placement_score(values, area.weight, self.settings) for values in seen])
         fraction = area.weight / area.weight.sum()
@@ -272,14 +267,12 @@ class Search:
             chosen.append(int(np.argmax(left)))
         return positions_m[chosen]
 
-    def links(
-        self, tracer: Tracer, positions_m: NDArray[np.float64], area: PlacementArea
-    ) -> tuple[LinkPrediction, NDArray[np.bool_]]:
+    def links(self, positions_m: NDArray[np.float64], area: PlacementArea) -> tuple[LinkPrediction, NDArray[np.bool_]]:
         """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
-        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.trace_settings.frequency_hz)
+        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.tracer.settings.frequency_hz)
         features = []
         for tx_m, kept in zip(positions_m, far, strict=True):
-            paths = tracer.paths(tx_m, area.rx_m[kept], no_progress)
+            paths = self.tracer.paths(tx_m, area.rx_m[kept], no_progress)
             phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
             features.append(phi)
         phi = LinkFeatures.concatenate(features)
@@ -289,6 +282,16 @@ class Search:
             columns[column.name] = np.full(far.shape, OUTAGE[column.name])
             columns[column.name][far] = getattr(found, column.name)
         return LinkPrediction(**columns), far
+
+    def values(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+        """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
+        links, far = self.links(positions_m, area)
+        return np.where(far, link_values(links, self.settings), 1.0 if self.settings.objective == "coverage" else 0.0)
+
+    def scores(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+        """Scores (P,) of positions (P, 3) [m]."""
+        values = self.values(positions_m, area)
+        return np.array([placement_score(each, area.weight, self.settings) for each in values])
 
 
 def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDArray[np.float64]:
@@ -315,28 +318,8 @@ def _counted(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)
 
 
-@dataclass(frozen=True, eq=False)
-class _Objective:
-    """The objective at transmitter positions: links are traced and predicted."""
-
-    search: Search
-    tracer: Tracer
-
-    def values(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
-        """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
-        settings = self.search.settings
-        links, far = self.search.links(self.tracer, positions_m, area)
-        return np.where(far, link_values(links, settings), 1.0 if settings.objective == "coverage" else 0.0)
-
-    def scores(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
-        """Scores (P,) of positions (P, 3) [m]."""
-        return np.array(
-            [placement_score(each, area.weight, self.search.settings) for each in self.values(positions_m, area)]
-        )
-
-
 def _refined(
-    objective: _Objective,
+    search: Search,
     area: PlacementArea,
     starts_m: NDArray[np.float64],
     start_scores: NDArray[np.float64],
@@ -351,7 +334,7 @@ def _refined(
         neighbours_m[..., :2] = np.round(neighbours_m[..., :2], 3)
         stands = area.stands(neighbours_m)
         scores = np.full(stands.shape, -math.inf)
-        scores[stands] = objective.scores(neighbours_m[stands], area)
+        scores[stands] = search.scores(neighbours_m[stands], area)
         for (route_m, route_scores), around_m, around_scores in zip(routes, neighbours_m, scores, strict=True):
             if around_scores.max() > route_scores[-1]:
                 route_m.append(around_m[around_scores.argmax()])

@@ -20,7 +20,6 @@ from sionna_partial.placement.placement import RECEIVERS, Search
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.progress import reporting
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import Tracer
 
 MOST_TRANSMITTERS = 16
 
@@ -130,24 +129,23 @@ def place_transmitters(
     settings = PlacementSettings(**options)
     require(settings.objective == "coverage", "objective", settings.objective, "several are placed for 'coverage'.")
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
-    area = search.area
-    if rx is not None:
-        rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
-        area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
-    some = area.thinned(2 * RECEIVERS)
-    with reporting(progress) as report, temporary_folder() as folder:
-        report(0.0, "building the scene")
-        tracer = Tracer(partial, folder, search.trace_settings, search.scene_settings)
-        candidates_m = _candidates(search, some, max(CANDIDATES, 2 * count))
-        report(0.2, "predicting candidates")
-        covered = _covered(search, tracer, some, candidates_m)
-        weight = some.weight / some.weight.sum()
-        chosen, scores = _greedy(covered, weight, count)
-        chosen = _swapped(covered, weight, chosen)
-        report(0.9, "evaluating the best positions")
-        values = _covered(search, tracer, area, candidates_m[chosen]).any(axis=1).mean(axis=0)
-        report(1.0, "done")
+    with temporary_folder() as folder:
+        search = Search.on(partial, folder, settings, predictor, scene_settings, trace_settings)
+        area = search.area
+        if rx is not None:
+            rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
+            area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
+        some = area.thinned(2 * RECEIVERS)
+        with reporting(progress) as report:
+            report(0.0, "predicting candidates")
+            candidates_m = _candidates(search, some, max(CANDIDATES, 2 * count))
+            covered = _covered(search, some, candidates_m)
+            weight = some.weight / some.weight.sum()
+            chosen, scores = _greedy(covered, weight, count)
+            chosen = _swapped(covered, weight, chosen)
+            report(0.9, "evaluating the best positions")
+            values = _covered(search, area, candidates_m[chosen]).any(axis=1).mean(axis=0)
+            report(1.0, "done")
     return NetworkPlacement(
         positions_m=candidates_m[chosen],
         score=float(values @ area.weight / area.weight.sum()),
@@ -173,11 +171,9 @@ def _candidates(search: Search, area: PlacementArea, count: int) -> NDArray[np.f
     return chosen_m
 
 
-def _covered(
-    search: Search, tracer: Tracer, area: PlacementArea, candidates_m: NDArray[np.float64]
-) -> NDArray[np.bool_]:
+def _covered(search: Search, area: PlacementArea, candidates_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
-    links, far = search.links(tracer, candidates_m, area)
+    links, far = search.links(candidates_m, area)
     latents = JointLatents(area.partial)
     gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [int(search.settings.seed)])[1]
     return (gain_db > search.settings.threshold_db) | ~far

@@ -24,6 +24,7 @@ from shapely.ops import split, substring
 from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.planar import largest_part
 from sionna_partial.settings import HomeKind
 from sionna_partial.simulation.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
 from sionna_partial.simulation.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
@@ -383,7 +384,7 @@ def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> 
     grid = {"out_shape": shape, "transform": Affine(resolution_m, 0, x, 0, resolution_m, y), "dtype": np.uint8}
     lines = rasterize([plan.lines], all_touched=True, **grid).astype(bool)
     inside = rasterize([plan.free], **grid).astype(bool) & ~lines
-    inside = _largest(inside & ~_swollen(inside, resolution_m, plan))
+    inside = largest_part(inside & ~_swollen(inside, resolution_m, plan))
     if not plan.doors.is_empty:
         inside &= ~rasterize([plan.doors], all_touched=True, **grid).astype(bool)
     around = ndimage.generate_binary_structure(2, 1 + corners)
@@ -393,12 +394,6 @@ def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> 
         inside |= shut & ~_swollen(shut, resolution_m, plan) & ~ndimage.binary_dilation(inside, around)
     beside = ndimage.binary_dilation(inside, around, iterations=wall_cells)
     return np.where(inside, CellState.FREE, np.where(beside, CellState.WALL, CellState.UNKNOWN)).astype(np.uint8)
-
-
-def _largest(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Largest connected part of a mask."""
-    labels, _ = ndimage.label(mask)
-    return labels == np.argmax(np.bincount(labels[mask]))
 
 
 def _swollen(inside: NDArray[np.bool_], resolution_m: float, plan: _Plan) -> NDArray[np.bool_]:

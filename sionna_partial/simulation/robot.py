@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
+from sionna_partial.planar import largest_part
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import Camera
 from sionna_partial.simulation.frontiers import Frontier, find_frontiers, part_of, wide_frontiers
@@ -213,15 +214,10 @@ class Robot:
 def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float, NDArray[np.bool_]]:
     """Largest radius [cells] of a robot that gets around, and the cells where its centre can be."""
     distance = ndimage.distance_transform_edt(free) - 0.5
-    part = _largest_part(free)
+    part = largest_part(free)
     for radius in np.array(ROBOT_RADII_M) / resolution_m:
-        roomy = _largest_part(part & (distance >= radius))
+        roomy = largest_part(part & (distance >= radius))
         covered = part & (ndimage.distance_transform_edt(~roomy) <= radius + 1.0)
         if roomy.any() and covered.sum() >= ROAMED_FRACTION * part.sum():
             break
     return float(radius), roomy
-
-
-def _largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    labels, _ = ndimage.label(mask)
-    return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from sionna_partial.checks import real_array, require, require_choice, require_whole
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
@@ -55,7 +56,8 @@ class Antennas:
         require(angles.shape in ((3,), (count, 3)) and bool(np.isfinite(angles).all()), name, orientation_rad, remedy)
         wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
         positions_m = wavelength_m * np.array(array.normalized_positions, dtype=np.float64).T
-        return cls(positions_m, array.antenna_pattern.patterns, rotation_matrices(angles.reshape(-1, 3)))
+        rotation = Rotation.from_euler("ZYX", angles.reshape(-1, 3)).as_matrix()  # TR 38.901, eq. 7.1-4
+        return cls(positions_m, array.antenna_pattern.patterns, rotation)
 
     def __len__(self) -> int:
         """Return the number of antennas, K A."""
@@ -106,14 +108,3 @@ def directions(
         np.stack([cos_t * cos_p, cos_t * sin_p, -sin_t], axis=1),
         np.stack([-sin_p, cos_p, np.zeros_like(sin_p)], axis=1),
     )
-
-
-def rotation_matrices(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations (E, 3, 3) by angles (E, 3) about z, y and x (TR 38.901, eq. 7.1-4)."""
-    (sin_a, sin_b, sin_c), (cos_a, cos_b, cos_c) = np.sin(angles_rad).T, np.cos(angles_rad).T
-    rows = (
-        (cos_a * cos_b, cos_a * sin_b * sin_c - sin_a * cos_c, cos_a * sin_b * cos_c + sin_a * sin_c),
-        (sin_a * cos_b, sin_a * sin_b * sin_c + cos_a * cos_c, sin_a * sin_b * cos_c - cos_a * sin_c),
-        (-sin_b, cos_b * sin_c, cos_b * cos_c),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.checks import Progress
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_mesh_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates, Wedges
@@ -132,11 +133,6 @@ def write_scene_of(
     geometry = build_scene(partial, scene_settings)
     xml = write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz)
     return PlanScene(xml, SHAPES, settings, geometry, find_wedges(geometry, open_ends=settings.open_ends))
-
-
-def part_of(report: Progress, low: float, high: float) -> Progress:
-    """Return what reports a part of the work, from one fraction to another."""
-    return lambda fraction, message: report(low + (high - low) * fraction, message)
 
 
 def _verified(

@@ -21,11 +21,11 @@ from sionna_partial.errors import BackendError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
-from sionna_partial.tracing.finder import part_of, write_scene_of
+from sionna_partial.tracing.finder import write_scene_of
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
 from sionna_partial.tracing.trace import checked_positions, checked_settings, link_summary
@@ -205,7 +205,7 @@ class PathSet:
             rx=self.rx_m,
             link_state=link_state.reshape(shape),
             gain_db=gain_db.reshape(shape),
-            **{field.name: getattr(paths, field.name) for field in fields(SolvedPaths)},
+            **vars(paths),
             settings=self._scene.settings,
             scene_settings=self._scene.scene_settings,
         )

@@ -41,7 +41,7 @@ class SolvedPaths:
 
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
         """Return the paths that an index array or a mask (P,) selects."""
-        return SolvedPaths(*(getattr(self, field.name)[index] for field in fields(self)))
+        return SolvedPaths(*(column[index] for column in vars(self).values()))
 
     def between(self, tx: int, rx: NDArray[np.int32]) -> "SolvedPaths":
         """Return the paths of transmitter `tx`, with receivers numbered by `rx`."""

@@ -21,12 +21,12 @@ from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
-from sionna_partial.progress import reporting
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Wedges
 from sionna_partial.tracing.engine import SceneSolver, engine_fault, load_sionna, open_scene
-from sionna_partial.tracing.finder import MeshScene, PlanScene, part_of, write_scene_of
+from sionna_partial.tracing.finder import MeshScene, PlanScene, write_scene_of
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import (
     DIFFRACTION,
@@ -225,7 +225,7 @@ class Tracer:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
         columns = PathColumns(max(1, self.settings.max_depth), self.polarisations)
         link_state, gain_db = self.fill(columns, tx_m, rx_m, report, valid)
-        found = {field.name: getattr(columns.paths(), field.name) for field in fields(SolvedPaths)}
+        found = vars(columns.paths())
         return TracedLinks(
             tx_m, rx_m, link_state, gain_db, **found, settings=self.settings, scene_settings=self.scene_settings
         )

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from trimesh.transformations import rotation_matrix, translation_matrix
 
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.files import read_bytes
+from sionna_partial.files import decoding, read_bytes
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
@@ -100,7 +100,7 @@ def confined_path(folder: Path, name: str, what: str) -> Path:
 def _read_triangles(path: Path, kind: str) -> Triangles:
     """Read the triangles of a mesh file in the axes of the file; nodes of a scene are placed by their transforms."""
     content = read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
-    try:
+    with decoding(path, f"no {kind.upper()} mesh", MapError):
         if kind == "gltf":
             json.loads(content)  # trimesh would look for another file
         stream, resolver = io.BytesIO(content), _Neighbours(os.fspath(path))
@@ -109,10 +109,6 @@ def _read_triangles(path: Path, kind: str) -> Triangles:
             scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, skip_materials=True)
             parts = [*_placed_parts(path, scene)]
         _require_whole(kind, content, sum(len(triangles) for _, triangles in parts))
-    except MapError:
-        raise
-    except Exception as error:  # decoders fail in many ways on damaged files
-        raise MapError(f"path = '{path}' is damaged or no {kind.upper()} mesh ({error}): export it again.") from error
     if not any(len(triangles) for _, triangles in parts):
         raise MapError(f"path = '{path}' holds 0 triangles: give a mesh with surfaces, not points or lines alone.")
     vertices, triangles = _concatenated(parts)

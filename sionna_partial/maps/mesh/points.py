@@ -19,7 +19,7 @@ from scipy import ndimage
 from sionna_partial.checks import real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.files import open_regular
+from sionna_partial.files import decoding, open_regular
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_BAND_M,
     DEFAULT_RESOLUTION_M,
@@ -73,7 +73,6 @@ POSE_M = 0.25
 """Sensor positions closer to one another than this are one [m]."""
 
 _HALF, _BITS = 1 << 20, 21
-_REMEDY = "export it again."
 
 
 def map_from_points(
@@ -149,14 +148,11 @@ def read_cloud(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike |
     most = MAX_WHOLE_BYTES if kind in ("pcd", "ply") else MAX_CLOUD_BYTES
     if f".{kind}" not in (*POINT_SUFFIXES, ".ply"):
         raise MapError(f"path = '{path}' is no point cloud: give one of {', '.join(POINT_SUFFIXES)}, .ply.")
-    with open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream:
-        try:
-            return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m)
-        except (MapError, MapWarning):
-            raise
-        except Exception as error:  # decoders fail in many ways on damaged files
-            reason = " ".join(str(error).split())[:200] or type(error).__name__
-            raise MapError(f"path = '{path}' is damaged or no {kind.upper()} ({reason}): {_REMEDY}") from error
+    with (
+        open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream,
+        decoding(path, f"no {kind.upper()}", MapError),
+    ):
+        return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m)
 
 
 def is_cloud(path: Path) -> bool:

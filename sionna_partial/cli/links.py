@@ -1,8 +1,7 @@
-"""Subcommand from a map to the channels of links: channels."""
+"""Subcommands from a map to links of several transmitters, and of antenna arrays: network, channels."""
 
-import csv
-import io
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,13 +9,10 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.errors import PositionError
-from sionna_partial.files import read_bytes, require_writable
-from sionna_partial.progress import reporting
-
-MAX_BYTES = 100_000_000
-"""Largest file of receivers that is read [bytes]."""
+from sionna_partial.files import atomic_files, read_columns, require_writable
+from sionna_partial.progress import part_of, reporting
 
 COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
 """Columns of positions, by any of these names."""
@@ -24,8 +20,59 @@ COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
 ROWS_BY_COLUMNS = "ROWSxCOLUMNS"
 
 
+@opt.with_options
+def network(
+    *,
+    tx: Annotated[
+        list[str],
+        typer.Option(metavar="X Y [Z]", help="Transmitter [m]; once for each.", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for coverage, network and picture.", show_default=False)],
+    tx_power: Annotated[float, typer.Option(help="Transmit power of each [dBm].")] = 20.0,
+    noise_figure: Annotated[float, typer.Option(help="Of the receivers [dB].")] = 7.0,
+    bandwidth: Annotated[float, typer.Option(help="Bandwidth [Hz].")] = 100e6,
+    load: Annotated[float, typer.Option(help="Fraction of time in which an interferer transmits.")] = 1.0,
+    sinr_threshold: Annotated[float, typer.Option(help="SINR that a receiver needs [dB].")] = 0.0,
+    spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.25,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
+    settings: opt.Settings,
+    predictor: opt.PredictorName = "",
+    partial: opt.PartialMap,
+    memory: opt.Memory = MEMORY_GB,
+) -> None:
+    """Predict best server, SINR and rate of several transmitters on a partial map."""
+    from sionna_partial.network import LinkBudget, transmit_powers_dbm
+
+    positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
+    powers_dbm = transmit_powers_dbm(tx_power, len(positions))
+    budget = LinkBudget(noise_figure, bandwidth, load, sinr_threshold)
+    require_writable(out)
+    with reporting(None, command=True) as report:
+        report(0.0, "loading the predictor")
+        coverage = sp.predict_map(
+            partial,
+            positions,
+            rx_height_m=rx_height,
+            spacing_m=spacing,
+            predictor=predictor or None,
+            **settings,
+            memory_gb=memory,
+            progress=part_of(report, 0.0, 0.8),
+        )
+        report(0.8, "drawing links together")
+        found = sp.network_map(coverage, tx_power_dbm=powers_dbm, **asdict(budget))
+        with atomic_files(out) as folder:
+            report(0.9, "writing")
+            for name in ("coverage.nc", "coverage.html"):
+                sp.save_coverage(coverage, folder / name)
+            sp.save_network(found, folder / "network.nc")
+            sp.plot_network(found).savefig(folder / "network.png")
+    opt.print_files(out, ["coverage.nc", "coverage.html", "network.nc", "network.png"])
+
+
+@opt.with_options
 def channels(
-    map_path: opt.Map,
+    *,
     tx: Annotated[
         str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z.", show_default=False)
     ],
@@ -45,21 +92,13 @@ def channels(
         tuple[float, float, float], typer.Option(metavar="A B C", help="Of the transmitter, about z, y, x [rad].")
     ] = (0.0, 0.0, 0.0),
     layout: Annotated[str, typer.Option(metavar="sionna|deepmimo", help="Axes of the arrays.")] = "sionna",
-    frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
-    material: opt.MaterialText = "",
-    max_depth: opt.MaxDepth = 6,
-    diffraction: opt.Diffraction = True,
-    strict: opt.Strict = False,
-    height_band: opt.HeightBand = None,
-    up: opt.Up = None,
-    wall_height: opt.WallHeight = None,
+    settings: opt.Settings,
+    partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
 ) -> None:
     """Trace a map, and write the channel impulse responses between antenna arrays."""
     position = (*opt.parse_position(tx), DEFAULT_HEIGHT_M)[:3]
     shapes = [_parse_shape(name, text) for name, text in (("array", array), ("rx-array", rx_array))]
-    scene_settings, trace_settings = opt.settings_of(material, frequency, max_depth, diffraction)
-    partial = sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
     require_writable(out.parent)
     with reporting(None, command=True) as report:
         report(0.0, "loading Sionna RT")
@@ -74,23 +113,22 @@ def channels(
         ]
         if rx == "grid":
             grid_m = _free_grid(partial, spacing, rx_height)
-            receivers_m = grid_m[valid_links(partial, position, grid_m, frequency)[2][0]]
+            receivers_m = grid_m[valid_links(partial, position, grid_m, settings["trace_settings"].frequency_hz)[2][0]]
         else:
             receivers_m = _read_positions(Path(rx))
         links = sp.trace_links(
             partial,
             position,
             receivers_m,
-            trace_settings=trace_settings,
-            scene_settings=scene_settings,
+            **settings,
             memory_gb=memory,
-            progress=lambda fraction, message: report(0.5 * fraction, message),
+            progress=part_of(report, 0.0, 0.5),
         )
         sp.save_channels(
             links,
             out,
             layout=layout,  # type: ignore[arg-type]
-            progress=lambda fraction, message: report(0.5 + 0.5 * fraction, message),
+            progress=part_of(report, 0.5, 1.0),
             tx_array=arrays[0],
             rx_array=arrays[1],
             tx_orientation_rad=orientation,
@@ -120,19 +158,11 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     return grid_m[partial.state_at(grid_m) == CellState.FREE]
 
 
-def _read_positions(path: Path) -> list[list[float]]:
+def _read_positions(path: Path) -> list[tuple[float, ...]]:
     """Read positions [m] from a CSV."""
     remedy = "give a CSV with the columns x,y,z in metres."
-    text = read_bytes(path, "--rx", PositionError, MAX_BYTES).decode("utf-8-sig", errors="replace")
-    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    header = [name.strip() for name in next(rows, [])]
-    names = next((names for names in COLUMNS if set(names) <= {*header}), None)
+    found = read_columns(path, "--rx", PositionError, sum(COLUMNS, ()), remedy)
+    names = next((names for names in COLUMNS if found.keys() >= {*names}), None)
     if names is None:
-        raise PositionError(f"--rx '{path}' has the columns {', '.join(header)[:80] or 'none'}: {remedy}")
-    columns, found = [header.index(name) for name in names], list[list[float]]()
-    for row in filter(None, rows):
-        try:
-            found.append([float(row[column]) for column in columns])
-        except (ValueError, IndexError) as error:
-            raise PositionError(f"--rx '{path}', line {rows.line_num} is no position ({error}): {remedy}") from error
-    return found
+        raise PositionError(f"--rx = '{path}' has no positions: {remedy}")
+    return [*zip(*(found[name] for name in names), strict=True)]
