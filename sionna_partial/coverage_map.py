@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sionna_partial.checks import number_of, require, require_number, shown
+from sionna_partial.checks import number_of, real_array, require, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
@@ -31,6 +31,9 @@ _OF_ALL = ("observed", "cell_state", "wall_parts")
 """Variables that do not depend on the transmitter."""
 
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
+
+_LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
+"""Attributes that are needed beside the position of the transmitter, and what they are above."""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
 
@@ -150,9 +153,19 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
         coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
     missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
     missing += [name for name in ("x", "y") if name not in coverage.coords]
-    missing += [name for name in ("transmitter_m", "spacing_m", "frequency_hz") if name not in coverage.attrs]
+    missing += [name for name in ("transmitter_m", *_LOWEST) if name not in coverage.attrs]
     if missing or not coverage["valid"].size:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
+    for name, attributes in ATTRIBUTES.items():
+        whole = "units" not in attributes
+        require(
+            coverage[name].dtype.kind in ("biu" if whole else "f"), f"coverage.{name}", coverage[name].dtype, remedy
+        )
+    for name, lowest in _LOWEST.items():
+        require_number(f"coverage.{name}", coverage.attrs[name], lowest, 1e15, open_low=True)
+    position_m = real_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
+    known = position_m.shape == (3,) and bool(np.isfinite(position_m).all())
+    require(known, "coverage.transmitter_m", coverage.attrs["transmitter_m"], remedy)
     return coverage
 
 

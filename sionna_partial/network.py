@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Checked, Within, real_array, require, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES, require_coverage
+from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -124,12 +124,15 @@ def network_map(
     """
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         raise SettingsError("coverage has no dimension tx: give what predict_map returned for several transmitters.")
-    require_coverage(coverage.isel(tx=0))
+    transmitters_of(coverage)
+    coverage = coverage.transpose("tx", "y", "x", ...)
     powers_dbm = transmit_powers_dbm(tx_power_dbm, coverage.sizes["tx"])
     budget = LinkBudget(noise_figure_db, bandwidth_hz, load, sinr_threshold_db)
     require_whole("n", n, 2, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
     valid: NDArray[np.bool_] = np.all(coverage["valid"].to_numpy(), axis=0)
+    if not valid.any():
+        raise SettingsError("coverage has no place where a receiver of every transmitter can stand.")
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
     rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
     tx_m = np.stack([coverage[name].to_numpy() for name in TX_COORDINATES], axis=1)

@@ -1,4 +1,5 @@
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -409,6 +410,11 @@ def test_bad_input_is_refused_before_any_heavy_work(no_work, arguments, error, m
         (lambda data: data.drop_vars("x"), "coverage lacks x:"),
         (lambda data: data["p_los"], "coverage is of type DataArray"),
         (lambda data: data.drop_attrs().assign_coords(tx="a"), "coverage lacks transmitter_m"),
+        (lambda data: data * 1.0, r"coverage\.link_state = .*float"),
+        (lambda data: data.astype(str), r"coverage\.p_los = "),
+        (lambda data: data.assign_attrs(spacing_m="x"), r"coverage\.spacing_m = 'x'"),
+        (lambda data: data.assign_attrs(frequency_hz=None), r"coverage\.frequency_hz = None"),
+        (lambda data: data.assign_attrs(transmitter_m=[1.0, math.nan, 1.5]), r"coverage\.transmitter_m = "),
     ],
 )
 def test_what_is_no_coverage_map_is_named(coverage, spoil, message):

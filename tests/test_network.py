@@ -119,6 +119,15 @@ def test_bad_settings_of_a_network(coverage: xr.Dataset, options: dict[str, Any]
         sp.network_map(coverage, **options)
 
 
+def test_maps_that_are_no_network(coverage: xr.Dataset) -> None:
+    with pytest.raises(SettingsError, match="at least one"):
+        sp.network_map(coverage.isel(tx=[]))
+    with pytest.raises(SettingsError, match="no place where a receiver"):
+        sp.network_map(coverage.assign(valid=coverage.valid & False))
+    turned = sp.network_map(coverage.transpose("y", "x", "tx"), n=10)
+    xr.testing.assert_equal(turned, sp.network_map(coverage, n=10))
+
+
 def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     network = sp.network_map(coverage)
     for suffix in (".nc", ".tif", ".csv", ".png"):
