@@ -70,11 +70,10 @@ def unobserved(found: dict[str, sp.LinkPrediction], links: LinkTable) -> None:
         here = links.stage == stage
         chosen = neither & here
         gain_db, fraction = links.gain_db[chosen], chosen.sum() / here.sum()
-        bins = np.array_split(np.argsort(links.phi.distance_m[chosen]), DISTANCES)
-        guesses = [prediction.gain_mean_db[chosen] for prediction in found.values()]
-        guesses.append(np.zeros(len(gain_db)))
-        for each in bins:
-            guesses[-1][each] = gain_db[each].mean()
+        fitted_db = np.empty(len(gain_db))
+        for each in np.array_split(np.argsort(links.phi.distance_m[chosen]), DISTANCES):
+            fitted_db[each] = gain_db[each].mean()
+        guesses = [*(prediction.gain_mean_db[chosen] for prediction in found.values()), fitted_db]
         errors = [np.sqrt(np.mean((guess_db - gain_db) ** 2)) for guess_db in guesses]
         row = [f"{each:.2f}; {np.sqrt(fraction) * each:.2f}" for each in errors]
         print(f"| {stage:g} | {fraction:.2f} | {' | '.join(row)} |")

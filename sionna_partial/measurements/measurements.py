@@ -287,9 +287,10 @@ def measurements_of_each(
     ]
 
 
-def _measured(partial: PartialMap, tx_m: NDArray[np.float64], measurements: Any, frequency_hz: float) -> Measurements:
-    """Read the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
-    measured = measurements_of(measurements)
+def _measured(
+    partial: PartialMap, tx_m: NDArray[np.float64], measured: Measurements, frequency_hz: float
+) -> Measurements:
+    """Choose the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
     measured = _of_transmitter(measured, tx_m[0]) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
