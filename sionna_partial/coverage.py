@@ -15,15 +15,8 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sionna_partial.checks import (
-    Progress,
-    no_progress,
-    real_array,
-    require,
-    require_choice,
-    require_number,
-    settings_or_default,
-)
+from sionna_partial.arrays import Bools, Floats
+from sionna_partial.checks import Progress, no_progress, real_array, require, require_choice, require_number
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState
 from sionna_partial.coverage_map import (
     COMPONENTS,
@@ -36,13 +29,13 @@ from sionna_partial.coverage_map import (
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of_each
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.unobserved import Bools, Floats, is_enclosed
+from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, clear_of_walls, nearest_m
@@ -123,8 +116,8 @@ def predict_map(
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     measurements : Measurements, mapping, data frame or path, optional
-        Gains that were measured of this transmitter (see `Measurements`): what they tell of the links to other
-        receivers is taken into account (`Assimilation`). Others in it, farther than 0.5 m from `tx`, are not used.
+        Gains that were measured of this transmitter (see `Measurements`), which improve the prediction of other
+        receivers (`Assimilation`). Those of transmitters farther than 0.5 m from `tx` are not used.
     receivers : {"indoor", "anywhere"}
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float
@@ -170,34 +163,28 @@ def predict_map(
     """
     require_choice("receivers", receivers, RECEIVERS)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    trace_settings, scene_settings = checked_settings(
-        partial,
-        settings_or_default("trace_settings", trace_settings, TraceSettings),
-        settings_or_default("scene_settings", scene_settings, SceneSettings),
-    )
+    trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    unknown = tx is None and measurements is not None
-    names, positions_m = (None, np.empty((0, 3))) if unknown else transmitter_positions(partial, tx)
-    sources_m = [positions_m] if unknown else [each[None] for each in positions_m]
+    to_be_found = tx is None and measurements is not None
+    names, positions_m = (None, np.empty((0, 3))) if to_be_found else transmitter_positions(partial, tx)
+    sources_m = [positions_m] if to_be_found else [each[None] for each in positions_m]
     grids = [_receivers(partial, tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz) for tx_m in sources_m]
     at_once = _receivers_at_once(partial, grids[0], memory_gb)
     complete = partial.is_complete and bool(is_enclosed(partial, positions_m, positions_m).all())
-    model = None
-    if predictor is not None or not complete:
-        loaded = Predictor.load(predictor)
-        model = None if complete else loaded
+    given = None if complete and predictor is None else Predictor.load(predictor)
+    model = None if complete else given
     if model is not None:
         _warn_of_other_traces(model, trace_settings, scene_settings)
-    measured = measurements_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
+    measured_of_each = measurements_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
     provenance = _provenance(partial, model, scene_settings, trace_settings)
     maps = []
     with reporting(progress) as report, temporary_folder() as work:
         report(0.0, "building the scene")
         links = _Links(partial, Tracer(partial, work, trace_settings, scene_settings), model, at_once)
-        for number, (tx_m, grid, known) in enumerate(zip(sources_m, grids, measured, strict=True)):
+        for number, (tx_m, grid, measured) in enumerate(zip(sources_m, grids, measured_of_each, strict=True)):
             part = part_of(report, number / len(grids), (number + 1) / len(grids))
-            posterior = _located(links, known, part) if unknown and known is not None else None
-            source = _transmitter_of(links, posterior or tx_m[0], known)
+            posterior = _located(links, measured, part) if to_be_found and measured is not None else None
+            source = _transmitter_of(links, posterior or tx_m[0], measured)
             if posterior is not None:
                 grid = _receivers(partial, source.tx_m, rx_height_m, spacing_m, trace_settings.frequency_hz)
             columns = [
@@ -211,8 +198,8 @@ def predict_map(
                 "spacing_m": float(spacing_m),
                 "receivers": receivers,
             }
-            if known is not None:
-                attributes |= _of_measurements(known, source)
+            if measured is not None:
+                attributes |= _measurement_attributes(measured, source)
             values = {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
             coverage = coverage_map(partial, grid, values, attributes)
             maps.append(coverage if posterior is None else with_posterior(coverage, posterior))
@@ -258,9 +245,7 @@ def _receivers(
     partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
 ) -> Receivers:
     """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
-    low_m, high_m = partial.height_range_m
-    require_number("rx_height_m", rx_height_m, low_m, high_m, open_low=True)
-    require(rx_height_m < high_m, "rx_height_m", rx_height_m, f"stay below the ceiling at {high_m:g} m.")
+    require_height(partial, "rx_height_m", rx_height_m)
     x_m, y_m = _grid_axes(partial, spacing_m)
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     limit_m = nearest_m(frequency_hz)
@@ -320,11 +305,6 @@ class _Links:
     model: Predictor | None
     at_once: int
 
-    @property
-    def nearest_m(self) -> float:
-        """Shortest distance of a link [m]."""
-        return nearest_m(self.tracer.settings.frequency_hz)
-
     def predict(self, tx_m: Floats, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
         """Trace and predict the links to receivers (N, 3) [m] that are indoors; without a model the trace predicts."""
         context = self.model is not None and self.model.settings.networks != "paper"
@@ -350,11 +330,11 @@ class _Links:
 
 @dataclass(frozen=True)
 class _Transmitter:
-    """Positions (T, 3) [m] with weights (T,), what measurements tell of the links of each, and the best estimate."""
+    """Possible positions (T, 3) [m] with weights (T,), the measurements assimilated for each, and the best estimate."""
 
     tx_m: Floats
     weights: Floats
-    told: Sequence[Assimilation]
+    assimilations: Sequence[Assimilation]
     position_m: Floats
 
 
@@ -373,8 +353,8 @@ def _predictions(
                 report(min(0.99, begin + (1.0 - begin) * done), message)
 
             phi, prediction = links.predict(each_m, block_m, within)
-            if transmitter.told:
-                prediction = transmitter.told[index].update(block_m, prediction)
+            if transmitter.assimilations:
+                prediction = transmitter.assimilations[index].update(block_m, prediction)
             found.append((phi, prediction, links.p_indoor(block_m, phi)))
         mixture = LinkPrediction.mixture([prediction for _, prediction, _ in found], transmitter.weights)
         yield found[nearest][0], mixture, transmitter.weights @ [indoor for _, _, indoor in found]
@@ -382,34 +362,31 @@ def _predictions(
 
 def _located(links: _Links, measured: Measurements, report: Progress) -> TransmitterPosterior:
     """Find a transmitter from what was measured of it."""
-    places = cKDTree(measured.rx)
+    measured_at, limit_m = cKDTree(measured.rx), nearest_m(links.tracer.settings.frequency_hz)
 
     def allowed(points_m: Floats) -> Bools:
-        return clear_of_walls(links.partial, points_m) & (places.query(points_m)[0] >= links.nearest_m)
+        return clear_of_walls(links.partial, points_m) & (measured_at.query(points_m)[0] >= limit_m)
 
-    def within(fraction: float, message: str) -> None:
-        report(_LOCATING * fraction, message)
-
-    return locate_transmitter(links.partial, measured, allowed, links.predict_all, within)
+    return locate_transmitter(links.partial, measured, allowed, links.predict_all, part_of(report, 0.0, _LOCATING))
 
 
 def _transmitter_of(links: _Links, where: Floats | TransmitterPosterior, measured: Measurements | None) -> _Transmitter:
-    """Hold what was measured against what is predicted there, for a position (3,) [m] or for several of a posterior."""
+    """Assimilate the measurements for a position (3,) [m], or for several that are drawn from a posterior."""
     if isinstance(where, TransmitterPosterior):
         (tx_m, weights), position_m = where.draw(POSITIONS), where.position_m
     else:
         tx_m, weights, position_m = where[None], np.ones(1), where
-    told = []
+    assimilations = []
     if measured is not None:
         for each_m in tx_m:
-            prior, _ = links.predict_all(each_m, measured.rx)
-            told.append(Assimilation(links.partial, each_m, measured, prior, links.tracer.settings.frequency_hz))
-    return _Transmitter(tx_m, weights, told, position_m)
+            prior, frequency_hz = links.predict_all(each_m, measured.rx)[0], links.tracer.settings.frequency_hz
+            assimilations.append(Assimilation(links.partial, each_m, measured, prior, frequency_hz))
+    return _Transmitter(tx_m, weights, assimilations, position_m)
 
 
-def _of_measurements(measured: Measurements, source: _Transmitter) -> dict[str, Any]:
+def _measurement_attributes(measured: Measurements, source: _Transmitter) -> dict[str, Any]:
     """Return attributes of the measurements; a large offset is logged."""
-    noise_db, offset_db = source.weights @ [(each.noise_db, each.offset_db) for each in source.told]
+    noise_db, offset_db = source.weights @ [(each.noise_db, each.offset_db) for each in source.assimilations]
     if abs(offset_db) > LARGE_OFFSET_DB:
         _log.warning(
             "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import number_of, real_array, require, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.display import later, picture_html
@@ -16,7 +17,6 @@ from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.prediction.unobserved import Bools, Floats
 
 WALL_PARTS = 6
 """`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
@@ -286,7 +286,7 @@ def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> 
 
 def _part_spans(
     centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
-) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
+) -> list[tuple[Indices, Indices]]:
     """Return the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
     edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
     step = spacing_m / resolution_m / WALL_PARTS

@@ -6,8 +6,8 @@ from os import PathLike
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools
 from sionna_partial.checks import Progress, no_progress
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
@@ -89,7 +89,7 @@ def comparison_table(coverages: Mapping[str, xr.Dataset]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _score(truth: xr.Dataset, state: xr.DataArray, gain_db: xr.DataArray, mask: NDArray[np.bool_]) -> str:
+def _score(truth: xr.Dataset, state: xr.DataArray, gain_db: xr.DataArray, mask: Bools) -> str:
     if not mask.any():
         return "-"
     accuracy = (state == truth["link_state"]).to_numpy()[mask].mean()

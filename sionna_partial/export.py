@@ -22,9 +22,8 @@ from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes
 from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
 from sionna_partial.network import VARIABLES, require_network
-from sionna_partial.plots.coverage_plot import plot_coverage
+from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
 from sionna_partial.plots.coverage_viewer import coverage_page
-from sionna_partial.plots.network_plot import plot_network
 from sionna_partial.plots.style import figure_png
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")

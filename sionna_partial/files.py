@@ -9,8 +9,8 @@ import shutil
 import socket
 import stat
 import tempfile
-from collections.abc import Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Collection, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -239,18 +239,15 @@ def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
     """Open a folder for files that libraries exchange, and remove it in the end."""
-    folder: Path | None = None
-    try:
-        with own_folder(Path(tempfile.gettempdir()), TEMPORARY) as folder:
-            yield folder
-    except OSError as error:
-        cause = error.__cause__ if isinstance(error, OutputError) and str(folder) in str(error) else error
-        if isinstance(cause, SionnaPartialError) or not isinstance(cause, OSError):
-            raise
-        raise OutputError(
+
+    def failed(cause: OSError) -> OutputError:
+        return OutputError(
             f"no temporary file could be written ({cause.strerror or cause}): free some space in the folder of "
             "temporary files, or set TMPDIR to one that you may write to."
-        ) from error
+        )
+
+    with _own_folder(Path(tempfile.gettempdir()), TEMPORARY, failed) as folder:
+        yield folder
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
@@ -294,20 +291,22 @@ def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
             stream.truncate(0)
 
 
-@contextmanager
-def _hidden_folder(target: Path, parent: Path) -> Iterator[Path]:
-    """Make a hidden folder in `parent`, and remove it in the end, as well as new parents that stay empty.
+def _hidden_folder(target: Path, parent: Path) -> AbstractContextManager[Path]:
+    """Make a hidden folder in `parent`, and remove it in the end; errors of the system name `target`."""
+    return _own_folder(parent, HIDDEN, lambda cause: _output_error(target, cause))
 
-    Errors of the system become OutputErrors that name `target`.
-    """
-    hidden: Path | None = None
+
+@contextmanager
+def _own_folder(parent: Path, prefix: str, failed: Callable[[OSError], OutputError]) -> Iterator[Path]:
+    """Open an `own_folder`; errors of the system, also while it is written to, become those that `failed` returns."""
+    folder: Path | None = None
     try:
-        with own_folder(parent, HIDDEN) as hidden:
-            yield hidden
+        with own_folder(parent, prefix) as folder:
+            yield folder
     except OSError as error:
-        cause = error.__cause__ if isinstance(error, OutputError) and str(hidden) in str(error) else error
+        cause = error.__cause__ if isinstance(error, OutputError) and str(folder) in str(error) else error
         if isinstance(cause, OSError) and not isinstance(cause, SionnaPartialError):
-            raise _output_error(target, cause) from error
+            raise failed(cause) from error
         raise
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Checked, Within, real_array, require, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
@@ -15,8 +16,6 @@ from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
-
-Floats = NDArray[np.float64]
 
 NOISE_DENSITY_DBM_HZ = -174.0
 """Thermal noise at 290 K [dBm/Hz]."""
@@ -130,7 +129,7 @@ def network_map(
     budget = LinkBudget(noise_figure_db, bandwidth_hz, load, sinr_threshold_db)
     require_whole("n", n, 2, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
-    valid: NDArray[np.bool_] = np.all(coverage["valid"].to_numpy(), axis=0)
+    valid: Bools = np.all(coverage["valid"].to_numpy(), axis=0)
     if not valid.any():
         raise SettingsError("coverage has no place where a receiver of every transmitter can stand.")
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
@@ -188,7 +187,7 @@ def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[A
 
 
 def _labelled(
-    coverage: xr.Dataset, found: dict[str, NDArray[Any]], valid: NDArray[np.bool_], settings: dict[str, Any]
+    coverage: xr.Dataset, found: dict[str, NDArray[Any]], valid: Bools, settings: dict[str, Any]
 ) -> xr.Dataset:
     layers: dict[str, Any] = {}
     for name, values in found.items():

@@ -3,24 +3,24 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import njit
 
 
-def cross(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross(first: Floats, second: Floats) -> Floats:
     """Cross products of vectors (..., 2)."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
-def largest_part(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def largest_part(mask: Bools) -> Bools:
     """Cells (ny, nx) of the largest part of a mask whose cells touch by edges."""
     labels, _ = ndimage.label(mask)
     return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))
 
 
-def grid_edges(cost: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def grid_edges(cost: Floats) -> tuple[Indices, Floats]:
     """Pairs of neighbouring cells (2, E) of a grid, in eight directions, and what a step from one to the other costs.
 
     A cell that costs 0 cannot be crossed, nor can the corner at which two such cells meet (skimage's MCP would take

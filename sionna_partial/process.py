@@ -1,4 +1,4 @@
-"""What a process owes others: it ends when it is told to, leaves nothing behind, and compiles where it may write."""
+"""Signals that end a process, folders that are removed with it, and where compiled code is cached."""
 
 import contextlib
 import fcntl

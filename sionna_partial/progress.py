@@ -75,8 +75,8 @@ def _time_left(rest_s: float) -> str:
     return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02} left"
 
 
-class _Place(Protocol):
-    """Where progress is shown."""
+class _Bar(Protocol):
+    """What shows progress."""
 
     def draw(self, fraction: float, text: str, *, at_once: bool) -> None: ...
 
@@ -87,24 +87,24 @@ class _Place(Protocol):
 def _display(progress: object, *, command: bool) -> Iterator[Callable[..., None]]:
     """Open what shows a fraction and a text."""
     require(progress is None or isinstance(progress, bool), "progress", progress, "give True, False or a callable.")
-    place = None if progress is False else _place(command=command)
+    bar = None if progress is False else _bar(command=command)
     started = monotonic()
 
     def draw(fraction: float, text: str, *, at_once: bool = False) -> None:
-        if place and (command or monotonic() - started >= WAIT_S):
-            place.draw(fraction, text, at_once=at_once)
+        if bar and (command or monotonic() - started >= WAIT_S):
+            bar.draw(fraction, text, at_once=at_once)
 
     try:
         yield draw
     except BaseException:  # the error that follows stands alone
-        if place:
-            place.close(done=False)
+        if bar:
+            bar.close(done=False)
         raise
-    if place:
-        place.close(done=True)
+    if bar:
+        bar.close(done=True)
 
 
-def _place(*, command: bool) -> _Place | None:
+def _bar(*, command: bool) -> _Bar | None:
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     if hasattr(shell, "kernel"):
         return _NotebookBar()

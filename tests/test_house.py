@@ -21,7 +21,7 @@ PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("constants", "errors", "checks", "display", "progress", "settings", "resources"),
+        *("arrays", "constants", "errors", "checks", "display", "progress", "settings", "resources"),
         *("process", "files", "planar", "cores", "llvm"),
     ),
     "maps": (
@@ -43,7 +43,7 @@ ROOMS = {
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "channels": (
-        *("responses", "beams", "spreads", "files"),
+        *("responses", "beams", "files"),
         *("joint", "path_model", "path_training", "samples"),
     ),
     "coverage": ("coverage_map", "coverage", "network"),
@@ -56,7 +56,7 @@ ROOMS = {
     "training": ("training",),
     "plots": (
         *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
-        *("material_plot", "placement_plot", "network_plot", "next_views_plot", "evaluation_plot"),
+        *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
     "cli": ("options", "prediction", "links", "learning", "planning", "app"),

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.calibration.material_fit import (
     INCOMPLETE_WEIGHT,
     LOSSLESS,
@@ -24,7 +25,7 @@ from sionna_partial.calibration.material_fit import (
 from sionna_partial.calibration.measured_building import (
     MeasuredBuilding,
     link_gains_db,
-    require_places,
+    require_positions,
     start_materials,
     usable_links,
 )
@@ -97,13 +98,13 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
     permittivity_std: Any
     conductivity_std: Any
     undetermined: tuple[str, ...]
-    loss: NDArray[np.float64]
+    loss: Floats
     noise_db: float
-    used: NDArray[np.bool_]
+    used: Bools
     left_out: dict[str, int]
-    gain_db: NDArray[np.float64]
-    gain_before_db: NDArray[np.float64]
-    gain_after_db: NDArray[np.float64]
+    gain_db: Floats
+    gain_before_db: Floats
+    gain_after_db: Floats
     start: tuple[Material, ...]
     materials: tuple[Material, ...]
     posteriors: tuple[Posterior, ...]
@@ -112,7 +113,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
 
     def reflection_loss_db(
         self, angle_deg: ArrayLike, polarisation: Polarisation = "te", *, which: int = 0
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Floats, Floats]:
         """Return the loss of a reflection off the calibrated material, and its standard deviation.
 
         Parameters
@@ -234,7 +235,7 @@ def calibrate_materials(
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
     measured.require_transmitters()
-    require_places(partial, measured, settings.frequency_hz)
+    require_positions(partial, measured, settings.frequency_hz)
     links, link, variance = merged(measured)
     building = MeasuredBuilding(partial, start_materials(partial, start, scene_settings, settings.frequency_hz))
     with reporting(progress) as report:
@@ -254,8 +255,8 @@ def calibrate_materials(
         np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(links)), GAIN_FLOOR_DB)[link]
         for each in (fit.steps[0], fit.point)
     ]
-    doubts = _undetermined(begin, fit)
-    for message in doubts.values():
+    undetermined = _undetermined(begin, fit)
+    for message in undetermined.values():
         _log.warning("%s", message)
     values = (*fit.point.values, *fit.deviations)
     numbers = [float(each[0]) if partial.mesh is None or len(materials) == 1 else each for each in values]
@@ -264,7 +265,7 @@ def calibrate_materials(
         conductivity=numbers[1],
         permittivity_std=numbers[2],
         conductivity_std=numbers[3],
-        undetermined=tuple(doubts),
+        undetermined=tuple(undetermined),
         loss=np.minimum.accumulate([each.loss for each in fit.steps]) / used.sum(),
         noise_db=fit.point.errors.noise_db,
         used=used[link],
@@ -282,12 +283,12 @@ def calibrate_materials(
 
 @dataclass(frozen=True)
 class _Fit:
-    """The steps to the likeliest materials, those that are taken, and what is left open: deviations are (2, M)."""
+    """Steps to the likeliest materials, the materials that are taken, and their posteriors; deviations are (2, M)."""
 
     steps: list[Point]
     point: Point
     posteriors: list[Posterior]
-    deviations: NDArray[np.float64]
+    deviations: Floats
 
 
 def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float, report: Progress) -> _Fit:
@@ -305,11 +306,11 @@ def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float,
     ordered = [posteriors[which] for which in range(len(start))]
     typical = [each.typical(material.thickness_m, frequency_hz) for each, material in zip(ordered, start, strict=True)]
     point = target.at(np.stack(typical, axis=1))
-    shown = [begin, *(each for each in steps if each.loss < begin.loss)]
-    return _Fit(shown, point, ordered, _deviations(point, ordered, curvature))
+    better = [each for each in steps if each.loss < begin.loss]
+    return _Fit([begin, *better], point, ordered, _deviations(point, ordered, curvature))
 
 
-def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: Floats) -> Floats:
     """Return the standard deviations (2, M) of permittivities and conductivities.
 
     A posterior is that of one material while the others stay as they are. Where there are others, the curvature of all
@@ -330,7 +331,7 @@ def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: NDArra
 
 def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
     """Parameters that the measurements hardly determine, and a message for each."""
-    prior, doubts = prior_posterior(), {}
+    prior, undetermined = prior_posterior(), {}
     for which, (posterior, material) in enumerate(zip(fit.posteriors, start, strict=True)):
         offsets = {"permittivity": 0.0, "conductivity": 0.1 * lossless_scale_s_m(2.0, material.thickness_m)}
         for row, (name, offset) in enumerate(offsets.items()):
@@ -339,8 +340,8 @@ def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
             if posterior.deviation(after, math.log(fit.point.values[row, which] + offset)) > DETERMINED * spread:
                 low, high = posterior.interval(posterior.values[row])
                 full_name = name if len(start) == 1 else f"{name}[{which}]"
-                doubts[full_name] = (
+                undetermined[full_name] = (
                     f"the measurements cannot determine the {full_name}: its 95 % interval is {low:.2g} to {high:.2g}"
                     f"{' S/m' * row}. Do not take its value for a property of the material."
                 )
-    return doubts
+    return undetermined

@@ -10,14 +10,15 @@ the fringes, before anything follows a slope. Cells that matter are divided unti
 
 import itertools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.calibration.measured_building import LinkPaths, link_gains_db
+from sionna_partial.checks import Progress
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Shown
 from sionna_partial.tracing.slab import reflection_loss_db
@@ -72,8 +73,6 @@ MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
 CELLS_A_REPORT = 64
 """Number of cells after which progress is reported."""
 
-Report = Callable[[float, str], None]
-
 
 @dataclass(frozen=True)
 class GainErrors:
@@ -94,9 +93,7 @@ class GainErrors:
         spread = math.log(self.noise_db / EXPECTED_NOISE_DB) / NOISE_SPREAD
         return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
 
-    def curve(
-        self, error_db: NDArray[np.float64], is_direct: NDArray[np.bool_], variance: ArrayLike = 0.0
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def curve(self, error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[Floats, Floats, Floats]:
         """Negative logarithm of the density of errors (N,) [dB], and its first and second derivatives."""
         noise_db = np.sqrt(self.noise_db**2 + np.asarray(variance))
         parts = _log_densities(error_db, noise_db)
@@ -122,40 +119,38 @@ _ALL_ERRORS = [GainErrors(float(noise_db), *fractions) for fractions in _ALL_FRA
 _PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
 
 
-def fit_errors(
-    error_db: NDArray[np.float64], is_direct: NDArray[np.bool_], variance: ArrayLike = 0.0
-) -> tuple[GainErrors, float]:
+def fit_errors(error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[GainErrors, float]:
     """Return the likeliest density of errors (N,) [dB], and its negative log likelihood with the prior's.
 
     The variance [dB^2] is that of each mean of repeated measurements, beyond the noise of the link.
     """
     noise_db = np.sqrt(NOISES_DB[:, None] ** 2 + np.asarray(variance))
-    kinds = np.exp(np.maximum(_log_densities(error_db, noise_db), -700.0))
-    parts = kinds[:, :, is_direct], kinds[:, :, ~is_direct]
+    densities = np.exp(np.maximum(_log_densities(error_db, noise_db), -700.0))
+    parts = densities[:, :, is_direct], densities[:, :, ~is_direct]
     direct, indirect = (
         -np.log(np.maximum(np.tensordot(fractions, part, 1), 1e-300)).sum(axis=-1)
-        for fractions, part in zip(_KIND_FRACTIONS, parts, strict=True)
+        for fractions, part in zip(_MIXTURES, parts, strict=True)
     )
     total = (direct + indirect).ravel() + _PENALTIES
     best = int(np.argmin(total))
     return _ALL_ERRORS[best], float(total[best])
 
 
-def _fractions(is_direct: NDArray[np.bool_], missed: float, blocked: float) -> NDArray[np.float64]:
+def _fractions(is_direct: Bools, missed: float, blocked: float) -> Floats:
     """Fractions (3, N) of noise alone, of missed and of blocked paths; none is 0."""
     stray = STRAY_FRACTION / 2.0
     off = np.where(is_direct, stray, np.maximum([[missed], [blocked]], stray))
     return np.stack([1.0 - off.sum(axis=0), *off])
 
 
-_KIND_FRACTIONS = [
+_MIXTURES = [
     np.stack([_fractions(np.array([direct]), *fractions)[:, 0] for fractions in chosen])
     for direct, chosen in ((True, _ALL_FRACTIONS[:1]), (False, _ALL_FRACTIONS))
 ]
 """Fractions of noise alone, of missed and of blocked paths: with a line of sight (1, 3), and without (15, 3)."""
 
 
-def _log_densities(error_db: NDArray[np.float64], noise_db: float | NDArray[np.float64]) -> NDArray[np.float64]:
+def _log_densities(error_db: Floats, noise_db: float | Floats) -> Floats:
     """Logarithms (3, ..., N) of the densities of noise alone, and with an exponential added either way."""
     parts = [-0.5 * (error_db / noise_db) ** 2 - np.log(noise_db * math.sqrt(2.0 * math.pi))]
     for error, mean_db in ((error_db, MISSED_DB), (-error_db, BLOCKED_DB)):
@@ -175,12 +170,12 @@ class Point:
     loss : negative logarithm of the posterior density of their logarithms, but for a constant
     """
 
-    values: NDArray[np.float64]
+    values: Floats
     loss: float
     errors: GainErrors
 
     @property
-    def logs(self) -> NDArray[np.float64]:
+    def logs(self) -> Floats:
         """Logarithms (2, M) of permittivity less 1, and of conductivity [S/m]."""
         return np.log(self.values - LOSSLESS)
 
@@ -189,28 +184,28 @@ class Point:
 class Posterior(Shown):
     """What measurements leave open about one material: K values with weights that sum to 1, all (K,)."""
 
-    permittivity: NDArray[np.float64]
-    conductivity_s_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    permittivity: Floats
+    conductivity_s_m: Floats
+    weight: Floats
 
     @property
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> Floats:
         """Permittivity and conductivity (2, K)."""
         return np.stack([self.permittivity, self.conductivity_s_m])
 
-    def deviation(self, values: NDArray[np.float64], best: float) -> float:
+    def deviation(self, values: Floats, best: float) -> float:
         """Root mean square of how far values (K,) are from the best one."""
         return float(np.sqrt(self.weight @ (values - best) ** 2))
 
-    def typical(self, thickness_m: float, frequency_hz: float) -> NDArray[np.float64]:
+    def typical(self, thickness_m: float, frequency_hz: float) -> Floats:
         """Return the values (2,) whose reflection losses are nearest to their mean: the likeliest may be odd ones."""
         loss_db = reflection_loss_db(
             self.permittivity[:, None], self.conductivity_s_m[:, None], thickness_m, frequency_hz, TYPICAL_DEG
         )
-        shown = np.minimum(loss_db, TYPICAL_LOSS_DB)
-        return self.values[:, int(np.argmin(((shown - self.weight @ shown) ** 2).sum(axis=1)))]
+        limited_db = np.minimum(loss_db, TYPICAL_LOSS_DB)
+        return self.values[:, int(np.argmin(((limited_db - self.weight @ limited_db) ** 2).sum(axis=1)))]
 
-    def interval(self, values: NDArray[np.float64], fraction: float = 0.95) -> tuple[float, float]:
+    def interval(self, values: Floats, fraction: float = 0.95) -> tuple[float, float]:
         """Central fraction of values (K,)."""
         order = np.argsort(values, kind="stable")
         rank = np.cumsum(self.weight[order]) - 0.5 * self.weight[order]
@@ -221,42 +216,38 @@ class Posterior(Shown):
 class MaterialTarget:
     """How well materials explain measured gains (N,) [dB] of links that all have a path; weight is the likelihood's."""
 
-    def __init__(
-        self, paths: LinkPaths, gain_db: NDArray[np.float64], variance: NDArray[np.float64], weight: float = 1.0
-    ) -> None:
+    def __init__(self, paths: LinkPaths, gain_db: Floats, variance: Floats, weight: float = 1.0) -> None:
         self.paths, self.gain_db, self.variance, self.weight = paths, gain_db, variance, weight
         self.is_direct = np.zeros(len(gain_db), dtype=bool)
         self.is_direct[paths.link[paths.is_direct]] = True
 
-    def at(self, values: NDArray[np.float64]) -> Point:
+    def at(self, values: Floats) -> Point:
         """Evaluate materials (2, M)."""
         error_db = self.gain_db - self.gains_db(self.paths.power(*values))
         errors, loss = fit_errors(error_db, self.is_direct, self.variance)
         return Point(values, self.weight * loss + prior_loss(values), errors)
 
-    def gains_db(self, power: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gains_db(self, power: Floats) -> Floats:
         """Gains (N,) [dB] from the power of the paths (P,)."""
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)
 
-    def slopes(self, point: Point) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slopes(self, point: Point) -> tuple[Floats, Floats]:
         """Gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms, by Sionna RT and Dr.Jit."""
         link, count = self.paths.link, len(self.gain_db)
         power, slopes = self.paths.slopes(*point.values)
         total = np.maximum(np.bincount(link, weights=power, minlength=count), 1e-30)
-        sums = np.stack([np.bincount(link, weights=column, minlength=count) for column in slopes.T], axis=1)
+        of_links = np.stack([np.bincount(link, weights=column, minlength=count) for column in slopes.T], axis=1)
         scale = (point.values - LOSSLESS).ravel()
-        jacobian: NDArray[np.float64] = sums * (10.0 / math.log(10.0) * scale / total[:, None])
+        jacobian: Floats = of_links * (10.0 / math.log(10.0) * scale / total[:, None])
         error_db = self.gain_db - np.maximum(10.0 * np.log10(total), LOWEST_GAIN_DB)
         _, first, second = point.errors.curve(error_db, self.is_direct, self.variance)
         information = np.broadcast_to(PRIOR_SPREAD**-2.0, point.values.shape)
         prior_slope = (information * (point.logs - np.log(PRIOR_MEDIAN))).ravel()
-        curvature: NDArray[np.float64] = self.weight * (jacobian.T * np.maximum(second, 0.0)) @ jacobian
+        curvature: Floats = self.weight * (jacobian.T * np.maximum(second, 0.0)) @ jacobian
         return prior_slope - self.weight * jacobian.T @ first, curvature + np.diag(information.ravel())
 
 
-def descend(
-    target: MaterialTarget, start: Point, report: Report, most_steps: int = 30
-) -> tuple[list[Point], NDArray[np.float64]]:
+def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: int = 30) -> tuple[list[Point], Floats]:
     """Follow the slopes to a minimum of the loss, by Newton's method with damping (Levenberg and Marquardt).
 
     Returns the start with each step that made the loss smaller, and the curvature (2 M, 2 M) at the last.
@@ -282,7 +273,7 @@ def descend(
     return steps, curvature
 
 
-def prior_loss(values: NDArray[np.float64]) -> float:
+def prior_loss(values: Floats) -> float:
     """Negative logarithm of the prior density of the logarithms of materials (2, M), but for a constant."""
     return 0.5 * float(((np.log((values - LOSSLESS) / PRIOR_MEDIAN) / PRIOR_SPREAD) ** 2).sum())
 
@@ -307,11 +298,11 @@ class _Plane:
     both.
     """
 
-    def __init__(self, target: MaterialTarget, start: Point, which: int, report: Report) -> None:
+    def __init__(self, target: MaterialTarget, start: Point, which: int, report: Progress) -> None:
         self._target, self._start, self._which, self._report = target, start, which, report
         self._points: dict[tuple[float, float], Point] = {}
 
-    def evaluate(self, cells: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
+    def evaluate(self, cells: Floats, begin: float, end: float) -> Floats:
         """Return the cells, and report progress from `begin` to `end`."""
         values = np.repeat(self._start.values[None], cells.shape[1], axis=0)
         values[:, 0, self._which], values[:, 1, self._which] = cells[0] ** 2, np.exp(cells[1])
@@ -322,22 +313,22 @@ class _Plane:
             self._report(begin + (end - begin) * part, "searching for the material")
         return cells
 
-    def points(self, cells: NDArray[np.float64]) -> list[Point]:
+    def points(self, cells: Floats) -> list[Point]:
         """Points at the centres of evaluated cells."""
         return [self._points[centre] for centre in map(tuple, cells[:2].T)]
 
-    def losses(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    def losses(self, cells: Floats) -> Floats:
         """Losses (K,) of evaluated cells."""
         return np.array([each.loss for each in self.points(cells)])
 
-    def fractions(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    def fractions(self, cells: Floats) -> Floats:
         """Fraction (K,) of the posterior in each cell; the measure is that of the logarithm of permittivity less 1."""
         loss = self.losses(cells)
         area = cells[2] * cells[3] * 2.0 * cells[0] / (cells[0] ** 2 - 1.0)
-        mass: NDArray[np.float64] = np.exp(loss.min() - loss) * area
+        mass: Floats = np.exp(loss.min() - loss) * area
         return mass / mass.sum()
 
-    def best(self, cells: NDArray[np.float64], fringe: float, most: int) -> list[Point]:
+    def best(self, cells: Floats, fringe: float, most: int) -> list[Point]:
         """Return the best points, each in a fringe of its own, at most so many."""
         found: list[int] = []
         for number in np.argsort(self.losses(cells), kind="stable"):
@@ -349,7 +340,7 @@ class _Plane:
 
 
 def search(
-    target: MaterialTarget, start: Point, which: int, thickness_m: float, frequency_hz: float, report: Report
+    target: MaterialTarget, start: Point, which: int, thickness_m: float, frequency_hz: float, report: Progress
 ) -> tuple[list[Point], Posterior]:
     """Search the plane of one material: its best points, each in a fringe of its own, and its posterior."""
     fringe = SPEED_OF_LIGHT_M_S / (2.0 * frequency_hz * thickness_m)
@@ -372,8 +363,8 @@ def search(
         split = wide | high
         if not split.any():
             break
-        kinds = ((wide & high, (2, 2)), (wide & ~high, (3, 1)), (~wide & high, (1, 2)))
-        parts = [_divided(cells[:, split & kind], *counts) for kind, counts in kinds]
+        cuts = ((wide & high, (2, 2)), (wide & ~high, (3, 1)), (~wide & high, (1, 2)))
+        parts = [_divided(cells[:, chosen], *counts) for chosen, counts in cuts]
         parts = [plane.evaluate(part, 0.8, 1.0) for part in parts if part.size]
         cells = np.hstack([cells[:, ~split], *parts])
         added += sum(part.shape[1] for part in parts)
@@ -384,7 +375,7 @@ def search(
     return plane.best(cells, fringe, FEW_FRINGES), posterior
 
 
-def _coarser_neighbours(cells: NDArray[np.float64], chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _coarser_neighbours(cells: Floats, chosen: Bools) -> Bools:
     """Find which cells (K,) touch a chosen one and are wider, and which are higher: a ridge may go on in them."""
     distance = np.abs(cells[:2, :, None] - cells[:2, None, chosen])
     own, other = cells[2:, :, None], cells[2:, None, chosen]
@@ -392,7 +383,7 @@ def _coarser_neighbours(cells: NDArray[np.float64], chosen: NDArray[np.bool_]) -
     return np.any(near & (own > 1.5 * other), axis=-1)
 
 
-def _divided(cells: NDArray[np.float64], index_parts: int, log_parts: int) -> NDArray[np.float64]:
+def _divided(cells: Floats, index_parts: int, log_parts: int) -> Floats:
     """Cut each cell into parts."""
     along, across = (np.arange(parts) - 0.5 * (parts - 1) for parts in (index_parts, log_parts))
     index, log, width, height = cells[:, :, None, None] / np.array([1, 1, index_parts, log_parts])[:, None, None, None]
@@ -400,7 +391,7 @@ def _divided(cells: NDArray[np.float64], index_parts: int, log_parts: int) -> ND
     return np.reshape(parts, (4, -1))
 
 
-def _first_cells(thickness_m: float, fringe: float) -> NDArray[np.float64]:
+def _first_cells(thickness_m: float, fringe: float) -> Floats:
     """Cover the plane: fine in the index where slabs interfere with themselves, coarse where they absorb the wave."""
     scale = lossless_scale_s_m(2.0, thickness_m)
     levels = np.log(scale * np.array([0.03, 0.5, 1.4, 3.0, 6.0, 15.0, 50.0, 300.0, 1e4, 1e7]))

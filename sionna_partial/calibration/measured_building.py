@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress
 from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
@@ -53,32 +54,30 @@ class LinkPaths:
     """
 
     paths: PathSet
-    columns: NDArray[np.intp]
+    columns: Indices
     link: NDArray[np.int64]
 
     @property
-    def is_direct(self) -> NDArray[np.bool_]:
+    def is_direct(self) -> Bools:
         """Whether each path (P,) is the line of sight."""
         return self.paths.is_direct
 
-    def of_links(self, chosen: NDArray[np.bool_]) -> "LinkPaths":
+    def of_links(self, chosen: Bools) -> "LinkPaths":
         """Return the paths of the links of a mask (N,), which are counted anew."""
         kept = chosen[self.link]
         return LinkPaths(self.paths.kept(kept), self.columns, (np.cumsum(chosen) - 1)[self.link[kept]])
 
-    def power(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    def power(self, permittivity: Floats, conductivity_s_m: Floats) -> Floats:
         """Evaluate |a|^2 of each path (P,) for M relative permittivities and conductivities [S/m]."""
         return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
 
-    def slopes(
-        self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def slopes(self, permittivity: Floats, conductivity_s_m: Floats) -> tuple[Floats, Floats]:
         """Evaluate |a|^2 of each path (P,), and differentiate it (P, 2 M): by permittivities, then conductivities."""
         parameters = self._parameters(permittivity, conductivity_s_m)
         slopes = self.paths.slopes(parameters, ("relative_permittivity", "conductivity_s_m")).values()
         return self.paths.at(parameters)[0], np.concatenate([each[:, self.columns] for each in slopes], axis=1)
 
-    def strong(self) -> NDArray[np.bool_]:
+    def strong(self) -> Bools:
         """Find the paths (P,) that have `KEPT_FRACTION` of the power of their link for some of `EXTREMES`."""
         strong, ones = np.zeros(len(self.link), dtype=bool), np.ones(len(self.columns))
         scale_s_m = 2.0 * np.pi * float(self.paths.base.frequency_hz) * VACUUM_F_M
@@ -86,7 +85,7 @@ class LinkPaths:
             strong |= _strongest(self.link, self.power(permittivity * ones, loss * scale_s_m * ones), KEPT_FRACTION)
         return strong
 
-    def _parameters(self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]) -> PathParameters:
+    def _parameters(self, permittivity: Floats, conductivity_s_m: Floats) -> PathParameters:
         values = {"relative_permittivity": permittivity, "conductivity_s_m": conductivity_s_m}
         all_values = {name: getattr(self.paths.base, name).copy() for name in values}
         for name, own in values.items():
@@ -107,8 +106,8 @@ class MeasuredBuilding:
         if mesh is None:
             return replace(self.partial, material=materials[0])
         new = dict(zip(self.start, materials, strict=True))
-        kinds = tuple(new.get(f"material{index}", old) for index, old in enumerate(mesh.materials))
-        return replace(self.partial, mesh=replace(mesh, materials=kinds))
+        named = tuple(new.get(f"material{index}", old) for index, old in enumerate(mesh.materials))
+        return replace(self.partial, mesh=replace(mesh, materials=named))
 
     def paths(
         self, measured: Measurements, settings: TraceSettings, scene_settings: SceneSettings, report: Progress
@@ -129,10 +128,10 @@ class MeasuredBuilding:
         links = [np.flatnonzero(index.ravel() == number) for number in range(len(tx_m))]
         nothing = PathSet(scene, tx_m, rx, [])
         kept, new = nothing, [nothing]
+        columns = np.array([scene.materials.index(name) for name in self.start], dtype=int)
 
         def link_paths(paths: PathSet) -> LinkPaths:
-            columns = [paths.materials.index(name) for name in self.start]
-            return LinkPaths(paths, np.array(columns, dtype=int), paths.path_rx.astype(np.int64))
+            return LinkPaths(paths, columns, paths.path_rx.astype(np.int64))
 
         def strong() -> PathSet:
             paths = PathSet.joined(new)
@@ -145,8 +144,8 @@ class MeasuredBuilding:
         return link_paths(strong())
 
 
-def require_places(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
-    """Check that radios can stand at the measured places, and that there are enough."""
+def require_positions(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
+    """Check that radios can stand at the measured positions, and that there are enough."""
     partial.require_positions("tx", measured.tx)
     partial.require_positions("rx", measured.rx)
     distance_m, limit_m = np.linalg.norm(measured.tx - measured.rx, axis=1), nearest_m(frequency_hz)
@@ -166,9 +165,8 @@ def start_materials(
     if partial.mesh is None:
         materials = {"material": start or scene_settings.material}
     else:
-        kinds = partial.mesh.materials
-        used = np.unique(partial.mesh.material).tolist()
-        materials = {f"material{index}": start or kinds[index] or scene_settings.material for index in used}
+        used, own = np.unique(partial.mesh.material).tolist(), partial.mesh.materials
+        materials = {f"material{index}": start or own[index] or scene_settings.material for index in used}
     for material in materials.values():
         material.require_frequency(frequency_hz)
     return {name: custom_material(each, frequency_hz) for name, each in materials.items()}
@@ -184,33 +182,33 @@ def custom_material(material: Material, frequency_hz: float) -> Material:
 
 def usable_links(
     partial: PartialMap, paths: LinkPaths, measured: Measurements, repeats: NDArray[np.int64]
-) -> tuple[NDArray[np.bool_], dict[str, int]]:
+) -> tuple[Bools, dict[str, int]]:
     """Find the links (N,) from which materials can be determined, and count the other measurements by reason."""
     count, ones = len(measured), np.ones(len(paths.columns))
     power = paths.power(4.0 * ones, 0.1 * ones)
     found = paths.paths
     start_m, end_m = found.base.tx_m[found.path_tx], found.rx_m[found.path_rx]
-    seen = path_unobserved_m(partial, start_m, found.interactions, found.vertices_m, end_m) < SEEN_M
+    observed = path_unobserved_m(partial, start_m, found.interactions, found.vertices_m, end_m) < SEEN_M
     total = np.bincount(paths.link, weights=power, minlength=count)
-    sure = np.bincount(paths.link, weights=power * seen, minlength=count)
-    doubtful = np.zeros(count, dtype=bool)
-    doubtful[paths.link[paths.is_direct & ~seen]] = True
+    observed_power = np.bincount(paths.link, weights=power * observed, minlength=count)
+    unseen_los = np.zeros(count, dtype=bool)
+    unseen_los[paths.link[paths.is_direct & ~observed]] = True
     reasons = {
         OUTAGE: measured.is_outage,
         "no path on the map": total == 0.0,
-        "runs through unobserved space": doubtful | (sure < OBSERVED_FRACTION * total),
+        "runs through unobserved space": unseen_los | (observed_power < OBSERVED_FRACTION * total),
     }
     used, left_out = np.ones(count, dtype=bool), {}
-    for reason, matters in reasons.items():
-        left_out[reason] = int(repeats[used & matters].sum())
-        used &= ~matters
+    for reason, applies in reasons.items():
+        left_out[reason] = int(repeats[used & applies].sum())
+        used &= ~applies
     _require_enough(used, left_out)
     if paths.is_direct[used[paths.link]].all():
         raise MeasurementError(f"the {int(used.sum())} usable links of measurements have no reflection {_NO_MATERIAL}")
     return used, left_out
 
 
-def _require_enough(used: NDArray[np.bool_], left_out: Mapping[str, int]) -> None:
+def _require_enough(used: Bools, left_out: Mapping[str, int]) -> None:
     if used.sum() < FEWEST_LINKS:
         counts = ", ".join(f"{number} ({reason})" for reason, number in left_out.items())
         raise MeasurementError(
@@ -219,18 +217,17 @@ def _require_enough(used: NDArray[np.bool_], left_out: Mapping[str, int]) -> Non
         )
 
 
-def link_gains_db(power: NDArray[np.float64], link: NDArray[np.int64], links: int) -> NDArray[np.float64]:
+def link_gains_db(power: Floats, link: NDArray[np.int64], links: int) -> Floats:
     """Gain of N links [dB] from the power of their paths (P,); -inf where there is none."""
     with np.errstate(divide="ignore"):
         return 10.0 * np.log10(np.bincount(link, weights=power, minlength=links))
 
 
-def _strongest(link: NDArray[np.int64], power: NDArray[np.float64], fraction: float) -> NDArray[np.bool_]:
+def _strongest(link: NDArray[np.int64], power: Floats, fraction: float) -> Bools:
     """Find the strongest paths (P,) of each link that have a fraction of its power together."""
     order = np.lexsort((-power, link))
-    sums = np.cumsum(power[order])
     total = np.bincount(link, weights=power)
-    before = sums - power[order] - (np.cumsum(total) - total)[link[order]]
+    before = np.cumsum(power[order]) - power[order] - (np.cumsum(total) - total)[link[order]]
     strong = np.zeros(len(link), dtype=bool)
     strong[order] = (before < fraction * total[link[order]]) & (power[order] > 0.0)
     return strong

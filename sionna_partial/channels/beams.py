@@ -16,7 +16,7 @@ from sionna_partial.tracing.antennas import Antennas
 from sionna_partial.tracing.trace import path_gain_db
 
 if TYPE_CHECKING:
-    from sionna_partial.tracing.links import ChannelPaths
+    from sionna_partial.tracing.links import TracedLinks
 
 MAX_ANTENNAS = 4096
 """Largest number of antennas of a codebook."""
@@ -61,7 +61,7 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
 
 
 def beam_gains(
-    paths: "ChannelPaths",
+    paths: "TracedLinks",
     codebook: ArrayLike,
     rx_codebook: ArrayLike | None = None,
     *,

@@ -15,7 +15,7 @@ from sionna_partial.checks import Progress, require, require_choice, require_typ
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_files, atomic_path, input_path, open_regular, output_path
 from sionna_partial.progress import reporting
-from sionna_partial.tracing.links import ChannelPaths
+from sionna_partial.tracing.links import TracedLinks
 
 Layout = Literal["sionna", "deepmimo"]
 """Names and axes of the arrays in a file."""
@@ -30,7 +30,7 @@ MAX_BYTES = 2**44
 
 
 def save_channels(
-    channels: ChannelPaths | xr.Dataset,
+    channels: TracedLinks | xr.Dataset,
     path: str | os.PathLike[str],
     *,
     layout: Layout = "sionna",
@@ -79,7 +79,7 @@ def save_channels(
         if isinstance(channels, xr.Dataset):
             table = _unstacked(channels, options)
         else:
-            require_type("channels", channels, ChannelPaths, "give links, or what their cir, cfr or taps returned.")
+            require_type("channels", channels, TracedLinks, "give links, or what their cir, cfr or taps returned.")
             arrays = ArrayPaths.of(channels, **options)
             require(arrays.most > 0, "channels", f"{arrays.links} links", "none has a path: there is nothing to save.")
             table = _computed_later(arrays, report)

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtri
 
+from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
-
-Floats = NDArray[np.float64]
 
 REACH_M = 1.0
 """Distance over which the field decorrelates: its correlation is exp(-(d / reach)^2 / 2) [m]."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.cores import core_count
 from sionna_partial.errors import PredictorError
@@ -25,11 +26,7 @@ from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.tracing.links import TracedLinks
-from sionna_partial.tracing.paths import DIFFRACTION
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Integers = NDArray[np.intp]
+from sionna_partial.tracing.paths import DIFFRACTION, zenith_azimuth
 
 STATES = (LinkState.LOS, LinkState.NLOS)
 
@@ -61,13 +58,11 @@ class LinkGeometry:
     @classmethod
     def of(cls, partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> "LinkGeometry":
         """Measure the lines between transmitters and receivers (L, 3) [m]."""
-        x, y, z = (rx_m - tx_m).T
         distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
         tx_seen, rx_seen = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in (tx_m, rx_m))
-        departure_rad = np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)
         free_space_db = free_space_gain_db(distance_m, frequency_hz)
         unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m)
-        return cls(distance_m, unobserved_m, tx_seen, rx_seen, departure_rad, free_space_db)
+        return cls(distance_m, unobserved_m, tx_seen, rx_seen, zenith_azimuth(rx_m - tx_m), free_space_db)
 
     @cached_property
     def arrival_rad(self) -> Floats:
@@ -75,7 +70,7 @@ class LinkGeometry:
         zenith_rad, azimuth_rad = self.departure_rad.T
         return np.stack([np.pi - zenith_rad, wrapped(azimuth_rad + np.pi)], axis=1)
 
-    def take(self, index: Integers | Bools) -> "LinkGeometry":
+    def take(self, index: Indices | Bools) -> "LinkGeometry":
         """Return some of the links."""
         return LinkGeometry(*(getattr(self, column.name)[index] for column in fields(self)))
 
@@ -92,7 +87,7 @@ class LinkGeometry:
         return np.stack(columns, axis=1) / _SCALE[STATES.index(state)]
 
 
-def survival_inputs(links: TracedLinks, paths: Integers, unobserved_m: Floats, geometry: LinkGeometry) -> Floats:
+def survival_inputs(links: TracedLinks, paths: Indices, unobserved_m: Floats, geometry: LinkGeometry) -> Floats:
     """Return the inputs (P, 8) of the network for some traced paths, by their numbers (P,), on all links."""
     link, interactions = links.path_link[paths], links.interactions[paths]
     columns = (
@@ -154,11 +149,11 @@ class PathModel:
             values = np.maximum(values @ self.weights[layer] + self.weights[layer + 1], 0.0)
         return np.asarray(expit((values @ self.weights[4] + self.weights[5])[:, 0]))
 
-    def analogues(self, state: LinkState, keys: Floats, quantile: Floats) -> Integers:
+    def analogues(self, state: LinkState, keys: Floats, quantile: Floats) -> Indices:
         """Numbers (L,) of analogues of links of one state: of those alike, that of a quantile (L,) of delay spread."""
         tree, start = self._trees[STATES.index(state)]
-        places = np.arange(1, min(ALIKE, tree.n) + 1)
-        alike = tree.query(keys, k=places, eps=_NEARLY, workers=core_count())[1] + start
+        ranks = np.arange(1, min(ALIKE, tree.n) + 1)
+        alike = tree.query(keys, k=ranks, eps=_NEARLY, workers=core_count())[1] + start
         order = np.take_along_axis(alike, np.argsort(self.spread_ns[alike], axis=1), axis=1)
         chosen = (quantile * order.shape[1]).astype(np.intp)
         return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]

@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.channels.path_model import (
     STATES,
-    Bools,
-    Floats,
-    Integers,
     LinkGeometry,
     PathModel,
     survival_inputs,
@@ -25,6 +23,7 @@ from sionna_partial.prediction.link_context import traced_unobserved_m
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home
+from sionna_partial.tracing.antennas import directions
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.trace import path_gain_db, trace_links
 
@@ -64,35 +63,24 @@ def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -
     link, true_link = known.path_link, true.path_link
     same = _same(known, link, true, true_link)
     state = true.link_state.ravel()
-    taught = np.flatnonzero((known.interactions > 0).any(axis=1) & (state[link] != LinkState.OUTAGE))
-    inputs = survival_inputs(known, taught, traced_unobserved_m(partial, known, taught), geometry)
-    inputs = np.column_stack([inputs, state[link[taught]] == LinkState.LOS])
+    indirect = np.flatnonzero((known.interactions > 0).any(axis=1) & (state[link] != LinkState.OUTAGE))
+    inputs = survival_inputs(known, indirect, traced_unobserved_m(partial, known, indirect), geometry)
+    inputs = np.column_stack([inputs, state[link[indirect]] == LinkState.LOS])
     new = np.ones(len(true_link), dtype=bool)
     new[same[same >= 0]] = False
     new &= (true.interactions > 0).any(axis=1)
     return Example(
-        inputs, (same >= 0)[taught], tuple(_analogues(true, true_link, new, geometry, each) for each in STATES)
+        inputs, (same >= 0)[indirect], tuple(_analogues(true, true_link, new, geometry, each) for each in STATES)
     )
 
 
-def _same(known: TracedLinks, link: Integers, true: TracedLinks, true_link: Integers) -> Integers:
+def _same(known: TracedLinks, link: Indices, true: TracedLinks, true_link: Indices) -> Indices:
     """For each path on the partial map the path in the home that it is, -1 if there is none."""
 
-    def points(links: TracedLinks, link: Integers) -> Floats:
-        angles = np.hstack([links.departure_rad, links.arrival_rad])
-        sines, cosines = np.sin(angles), np.cos(angles)
-        directions = [
-            part
-            for start in (0, 2)
-            for part in (
-                sines[:, start] * cosines[:, start + 1],
-                sines[:, start] * sines[:, start + 1],
-                cosines[:, start],
-            )
-        ]
+    def points(links: TracedLinks, link: Indices) -> Floats:
+        toward = [directions(angles_rad)[0] / DIRECTION for angles_rad in (links.departure_rad, links.arrival_rad)]
         length_m, gain_db = links.delay_s * SPEED_OF_LIGHT_M_S, path_gain_db(np.abs(links.a) ** 2)
-        columns = [*(each / DIRECTION for each in directions), length_m / LENGTH_M, gain_db / GAIN_DB, 10.0 * link]
-        return np.stack(columns, axis=1)
+        return np.column_stack([*toward, length_m / LENGTH_M, gain_db / GAIN_DB, 10.0 * link])
 
     if not len(true_link) or not len(link):
         return np.full(len(link), -1)
@@ -101,7 +89,7 @@ def _same(known: TracedLinks, link: Integers, true: TracedLinks, true_link: Inte
 
 
 def _analogues(
-    true: TracedLinks, link: Integers, new: Bools, geometry: LinkGeometry, state: LinkState
+    true: TracedLinks, link: Indices, new: Bools, geometry: LinkGeometry, state: LinkState
 ) -> list[tuple[Floats, Floats]]:
     """Key and new paths of each link of one state."""
     power, count = np.abs(true.a) ** 2, len(geometry.distance_m)

@@ -1,4 +1,7 @@
-"""Channel responses of links with antenna arrays: paths + arrays -> impulse responses, frequency responses, taps."""
+"""Channel responses of links with antenna arrays: paths + arrays -> impulse responses, frequency responses, taps.
+
+And large-scale parameters of links: their spreads, K-factor and path loss.
+"""
 
 import math
 from collections.abc import Callable, Iterator
@@ -10,6 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import real_array, require, require_bool, require_number, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, SettingsError
@@ -17,7 +21,7 @@ from sionna_partial.tracing.antennas import Antennas
 from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION
 
 if TYPE_CHECKING:
-    from sionna_partial.tracing.links import ChannelPaths
+    from sionna_partial.tracing.links import TracedLinks
 
 BLOCK_BYTES = 4_000_000
 """Size of the coefficients that are computed together, which caches hold."""
@@ -33,7 +37,7 @@ FIRST_TAP, MORE_TAPS = -6, 6
 class ArrayPaths:
     """The paths of all links between antenna arrays."""
 
-    paths: "ChannelPaths"
+    paths: "TracedLinks"
     tx: Antennas
     rx: Antennas
     synthetic_array: bool
@@ -42,7 +46,7 @@ class ArrayPaths:
     @classmethod
     def of(
         cls,
-        paths: "ChannelPaths",
+        paths: "TracedLinks",
         *,
         tx_array: Any = None,
         rx_array: Any = None,
@@ -77,7 +81,7 @@ class ArrayPaths:
         return f"{len(self.rx)} x {len(self.tx)} antennas"
 
     @cached_property
-    def first(self) -> NDArray[np.intp]:
+    def first(self) -> Indices:
         """Where the paths of each link begin, and the number of all paths: (links + 1,)."""
         return np.searchsorted(self.paths.path_link, np.arange(self.links + 1))
 
@@ -86,12 +90,12 @@ class ArrayPaths:
         """The largest number of paths of a link."""
         return int(np.diff(self.first).max(initial=0))
 
-    def empty(self, links: int) -> tuple[NDArray[np.complex64], NDArray[np.float64]]:
+    def empty(self, links: int) -> tuple[NDArray[np.complex64], Floats]:
         """Return arrays for `Block.fill`: 0 and NaN."""
         shape = links, self.most, len(self.rx), len(self.tx)
         return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
 
-    def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, NDArray[np.intp]]]:
+    def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, Indices]]:
         """Yield links, their paths, and where those of each link begin and end among them, some at a time."""
         start = 0
         while start < self.links:
@@ -106,7 +110,7 @@ class ArrayPaths:
         for span in self.spans(max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))):
             yield self.block(*span)
 
-    def block(self, links: slice, rows: slice, first: NDArray[np.intp]) -> "Block":
+    def block(self, links: slice, rows: slice, first: Indices) -> "Block":
         """Compute the coefficients of one of the `spans`."""
         delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
         if self.synthetic_array:
@@ -141,12 +145,12 @@ class ArrayPaths:
         gains: NDArray[np.complex128] = at_rx.conj() @ each.transfer[rows] @ at_tx.transpose(0, 2, 1)
         return gains.astype(np.complex64)
 
-    def _advances_m(self, rows: slice) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _advances_m(self, rows: slice) -> tuple[Floats, Floats]:
         each = self.paths
         at_rx_m = self.rx.advance_m(np.asarray(each.arrival_rad[rows]), each.path_rx[rows])
         return at_rx_m, self.tx.advance_m(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
 
-    def _longer_m(self, rows: slice) -> NDArray[np.float64]:
+    def _longer_m(self, rows: slice) -> Floats:
         """By how much paths between antenna positions (P, A_rx, A_tx) are longer than between the centres [m].
 
         A path of reflections is a straight line from the image of the transmitter, which moves by M dt if the
@@ -160,7 +164,7 @@ class ArrayPaths:
         square = np.sum(self.rx.positions_m**2, axis=1)[:, None] + np.sum(self.tx.positions_m**2, axis=1)
         square = square - 2.0 * length_m * (at_rx_m[:, :, None] + at_tx_m[:, None, :])
         square -= 2.0 * (self.rx.positions_m @ between @ self.tx.positions_m.T)
-        longer_m: NDArray[np.float64] = np.sqrt(length_m**2 + square) - length_m
+        longer_m: Floats = np.sqrt(length_m**2 + square) - length_m
         split = np.flatnonzero(unfolded.split)
         if len(split):
             moved = [
@@ -180,7 +184,7 @@ def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
     return found
 
 
-def _after_shortest(delay_s: NDArray[np.float64], first: NDArray[np.intp]) -> NDArray[np.float64]:
+def _after_shortest(delay_s: Floats, first: Indices) -> Floats:
     """Return delays (P, ., .) after the shortest of each link."""
     reached, count = np.flatnonzero(np.diff(first)), np.diff(first)
     if not len(reached):
@@ -197,11 +201,11 @@ class Block:
     """
 
     links: slice
-    first: NDArray[np.intp]
+    first: Indices
     a: NDArray[np.complex64]
-    delay_s: NDArray[np.float64]
+    delay_s: Floats
 
-    def fill(self, a: NDArray[np.complex64], delay_s: NDArray[np.float64]) -> None:
+    def fill(self, a: NDArray[np.complex64], delay_s: Floats) -> None:
         """Put them into arrays (links, paths, antennas of rx, of tx), the delays likewise or (links, paths)."""
         count = np.diff(self.first)
         link = np.repeat(np.arange(len(count)), count)
@@ -219,19 +223,19 @@ class Unfolded:
     the images of both ends; `after` maps displacements of the receiver; `upright` (P,) is an edge.
     """
 
-    before: NDArray[np.float64]
-    after: NDArray[np.float64]
-    to_tx_m: NDArray[np.float64]
-    to_rx_m: NDArray[np.float64]
-    split: NDArray[np.bool_]
-    upright: NDArray[np.bool_]
+    before: Floats
+    after: Floats
+    to_tx_m: Floats
+    to_rx_m: Floats
+    split: Bools
+    upright: Bools
 
     @classmethod
-    def of(cls, paths: "ChannelPaths", rows: slice) -> "Unfolded":
+    def of(cls, paths: "TracedLinks", rows: slice) -> "Unfolded":
         """Walk along paths from the transmitter."""
-        kinds, vertices_m = np.asarray(paths.interactions[rows]), np.asarray(paths.vertices_m[rows])
+        types, vertices_m = np.asarray(paths.interactions[rows]), np.asarray(paths.vertices_m[rows])
         rx_m = paths.rx[paths.path_rx[rows]]
-        here_m, (count, depth) = paths.tx.reshape(-1, 3)[paths.path_tx[rows]], kinds.shape
+        here_m, (count, depth) = paths.tx.reshape(-1, 3)[paths.path_tx[rows]], types.shape
         points_m = np.concatenate([vertices_m, rx_m[:, None]], axis=1)
         points_m = np.where(np.isnan(points_m), rx_m[:, None], points_m)
         mirrored, length_m = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count)
@@ -246,12 +250,12 @@ class Unfolded:
             length_m += leg_m
             normal = following - arriving
             normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-9)[:, None]
-            reflected = kinds[:, step] == REFLECTION
+            reflected = types[:, step] == REFLECTION
             mirrored[reflected] -= 2.0 * (normal[reflected, :, None] * (normal[reflected, None] @ mirrored[reflected]))
-            new = np.isin(kinds[:, step], (DIFFRACTION, DIFFUSE))
+            new = np.isin(types[:, step], (DIFFRACTION, DIFFUSE))
             fresh = new & ~split
             before[fresh], to_tx_m[fresh] = mirrored[fresh], -(length_m[:, None] * arriving)[fresh]
-            upright |= fresh & (kinds[:, step] == DIFFRACTION) & (np.abs(following - arriving)[:, 2] < UPRIGHT)
+            upright |= fresh & (types[:, step] == DIFFRACTION) & (np.abs(following - arriving)[:, 2] < UPRIGHT)
             upright &= ~(new & split)
             split |= new
             mirrored[new], length_m[new], leaving[new] = np.eye(3), 0.0, following[new]
@@ -260,17 +264,15 @@ class Unfolded:
         before[~split] = mirrored[~split]
         return cls(before, mirrored.transpose(0, 2, 1), to_tx_m, length_m[:, None] * leaving, split, upright)
 
-    def longer_at_edges_m(
-        self, split: NDArray[np.intp], rx_moved_m: NDArray[np.float64], tx_moved_m: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def longer_at_edges_m(self, split: Indices, rx_moved_m: Floats, tx_moved_m: Floats) -> Floats:
         """By how much paths with numbers `split` are longer for displaced ends (P or 1, 3, A): (P, A_rx, A_tx) [m]."""
 
-        def from_edge(to_m: NDArray[np.float64], moved_m: NDArray[np.float64]) -> tuple[Any, Any]:
+        def from_edge(to_m: Floats, moved_m: Floats) -> tuple[Any, Any]:
             x, y, z = np.moveaxis(to_m[split, :, None] + moved_m, 1, 0)
             upright = self.upright[split, None]
             return np.hypot(np.hypot(x, y), np.where(upright, 0.0, z)), np.where(upright, z, 0.0)
 
-        def length_m(rx_moved_m: NDArray[np.float64], tx_moved_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        def length_m(rx_moved_m: Floats, tx_moved_m: Floats) -> Floats:
             rx_away, rx_z = from_edge(self.to_rx_m, self.after[split] @ rx_moved_m)
             tx_away, tx_z = from_edge(self.to_tx_m, self.before[split] @ tx_moved_m)
             return np.hypot(rx_away[:, :, None] + tx_away[:, None, :], rx_z[:, :, None] - tx_z[:, None, :])
@@ -279,7 +281,7 @@ class Unfolded:
         return length_m(rx_moved_m, tx_moved_m) - length_m(still, still)
 
 
-def cir(paths: "ChannelPaths", *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
+def cir(paths: "TracedLinks", *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
     """Impulse responses (`TracedLinks.cir`)."""
     arrays = ArrayPaths.of(paths, **options)
     pairs = len(arrays.rx) * len(arrays.tx)
@@ -302,9 +304,7 @@ _A = {"long_name": "complex baseband gain of the path", "units": "1"}
 _DELAY = {"long_name": "propagation delay, NaN where there is no path", "units": "s"}
 
 
-def cfr(
-    paths: "ChannelPaths", frequencies_hz: ArrayLike, *, memory_gb: float = MEMORY_GB, **options: Any
-) -> xr.Dataset:
+def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
     """Frequency responses (`TracedLinks.cfr`)."""
     arrays = ArrayPaths.of(paths, **options)
     remedy = "give frequencies relative to the carrier [Hz], such as those of subcarriers: (F,) numbers."
@@ -313,7 +313,7 @@ def cfr(
     inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
     require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")
 
-    def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
+    def kernel(delay_s: Floats) -> NDArray[Any]:
         return phasors(-2.0 * np.pi * delay_s[..., None] * offsets_hz)
 
     h = _filtered(arrays, kernel, len(offsets_hz), "frequencies", memory_gb)
@@ -323,7 +323,7 @@ def cfr(
 
 
 def taps(
-    paths: "ChannelPaths",
+    paths: "TracedLinks",
     bandwidth_hz: float,
     l_min: int = FIRST_TAP,
     l_max: int | None = None,
@@ -341,7 +341,7 @@ def taps(
     require_whole("l_min", l_min, -1_000_000, 1_000_000)
     require_whole("l_max", l_max, l_min, 1_000_000_000)
 
-    def kernel(delay_s: NDArray[np.float64]) -> NDArray[Any]:
+    def kernel(delay_s: Floats) -> NDArray[Any]:
         tap = np.arange(l_min, l_max + 1)
         return np.sinc(tap - bandwidth_hz * delay_s[..., None]).astype(np.complex64)
 
@@ -352,7 +352,7 @@ def taps(
 
 
 def _filtered(
-    arrays: ArrayPaths, kernel: Callable[[NDArray[np.float64]], NDArray[Any]], size: int, what: str, memory_gb: float
+    arrays: ArrayPaths, kernel: Callable[[Floats], NDArray[Any]], size: int, what: str, memory_gb: float
 ) -> NDArray[np.complex64]:
     """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size)."""
     link_bytes = 8 * len(arrays.rx) * len(arrays.tx) * size
@@ -391,3 +391,40 @@ def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: fl
             f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {what}, which take {size_gb:,.1f} "
             "GB: give fewer of them, more memory_gb, or use save_channels, which needs memory for some links only."
         )
+
+
+def spreads(links: "TracedLinks") -> xr.Dataset:
+    """Large-scale parameters (`TracedLinks.spreads`)."""
+    link, power = links.path_link, np.abs(links.a) ** 2
+
+    def total(values: Floats) -> Floats:
+        return np.bincount(link, values, links.gain_db.size).astype(np.float64)
+
+    with np.errstate(divide="ignore", invalid="ignore"):
+        all_power = total(power)
+        mean_s = total(power * links.delay_s) / all_power
+        delay_s = np.sqrt(total(power * (links.delay_s - mean_s[link]) ** 2) / all_power)
+        direct = total(power * (links.interactions == 0).all(axis=1))
+        k_factor_db = np.where(direct > 0.0, 10.0 * np.log10(direct / (all_power - direct).clip(0.0)), np.nan)
+
+        def angular_rad(angle: Floats) -> Floats:
+            length = np.hypot(total(power * np.cos(angle)), total(power * np.sin(angle))) / all_power
+            return np.sqrt(-2.0 * np.log(length.clip(max=1.0)))
+
+        angles = {
+            f"{name}_{end}_spread_rad": angular_rad(values[:, column])
+            for end, values in (("departure", links.departure_rad), ("arrival", links.arrival_rad))
+            for column, name in enumerate(("zenith", "azimuth"))
+        }
+    values: dict[str, NDArray[Any]] = {
+        "path_loss_db": np.where(all_power > 0.0, -links.gain_db.ravel(), np.nan),
+        "k_factor_db": k_factor_db,
+        "delay_spread_s": delay_s,
+        **angles,
+    }
+    units = {name: name.rpartition("_")[2].replace("db", "dB") for name in values}
+    table = {
+        name: (("tx", "rx")[2 - links.gain_db.ndim :], each.reshape(links.gain_db.shape), {"units": units[name]})
+        for name, each in values.items()
+    }
+    return xr.Dataset(table, attrs={"source": "3GPP TR 38.901, sections 7.5 and A.1"})

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.channels.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.checks import Progress, require_number, require_whole
@@ -66,7 +67,7 @@ class ChannelSamples(Shown):
     """
 
     link_state: NDArray[np.uint8]
-    gain_db: NDArray[np.float64]
+    gain_db: Floats
     memory_gb: float
     _draws: "_Draws" = field(repr=False)
 
@@ -168,7 +169,7 @@ def sample_channels(
     """Draw the channels of links on a partial map n times: states, gains and paths.
 
     Link state and gain of each link are drawn from what `predict_map` predicts, so that they agree with it; with 64
-    draws or more each link has its share of every state. Links share latents over space (`JointLatents`), so that a
+    draws or more, states occur as often as predicted. Links have spatial latents in common (`JointLatents`), so that a
     draw looks like one building: neighbours, and transmitters behind the same unseen wall, fail together. Given state
     and gain, traced paths survive with a learned probability, and analogues from procedural homes supply the rest
     (`PathModel`). On a complete map every draw is the trace.
@@ -272,9 +273,9 @@ class _Draws:
         self._survival_latent = ndtri(of_survival[:, self._uncertain])
         self._analogue_quantile = of_analogue[:, self._uncertain]
         self._model = PathModel.load()
-        self._paths, self._place, power = self._indirect()
+        self._paths, self._of_link, power = self._indirect()
         shape = len(self._paths), len(self._uncertain)
-        self._power = csr_array((power, (np.arange(len(power)), self._place)), shape=shape)
+        self._power = csr_array((power, (np.arange(len(power)), self._of_link)), shape=shape)
         unobserved_m = traced_unobserved_m(partial, traced, self._paths)
         self._crosses = np.zeros(len(self._link), dtype=bool)
         self._crosses[self._paths] = unobserved_m > 0.0
@@ -309,30 +310,30 @@ class _Draws:
         """Add vertices, which are not drawn."""
         return {**columns, "vertices_m": np.broadcast_to(math.nan, (*columns["interactions"].shape, 3))}
 
-    def _ordered(self, draws: NDArray[np.intp]) -> dict[str, NDArray[Any]]:
+    def _ordered(self, draws: Indices) -> dict[str, NDArray[Any]]:
         """Columns of all paths of some draws."""
         parts = [*self._parts(draws, np.random.default_rng([self._seed, _REST, draws[0]]))]
         order = path_order(parts)
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
-    def _parts(self, draws: NDArray[np.intp], rng: np.random.Generator) -> Iterator[SolvedPaths]:
+    def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
         """Paths of some draws: those of certain links, the surviving and direct ones, and those of analogues."""
-        certain, links, place = self._certain_paths, self._uncertain, self._place
+        certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
         state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]
         is_los, free_space = state == LinkState.LOS, 10.0 ** (self._geometry.free_space_db[links] / 10.0)
         rest = np.maximum(10.0 ** (gain_db / 10.0) - is_los * free_space, 0.0)
-        latent = self._survival_latent[draws][:, place]
+        latent = self._survival_latent[draws][:, of_link]
         latent += rng.standard_normal(latent.shape)
-        survives = latent < np.where(is_los[:, place], *self._survives_below)
-        survives &= (state != LinkState.OUTAGE)[:, place]
+        survives = latent < np.where(is_los[:, of_link], *self._survives_below)
+        survives &= (state != LinkState.OUTAGE)[:, of_link]
         survivors = survives.astype(np.float64) @ self._power
         analogue = self._analogues(draws, state, gain_db, survivors)
         has_paths = (np.diff(self._model.first)[analogue] > 0) & (analogue >= 0)
         # without an analogue's paths the survivors have all of the power
         scale = np.where((survivors > rest) | ~has_paths, rest / np.maximum(survivors, 1e-30), 1.0)
-        row, path = np.nonzero(survives & (scale > 0.0)[:, place])
-        yield self._copies(draws[row], self._paths[path], np.sqrt(scale[row, place[path]]), rng)
+        row, path = np.nonzero(survives & (scale > 0.0)[:, of_link])
+        yield self._copies(draws[row], self._paths[path], np.sqrt(scale[row, of_link[path]]), rng)
         alone = ~has_paths & (survivors == 0.0) & (state == LinkState.NLOS)
         row, link = np.nonzero(is_los | alone)
         kind = np.where(is_los[row, link], 0, UNSEEN)
@@ -341,13 +342,13 @@ class _Draws:
         left = np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
         yield self._of_analogues(draws, analogue, left, rng)
 
-    def _indirect(self) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
-        """Indirect traced paths of uncertain links that are not too weak; the place of each link there, and power."""
+    def _indirect(self) -> tuple[Indices, Indices, Floats]:
+        """Indirect traced paths of uncertain links that are not too weak, the number of the link of each, and power."""
         links = self._uncertain
-        place = np.full(len(self._geometry.distance_m), -1)
-        place[links] = np.arange(len(links))
-        paths = np.flatnonzero((place[self._link] >= 0) & (self.traced.interactions > 0).any(axis=1))
-        power, at = np.abs(self.traced.a[paths]) ** 2, place[self._link[paths]]
+        index = np.full(len(self._geometry.distance_m), -1)
+        index[links] = np.arange(len(links))
+        paths = np.flatnonzero((index[self._link] >= 0) & (self.traced.interactions > 0).any(axis=1))
+        power, at = np.abs(self.traced.a[paths]) ** 2, index[self._link[paths]]
         strongest = np.zeros(len(links))
         np.maximum.at(strongest, at, power)
         kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
@@ -355,11 +356,11 @@ class _Draws:
 
     def _analogues(
         self,
-        draws: NDArray[np.intp],
+        draws: Indices,
         state: NDArray[np.uint8],
-        gain_db: NDArray[np.float64],
-        survivors: NDArray[np.float64],
-    ) -> NDArray[np.intp]:
+        gain_db: Floats,
+        survivors: Floats,
+    ) -> Indices:
         """Analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
         analogue = np.full(survivors.shape, -1)
         for each in (LinkState.LOS, LinkState.NLOS):
@@ -371,9 +372,9 @@ class _Draws:
 
     def _of_analogues(
         self,
-        draws: NDArray[np.intp],
-        analogue: NDArray[np.intp],
-        power: NDArray[np.float64],
+        draws: Indices,
+        analogue: Indices,
+        power: Floats,
         rng: np.random.Generator,
     ) -> SolvedPaths:
         """Paths of analogues (D, U) with a power in sum (D, U), mirrored at random for each link and draw."""
@@ -398,9 +399,9 @@ class _Draws:
 
     def _copies(
         self,
-        draw: NDArray[np.intp],
-        paths: NDArray[np.intp],
-        scale: NDArray[np.float64] | None,
+        draw: Indices,
+        paths: Indices,
+        scale: Floats | None,
         rng: np.random.Generator | None,
     ) -> SolvedPaths:
         """Traced paths in some draws; what crosses the unseen has a random phase."""
@@ -413,13 +414,13 @@ class _Draws:
 
     def _made(
         self,
-        draw: NDArray[np.intp],
-        link: NDArray[np.intp],
-        power: NDArray[np.float64],
-        excess_s: NDArray[np.float64],
-        departure_rad: NDArray[np.float64],
-        arrival_rad: NDArray[np.float64],
-        kind: NDArray[np.intp],
+        draw: Indices,
+        link: Indices,
+        power: Floats,
+        excess_s: Floats,
+        departure_rad: Floats,
+        arrival_rad: Floats,
+        kind: Indices,
         rng: np.random.Generator,
     ) -> SolvedPaths:
         """Paths that were not traced: angles are those from the direct line, and they keep the polarisation."""

@@ -146,15 +146,12 @@ def _parse_shape(name: str, text: str) -> tuple[int, int]:
 
 def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     """Return positions (N, 3) in free cells [m]."""
-    import numpy as np
+    from sionna_partial.placement.area import grid_positions
 
-    low_x, low_y, high_x, high_y = partial.bounds_m
+    x0, y0, x1, y1 = partial.bounds_m
     if not spacing_m >= partial.resolution_m / 10.0:
         raise typer.BadParameter(f"--spacing {spacing_m:g} is too small: give {partial.resolution_m / 10.0:g} or more.")
-    x, y = np.meshgrid(
-        np.arange(low_x + spacing_m / 2.0, high_x, spacing_m), np.arange(low_y + spacing_m / 2.0, high_y, spacing_m)
-    )
-    grid_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height_m)])
+    grid_m = grid_positions((x0 + spacing_m / 2.0, x1), (y0 + spacing_m / 2.0, y1), spacing_m, height_m)
     return grid_m[partial.state_at(grid_m) == CellState.FREE]
 
 

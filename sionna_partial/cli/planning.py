@@ -1,4 +1,4 @@
-"""Subcommands that fit a material or a transmitter position, or plan a robot's way: calibrate, place, next."""
+"""Subcommands that fit a material or a transmitter position, or plan a robot's route: calibrate, place, next."""
 
 import json
 from pathlib import Path

@@ -8,7 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from sionna_partial.datasets.home_process import (
     allow_homes,
     installed_versions,
     run_home,
+    settings_record,
     stop_homes,
 )
 from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
@@ -186,14 +187,10 @@ def _prepare(
     folder: Path, sources: list[HomeSource], settings: DatasetSettings, home_time_limit_s: float
 ) -> list[HomeTask]:
     """Write or check the folder's `dataset.json`, remove what killed runs left, and return what is to be done."""
-    versions = installed_versions()
-    tasks = [HomeTask(str(folder), "", source, settings, versions, home_time_limit_s) for source in sources]
-    index = {
-        "versions": versions,
-        "settings": tasks[0].metadata["settings"],
-        "homes": [source.record for source in sources],
-    }
-    path, text = folder / INDEX_FILE, json.dumps(index, indent=2, sort_keys=True) + "\n"
+    path, versions = folder / INDEX_FILE, installed_versions()
+    homes = [source.record for source in sources]
+    index = {"versions": versions, "settings": settings_record(settings), "homes": homes}
+    text = json.dumps(index, indent=2, sort_keys=True) + "\n"
     _require_same(folder, json.loads(text))
     for parent in (folder, folder / SHARDS_FOLDER, folder / FAILED_FOLDER):
         for left in parent.glob(".tmp-*"):
@@ -202,7 +199,7 @@ def _prepare(
         with atomic_write(path, "w") as stream:
             stream.write(text)
     digest = hashlib.sha256(text.encode()).hexdigest()
-    return [replace(task, index_sha256=digest) for task in tasks]
+    return [HomeTask(str(folder), digest, source, settings, versions, home_time_limit_s) for source in sources]
 
 
 def _require_same(folder: Path, index: dict[str, Any]) -> None:

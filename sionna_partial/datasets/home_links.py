@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import MapError
@@ -35,9 +36,9 @@ _log = logging.getLogger(__name__)
 class _Positions:
     """T transmitters (3,) of a home, and for each its N receivers (N, 3), and whether they were drawn anywhere (N,)."""
 
-    tx_m: list[NDArray[np.float64]]
-    rx_m: list[NDArray[np.float64]]
-    anywhere: list[NDArray[np.bool_]]
+    tx_m: list[Floats]
+    rx_m: list[Floats]
+    anywhere: list[Bools]
 
 
 def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = None) -> LinkTable:
@@ -144,14 +145,14 @@ def _draw_positions(
 
 
 def _receivers(
-    cells: NDArray[np.bool_],
+    cells: Bools,
     count: int,
     home: PartialMap,
     name: str,
-    tx_m: NDArray[np.float64],
+    tx_m: Floats,
     settings: DatasetSettings,
     rng: np.random.Generator,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Draw receivers (count, 3) that are not at the transmitter [m]."""
     short, height_m = round(settings.short_link_fraction * count), settings.rx_height_m
     x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
@@ -166,9 +167,7 @@ def _receivers(
     raise MapError(f"home {name!r} is too small, all of it is within {NEAREST_M:g} m of a transmitter: leave it out.")
 
 
-def _points_in(
-    cells: NDArray[np.bool_], count: int, home: PartialMap, height_m: float, rng: np.random.Generator
-) -> NDArray[np.float64]:
+def _points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: np.random.Generator) -> Floats:
     """Draw points (count, 3) uniformly from cells, off their borders [m]."""
     rows, columns = np.nonzero(cells)
     index = rng.integers(len(rows), size=count)
@@ -179,7 +178,7 @@ def _points_in(
 
 def _truth(
     home: PartialMap, positions: _Positions, settings: DatasetSettings
-) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.float64]]:
+) -> tuple[Bools, NDArray[np.uint8], Floats]:
     """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]

@@ -70,8 +70,7 @@ class HomeTask:
     @property
     def metadata(self) -> dict[str, object]:
         """What the shard notes beside its links."""
-        sensor, settings = asdict(home_sensor(self.source.name, self.settings)), asdict(self.settings)
-        settings["stages"] = list(self.settings.stages)  # as JSON has it
+        sensor, settings = asdict(home_sensor(self.source.name, self.settings)), settings_record(self.settings)
         return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
 
     @property
@@ -95,6 +94,11 @@ class HomeResult:
 
     outcome: Literal["done", "failed", "unusable"]
     error: str = ""
+
+
+def settings_record(settings: DatasetSettings) -> dict[str, object]:
+    """Return settings as JSON has them."""
+    return asdict(settings) | {"stages": list(settings.stages)}
 
 
 def installed_versions() -> dict[str, str]:

@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
@@ -43,15 +44,15 @@ class LinkTable(Shown):
     """
 
     home: NDArray[np.str_]
-    stage: NDArray[np.float64]
+    stage: Floats
     features: LinkFeatures
     maps: tuple[PartialMap, ...]
     map_index: NDArray[np.int64]
     link_state: NDArray[np.uint8]
-    gain_db: NDArray[np.float64]
-    inside: NDArray[np.bool_]
-    anywhere: NDArray[np.bool_]
-    observed_fraction: NDArray[np.float64]
+    gain_db: Floats
+    inside: Bools
+    anywhere: Bools
+    observed_fraction: Floats
     complete_maps: Mapping[str, PartialMap]
 
     def __post_init__(self) -> None:

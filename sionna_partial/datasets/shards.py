@@ -201,7 +201,7 @@ def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
 
 
 def file_stem(name: str) -> str:
-    """Return the name of a home, cut where it is too long for the name of a file, and told apart by its hash."""
+    """Return the name of a home; one that is too long for the name of a file is cut, with its hash at the end."""
     content = name.encode(errors="surrogateescape")
     if len(content) <= _MAX_NAME_BYTES:
         return name

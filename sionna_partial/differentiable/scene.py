@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
@@ -394,7 +395,7 @@ def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
         parameters = replace(paths.base, **values)
 
         @cache
-        def slopes() -> dict[str, NDArray[np.float64]]:
+        def slopes() -> dict[str, Floats]:
             constants = [name for name in given if name != "tx_m"]
             found = paths.slopes(parameters, constants) if constants else {}
             if "tx_m" in given:
@@ -417,7 +418,7 @@ def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
     return power, vertices_m
 
 
-def _pulled(slopes: NDArray[np.float64], upstream: Any) -> Any:
+def _pulled(slopes: Floats, upstream: Any) -> Any:
     """Sum (K,) of slopes (P, K) times upstream derivatives (P,), in an order that does not depend on threads."""
     rows = tf.convert_to_tensor(upstream)[:, None] * slopes
     return tf.math.unsorted_segment_sum(rows, np.zeros(len(slopes), dtype=np.int32), 1)[0]
@@ -430,8 +431,8 @@ def _once_only(slopes: Any) -> Any:
 
 def moved_lengths_m(
     lengths: SmoothLengths,
-    exact_m: NDArray[np.float64],
-    base: tuple[NDArray[np.float64], NDArray[np.float64]],
+    exact_m: Floats,
+    base: tuple[Floats, Floats],
     ends: tuple[Any, Any],
 ) -> Any:
     """Return lengths (N,) that change from exact ones as smooth ones do while the ends of their segments move.

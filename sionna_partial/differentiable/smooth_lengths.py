@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.unobserved import Bools, Floats, Segment, enter_grid, leave_cells, segment_between
+from sionna_partial.prediction.unobserved import Segment, enter_grid, leave_cells, segment_between
 from sionna_partial.process import njit
 
 _BORDER_CELLS = 1e-6

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.display import Shown
@@ -38,7 +39,7 @@ class Majority:
     stds_db: tuple[float, ...]
 
     @classmethod
-    def fit(cls, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> "Majority":
+    def fit(cls, link_state: NDArray[np.uint8], gain_db: Floats) -> "Majority":
         """Count true link states (N,), and average true gains (N,) [dB]."""
         groups = [gain_db[link_state == state] for state in LinkState]
         known = [group if len(group) else np.array([GAIN_FLOOR_DB]) for group in groups]
@@ -104,7 +105,7 @@ def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
     return LinkFeatures(np.full(len(phi), LinkState.LOS), phi.distance_m, phi.distance_m, gain_db)
 
 
-def indoor_los_probability(distance_m: NDArray[np.float64], office: str) -> NDArray[np.float64]:
+def indoor_los_probability(distance_m: Floats, office: str) -> Floats:
     """Return the LOS probability of 3GPP TR 38.901 V18.0.0, Table 7.4.2-1, "Indoor - Mixed/Open office".
 
     The distance (N,) is horizontal [m]; `office` is one of `OFFICES`.
@@ -117,7 +118,7 @@ def indoor_los_probability(distance_m: NDArray[np.float64], office: str) -> NDAr
     return np.select([d <= 5.0, d <= 49.0], [1.0, near], far)
 
 
-def indoor_gain_db(distance_m: NDArray[np.float64], frequency_hz: float) -> dict[LinkState, NDArray[np.float64]]:
+def indoor_gain_db(distance_m: Floats, frequency_hz: float) -> dict[LinkState, Floats]:
     """Return the path gain [dB] of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
 
     The distance (N,) is three-dimensional [m]; the model is made for 1 to 150 m and 0.5 to 100 GHz, and is extended to

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, shown
 from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.datasets.link_table import LinkTable, stage_name
@@ -185,7 +185,7 @@ def evaluate(
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
 
 
-def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[Floats, Floats]:
     """Return accuracy and root mean square gain error [dB] of each home (H,), in the order of their names."""
     _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
     right = np.bincount(home, prediction.link_state == links.link_state)
@@ -193,7 +193,7 @@ def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[NDArray[n
     return right / count, np.sqrt(squares / count)
 
 
-def mean_and_error(values: NDArray[np.float64]) -> tuple[float, float]:
+def mean_and_error(values: Floats) -> tuple[float, float]:
     """Return the mean of values of homes (H,), and its standard error; nan for one home."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return float(values.mean()), float(error)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -74,8 +75,8 @@ class Reliability(Shown):
     """Links, mean confidence and accuracy in bins of the confidence (`CONFIDENCE_BINS`,); 0 in an empty bin."""
 
     links: NDArray[np.int64]
-    confidence: NDArray[np.float64]
-    accuracy: NDArray[np.float64]
+    confidence: Floats
+    accuracy: Floats
 
     @property
     def error(self) -> float:
@@ -93,10 +94,10 @@ class Calibration(Shown):
     """
 
     state: Reliability
-    gain_pit: NDArray[np.float64]
+    gain_pit: Floats
 
 
-def measure(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Metrics:
+def measure(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats) -> Metrics:
     """Compare a prediction of N links with their true link states and gains [dB]; outages count as -150 dB."""
     outage = link_state == LinkState.OUTAGE
     errors_db = gain_errors_db(prediction, link_state, gain_db)
@@ -114,15 +115,13 @@ def measure(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: 
     )
 
 
-def calibration(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]) -> Calibration:
+def calibration(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats) -> Calibration:
     """Measure the calibration of link state and gain."""
     fractions = pit_fractions(prediction, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
     return Calibration(reliability(prediction, link_state), np.diff(fractions))
 
 
-def gain_errors_db(
-    prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def gain_errors_db(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats) -> Floats:
     """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB."""
     return prediction.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
 
@@ -140,9 +139,9 @@ def reliability(prediction: LinkPrediction, link_state: NDArray[np.uint8]) -> Re
 def pit_fractions(
     prediction: LinkPrediction,
     link_state: NDArray[np.uint8],
-    gain_db: NDArray[np.float64],
-    levels: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    gain_db: Floats,
+    levels: Floats,
+) -> Floats:
     """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
@@ -156,9 +155,7 @@ def pit_fractions(
     return np.array([np.clip((level - below) / width, 0.0, 1.0).mean() for level in levels])
 
 
-def _gain_probabilities(
-    prediction: LinkPrediction, gain_db: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _gain_probabilities(prediction: LinkPrediction, gain_db: Floats) -> tuple[Floats, Floats]:
     """Predicted probabilities (N,) of a smaller gain, and of a gain that is not greater."""
     floor, none = np.full_like(gain_db, GAIN_FLOOR_DB), np.zeros_like(gain_db)
     below, upto = none.copy(), none.copy()
@@ -175,7 +172,7 @@ def _gain_probabilities(
 
 
 def _negative_log_likelihoods(
-    prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: NDArray[np.float64]
+    prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats
 ) -> tuple[float, float]:
     """Of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE

@@ -10,11 +10,12 @@ from typing import Any, overload
 import numpy as np
 import xarray as xr
 import yaml
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 from scipy.special import entr
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import (
     real_array,
     require_choice,
@@ -30,7 +31,7 @@ from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
 from sionna_partial.planar import largest_part
@@ -91,17 +92,17 @@ class NextView(Shown):
     ((2,), True)
     """
 
-    position_m: NDArray[np.float64]
+    position_m: Floats
     heading_deg: float
     path_length_m: float
     gain: float
     gain_per_m: float
-    path_m: NDArray[np.float64]
-    frontier_m: NDArray[np.float64]
+    path_m: Floats
+    frontier_m: Floats
 
 
 @dataclass(frozen=True, eq=False)
-class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_next_views"):
+class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_next_views"):
     """Poses to drive to, the best first: a sequence of `NextView`.
 
     Parameters
@@ -130,8 +131,8 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.next_views_plot:plot_n
 
     views: tuple[NextView, ...]
     partial: PartialMap
-    start_m: NDArray[np.float64]
-    tx_m: NDArray[np.float64]
+    start_m: Floats
+    tx_m: Floats
     uncertainty: xr.DataArray = field(repr=False)
     goal: str
 
@@ -262,7 +263,7 @@ def next_views(
     gains = _gains(partial, frontiers, tx_m, uncertainty, sensor)
     views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
     views.sort(key=lambda view: -view.gain_per_m)
-    start_m = _centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
+    start_m = cell_centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
     return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal)
 
 
@@ -287,7 +288,7 @@ def coverage_choice(
 def _gains(
     partial: PartialMap,
     frontiers: list[Frontier],
-    tx_m: NDArray[np.float64],
+    tx_m: Floats,
     uncertainty: xr.DataArray,
     sensor: SensorSettings,
 ) -> tuple[list[float], list[float]]:
@@ -320,9 +321,9 @@ def _gains(
 
 
 def _view(partial: PartialMap, frontier: Frontier, gain: float, heading_deg: float) -> NextView:
-    path_m = _centres_m(partial, frontier.route)
+    path_m = cell_centres_m(partial, frontier.route)
     length_m = float(np.linalg.norm(np.diff(path_m, axis=0), axis=1).sum())
-    frontier_m = _centres_m(partial, frontier.cells)
+    frontier_m = cell_centres_m(partial, frontier.cells)
     return NextView(path_m[-1], heading_deg, length_m, gain, gain / (length_m + LOOK_M), path_m, frontier_m)
 
 
@@ -341,12 +342,12 @@ def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]
         if not stands:
             raise PositionError(f"start = {shown(start)} is not in a free cell: {remedy}")
         cells = np.argwhere(free)
-        near = _centres_m(partial, cells) - start_m
+        near = cell_centres_m(partial, cells) - start_m
     row, column = cells[np.hypot(*near.T).argmin()]
     return int(row), int(column)
 
 
-def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measurements | None) -> NDArray[np.float64]:
+def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measurements | None) -> Floats:
     """Return the transmitters (T, 3) to predict [m]."""
     if tx is None and measured is not None:
         measured.require_transmitters()
@@ -357,9 +358,11 @@ def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measureme
     return tx_m
 
 
-def _possible_m(partial: PartialMap) -> NDArray[np.float64]:
+def _possible_m(partial: PartialMap) -> Floats:
     """Return positions that stand for all free cells (T, 3) [m]."""
-    cells_m = np.insert(_centres_m(partial, np.argwhere(partial.state == CellState.FREE)), 2, DEFAULT_HEIGHT_M, axis=1)
+    cells_m = np.insert(
+        cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE)), 2, DEFAULT_HEIGHT_M, axis=1
+    )
     cells_m = cells_m[clear_of_walls(partial, cells_m)]
     if not len(cells_m):
         raise PositionError("tx can be in no free cell clear of walls: give a transmitter.")
@@ -369,23 +372,21 @@ def _possible_m(partial: PartialMap) -> NDArray[np.float64]:
 
 
 def _uncertainty(
-    partial: PartialMap, tx_m: NDArray[np.float64], measured: Measurements | None, threshold_db: float | None
+    partial: PartialMap, tx_m: Floats, measured: Measurements | None, threshold_db: float | None
 ) -> xr.DataArray:
     """Predict the uncertainty of links of given transmitters on (tx, y, x) [bit]."""
     spacing_m = _spacing_m(partial)
     if not len(tx_m):
         none = xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))
         return _described(none, spacing_m)
-    own = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
-    told = measured if own or len(tx_m) == 1 else None
-    coverage = predict_map(partial, tx_m, spacing_m=spacing_m, measurements=told, progress=False)
+    near = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
+    used = measured if near or len(tx_m) == 1 else None
+    coverage = predict_map(partial, tx_m, spacing_m=spacing_m, measurements=used, progress=False)
     return _described(_entropy(coverage, threshold_db).drop_vars(("tx", *TX_COORDINATES)), spacing_m)
 
 
-def _located(
-    partial: PartialMap, measured: Measurements, threshold_db: float | None
-) -> tuple[NDArray[np.float64], xr.DataArray]:
-    """Return some positions (T, 3) [m] where the transmitter may be, and the share of each in the uncertainty.
+def _located(partial: PartialMap, measured: Measurements, threshold_db: float | None) -> tuple[Floats, xr.DataArray]:
+    """Return some positions (T, 3) [m] where the transmitter may be, and the contribution of each to the uncertainty.
 
     That is the uncertainty of the coverage averaged over all positions, weighted by the posterior of each.
     """
@@ -394,8 +395,8 @@ def _located(
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
     posterior = TransmitterPosterior(x_m, y_m, float(coverage.attrs["transmitter_m"][2]), probability)
     tx_m, weights = posterior.draw(POSITIONS)
-    shares = xr.DataArray(weights * len(weights), dims="tx")
-    return tx_m, _described(shares * _entropy(coverage, threshold_db), spacing_m)
+    relative = xr.DataArray(weights * len(weights), dims="tx")
+    return tx_m, _described(relative * _entropy(coverage, threshold_db), spacing_m)
 
 
 def _entropy(coverage: xr.Dataset, threshold_db: float | None) -> xr.DataArray:
@@ -416,11 +417,6 @@ def _spacing_m(partial: PartialMap) -> float:
 def _described(uncertainty: xr.DataArray, spacing_m: float) -> xr.DataArray:
     attributes = {"long_name": "uncertainty of the link", "units": "bit", "spacing_m": spacing_m}
     return uncertainty.rename("uncertainty").assign_attrs(attributes)
-
-
-def _centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> NDArray[np.float64]:
-    """Return x and y of the centres of cells (..., 2), rows and columns [m]."""
-    return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
 
 
 def _pose(view: NextView) -> dict[str, dict[str, float]]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
@@ -54,7 +55,7 @@ FLAT_FRACTION = 0.001
 
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID"}
 
-Segments = NDArray[np.float64]
+Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
 
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.checks import is_whole, number_of, real_array, shown
+from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.checks import is_whole, number_of, real_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
@@ -153,7 +154,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             return 1.0
         return float((self.state != CellState.UNKNOWN).mean())
 
-    def cell_index(self, points_m: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def cell_index(self, points_m: NDArray[np.floating]) -> tuple[Indices, Indices]:
         """Row and column (...) of the cells that hold world points (..., 2 or 3) [m]; they may be outside the grid."""
         points = np.asarray(points_m, dtype=float)
         column = np.floor((points[..., 0] - self.origin_m[0]) / self.resolution_m + 1e-9).astype(np.intp)
@@ -176,7 +177,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             freest = np.minimum(freest, _RANK[padded[row, column]])
         return _FREEST[freest]
 
-    def require_positions(self, name: str, points_m: object) -> NDArray[np.float64]:
+    def require_positions(self, name: str, points_m: object) -> Floats:
         """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
 
         Raises
@@ -196,7 +197,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
 
-    def _turned_hint(self, points_m: NDArray[np.float64]) -> str:
+    def _turned_hint(self, points_m: Floats) -> str:
         """Say how positions (N, 3), three at least, would all be free if the array of states were turned."""
         turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
         can_tell = len(points_m) >= 3 and self.mesh is None and bool((np.abs(points_m) < 1e8).all())
@@ -205,11 +206,11 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
                 return f" All {len(points_m)} are free on the map {name}."
         return ""
 
-    def radios_can_stand(self, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def radios_can_stand(self, points_m: Floats) -> Bools:
         """Whether `require_positions` takes each of the points (N, 3) [m]."""
         return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
 
-    def _position_faults(self, points_m: NDArray[np.float64]) -> list[tuple[NDArray[np.bool_], str, str]]:
+    def _position_faults(self, points_m: Floats) -> list[tuple[Bools, str, str]]:
         """Which points (N, 3) [m] have each fault, what it is, and the remedy."""
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
@@ -227,7 +228,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         ]
 
 
-def position_array(name: str, points_m: object) -> NDArray[np.float64]:
+def position_array(name: str, points_m: object) -> Floats:
     """Return positions (3,) or (N, 3) [m] as a float64 array, or raise a PositionError that names them."""
     points = real_array(name, points_m, PositionError, "give x, y, z in metres.").astype(np.float64)
     if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
@@ -235,14 +236,26 @@ def position_array(name: str, points_m: object) -> NDArray[np.float64]:
     return points
 
 
-def row_runs(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+def require_height(partial: PartialMap, name: str, height_m: object) -> None:
+    """Raise a SettingsError unless a height is between floor and ceiling of a map."""
+    low_m, high_m = partial.height_range_m
+    require_number(name, height_m, low_m, high_m, open_low=True)
+    require(number_of(height_m) < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
+
+
+def cell_centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> Floats:
+    """Return x and y of the centres of cells (..., 2), rows and columns [m]."""
+    return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
+
+
+def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
     """Row, first column and one past the last column of every horizontal run of True, in reading order."""
     step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(step == 1)
     return row, start, np.nonzero(step == -1)[1]
 
 
-def frontier_cells(state: NDArray[np.uint8]) -> NDArray[np.bool_]:
+def frontier_cells(state: NDArray[np.uint8]) -> Bools:
     """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]

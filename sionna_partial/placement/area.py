@@ -4,12 +4,12 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import PositionError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
@@ -53,8 +53,8 @@ class PlacementArea:
     partial: PartialMap
     height_m: float
     room: PartialMap
-    rx_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    rx_m: Floats
+    weight: Floats
     spacing_m: float
 
     @property
@@ -62,24 +62,23 @@ class PlacementArea:
         """Area where the transmitter may stand [m^2]."""
         return float((self.room.state == CellState.FREE).sum()) * self.room.resolution_m**2
 
-    def stands(self, positions_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def stands(self, positions_m: Floats) -> Bools:
         """Whether a transmitter may stand at each of the positions (..., 3) [m]."""
         return self.room.state_at(positions_m) == CellState.FREE
 
-    def positions(self, seed: int) -> NDArray[np.float64]:
+    def positions(self, seed: int) -> Floats:
         """Transmitter positions (C, 3) on a grid with a random offset [m]; cell centres where the grid meets none."""
         rng = np.random.default_rng(seed)
         spacing_m = max(POSITION_SPACING_M, math.sqrt(self.size_m2 / MAX_POSITIONS))
         x0, y0, x1, y1 = self.room.bounds_m
         start = rng.uniform(0.0, spacing_m, 2)
-        grid_m = np.round(_grid((x0 + start[0], x1), (y0 + start[1], y1), spacing_m, self.height_m), 3)
+        grid_m = np.round(grid_positions((x0 + start[0], x1), (y0 + start[1], y1), spacing_m, self.height_m), 3)
         grid_m = grid_m[self.stands(grid_m)]
         if len(grid_m):
             return grid_m
         cells = np.argwhere(self.room.state == CellState.FREE)
         chosen = cells[np.sort(rng.choice(len(cells), min(len(cells), MAX_POSITIONS), replace=False))]
-        xy_m = (chosen[:, ::-1] + 0.5) * self.room.resolution_m + self.room.origin_m
-        return np.column_stack([xy_m, np.full(len(xy_m), self.height_m)])
+        return np.column_stack([cell_centres_m(self.room, chosen), np.full(len(chosen), self.height_m)])
 
     def thinned(self, count: int) -> "PlacementArea":
         """Return the area with at most `count` of the receivers, drawn evenly by weight along the rows of the grid."""
@@ -91,7 +90,7 @@ class PlacementArea:
         weight = np.bincount(order[np.minimum(picks, len(order) - 1)], minlength=len(order)).astype(np.float64)
         return replace(self, rx_m=self.rx_m[weight > 0.0], weight=weight[weight > 0.0])
 
-    def visibility(self, positions_m: NDArray[np.float64], range_m: float = math.inf) -> NDArray[np.float64]:
+    def visibility(self, positions_m: Floats, range_m: float = math.inf) -> Floats:
         """How well positions (C, 3) see each receiver, without tracing: (C, N) in [0, 1], 0 beyond `range_m`."""
         walled, unobserved_m, distance_m = _lines(self.partial, positions_m, self.rx_m)
         seen = np.exp(-unobserved_m / _UNSEEN_LENGTH_M)
@@ -108,7 +107,7 @@ def placement_area(partial: PartialMap, height_m: float, rx_height_m: float, mod
     x0, y0, x1, y1 = partial.bounds_m
     spacing_m = max(RECEIVER_SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS))
     spacing_m = min(spacing_m, x1 - x0, y1 - y0)
-    rx_m = _grid((x0 + spacing_m / 2, x1), (y0 + spacing_m / 2, y1), spacing_m, rx_height_m)
+    rx_m = grid_positions((x0 + spacing_m / 2, x1), (y0 + spacing_m / 2, y1), spacing_m, rx_height_m)
     rx_m = rx_m[clear_of_walls(partial, rx_m)]
     area = PlacementArea(partial, height_m, _room(partial), rx_m, np.ones(len(rx_m)), spacing_m)
     weight = _weights(area, model)
@@ -139,7 +138,7 @@ def _room(partial: PartialMap) -> PartialMap:
     return PartialMap(room, cell_m, partial.origin_m, partial.wall_height_m)
 
 
-def _weights(area: PlacementArea, model: Predictor | None) -> NDArray[np.float64]:
+def _weights(area: PlacementArea, model: Predictor | None) -> Floats:
     """Weight (N,) of each receiver: 1 in free cells, else the mean P(indoor) over some transmitter positions."""
     weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
     if model is None or weight.all():
@@ -157,21 +156,20 @@ def _weights(area: PlacementArea, model: Predictor | None) -> NDArray[np.float64
     return weight
 
 
-def _grid(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, z_m: float) -> NDArray[np.float64]:
+def grid_positions(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, z_m: float) -> Floats:
+    """Return positions (N, 3) on a grid between two x and two y, all at one height [m]."""
     x, y = np.meshgrid(np.arange(*x_m, spacing_m), np.arange(*y_m, spacing_m))
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z_m)])
 
 
-def _lines(
-    partial: PartialMap, start_m: NDArray[np.float64], end_m: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, Floats, Floats]:
     """Whether each line (A B,) from A points to B others meets a wall, its unobserved length, and its length [m]."""
     start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
     walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
     return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)
 
 
-def _boustrophedon(points_m: NDArray[np.float64]) -> NDArray[np.intp]:
+def _boustrophedon(points_m: Floats) -> Indices:
     """Order points (N, 3) along stripes of four rows, to and fro."""
     x, y = points_m[:, 0], points_m[:, 1]
     rows = np.unique(np.round(y, 6), return_inverse=True)[1]

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sionna_partial.checks import Progress, no_progress, require, require_number
+from sionna_partial.arrays import Bools, Floats
+from sionna_partial.checks import Progress, no_progress
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write, temporary_folder
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.placement.area import PlacementArea, placement_area
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
@@ -88,15 +88,15 @@ class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement")
     ((3,), True)
     """
 
-    position_m: NDArray[np.float64]
+    position_m: Floats
     score: float
-    trajectory_m: NDArray[np.float64]
-    scores: NDArray[np.float64]
-    starts_m: NDArray[np.float64]
-    start_scores: NDArray[np.float64]
-    rx_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    values: NDArray[np.float64]
+    trajectory_m: Floats
+    scores: Floats
+    starts_m: Floats
+    start_scores: Floats
+    rx_m: Floats
+    weight: Floats
+    values: Floats
     spacing_m: float
     partial: PartialMap
     settings: PlacementSettings
@@ -241,16 +241,13 @@ class Search:
     ) -> "Search":
         """Check the settings against a map, whose scene will be written to an existing folder."""
         tracer = Tracer(partial, folder, *checked_settings(partial, trace_settings, scene_settings))
-        low_m, high_m = partial.height_range_m
         for name in ("tx_height_m", "rx_height_m"):
-            height_m = getattr(settings, name)
-            require_number(name, height_m, low_m, high_m, open_low=True)
-            require(height_m < high_m, name, height_m, f"stay below the ceiling at {high_m:g} m.")
+            require_height(partial, name, getattr(settings, name))
         model = None if partial.is_complete else Predictor.load(predictor)
         area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
         return cls(settings, tracer, model, area)
 
-    def starts(self, area: PlacementArea, count: int) -> NDArray[np.float64]:
+    def starts(self, area: PlacementArea, count: int) -> Floats:
         """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
         positions_m, range_m = area.positions(int(self.settings.seed)), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
@@ -267,7 +264,7 @@ class Search:
             chosen.append(int(np.argmax(left)))
         return positions_m[chosen]
 
-    def links(self, positions_m: NDArray[np.float64], area: PlacementArea) -> tuple[LinkPrediction, NDArray[np.bool_]]:
+    def links(self, positions_m: Floats, area: PlacementArea) -> tuple[LinkPrediction, Bools]:
         """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.tracer.settings.frequency_hz)
         features = []
@@ -283,25 +280,25 @@ class Search:
             columns[column.name][far] = getattr(found, column.name)
         return LinkPrediction(**columns), far
 
-    def values(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+    def values(self, positions_m: Floats, area: PlacementArea) -> Floats:
         """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
         links, far = self.links(positions_m, area)
         return np.where(far, link_values(links, self.settings), 1.0 if self.settings.objective == "coverage" else 0.0)
 
-    def scores(self, positions_m: NDArray[np.float64], area: PlacementArea) -> NDArray[np.float64]:
+    def scores(self, positions_m: Floats, area: PlacementArea) -> Floats:
         """Scores (P,) of positions (P, 3) [m]."""
         values = self.values(positions_m, area)
         return np.array([placement_score(each, area.weight, self.settings) for each in values])
 
 
-def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> NDArray[np.float64]:
+def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> Floats:
     """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
     return prediction.probability_above(settings.threshold_db)
 
 
-def placement_score(values: NDArray[np.float64], weight: NDArray[np.float64], settings: PlacementSettings) -> float:
+def placement_score(values: Floats, weight: Floats, settings: PlacementSettings) -> float:
     """Return the objective of receivers' values (N,) and weights (N,), rounded: threads change the last bits."""
     fraction = weight / weight.sum()
     if settings.objective == "coverage":
@@ -311,7 +308,7 @@ def placement_score(values: NDArray[np.float64], weight: NDArray[np.float64], se
     return round(float(values[order] @ np.diff(_counted(ends)) / _counted(np.ones(1))[0]), 3)
 
 
-def _counted(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
+def _counted(fraction: Floats) -> Floats:
     """Integral of what the worst receivers count, from 0 to a fraction of them."""
     falling = np.clip(fraction, FULL_FRACTION, LAST_FRACTION) - FULL_FRACTION
     width = LAST_FRACTION - FULL_FRACTION
@@ -321,10 +318,10 @@ def _counted(fraction: NDArray[np.float64]) -> NDArray[np.float64]:
 def _refined(
     search: Search,
     area: PlacementArea,
-    starts_m: NDArray[np.float64],
-    start_scores: NDArray[np.float64],
+    starts_m: Floats,
+    start_scores: Floats,
     report: Progress,
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+) -> list[tuple[Floats, Floats]]:
     """Move the best starts to better neighbours: positions (K, 3) [m] and scores (K,) of each route."""
     best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]
     routes = [([starts_m[index]], [start_scores[index]]) for index in best]

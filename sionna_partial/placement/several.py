@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Progress, require, require_whole
 from sionna_partial.display import Pictured
@@ -65,13 +66,13 @@ class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placeme
     ((2, 3), True)
     """
 
-    positions_m: NDArray[np.float64]
+    positions_m: Floats
     score: float
-    scores: NDArray[np.float64]
-    candidates_m: NDArray[np.float64]
-    rx_m: NDArray[np.float64]
-    weight: NDArray[np.float64]
-    values: NDArray[np.float64]
+    scores: Floats
+    candidates_m: Floats
+    rx_m: Floats
+    weight: Floats
+    values: Floats
     spacing_m: float
     partial: PartialMap
     settings: PlacementSettings
@@ -160,7 +161,7 @@ def place_transmitters(
     )
 
 
-def _candidates(search: Search, area: PlacementArea, count: int) -> NDArray[np.float64]:
+def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
     """Positions (C, 3) [m]: half of them good alone, the others each as far as possible from those before."""
     chosen_m, positions_m = search.starts(area, count // 2), area.positions(int(search.settings.seed))
     apart_m = np.linalg.norm(positions_m[:, None] - chosen_m, axis=2).min(axis=1)
@@ -171,7 +172,7 @@ def _candidates(search: Search, area: PlacementArea, count: int) -> NDArray[np.f
     return chosen_m
 
 
-def _covered(search: Search, area: PlacementArea, candidates_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _covered(search: Search, area: PlacementArea, candidates_m: Floats) -> Bools:
     """Whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
     links, far = search.links(candidates_m, area)
     latents = JointLatents(area.partial)
@@ -179,11 +180,11 @@ def _covered(search: Search, area: PlacementArea, candidates_m: NDArray[np.float
     return (gain_db > search.settings.threshold_db) | ~far
 
 
-def _score(covered: NDArray[np.bool_], weight: NDArray[np.float64], chosen: list[int]) -> float:
+def _score(covered: Bools, weight: Floats, chosen: list[int]) -> float:
     return float(covered[:, chosen].any(axis=1).mean(axis=0) @ weight)
 
 
-def _greedy(covered: NDArray[np.bool_], weight: NDArray[np.float64], count: int) -> tuple[list[int], list[float]]:
+def _greedy(covered: Bools, weight: Floats, count: int) -> tuple[list[int], list[float]]:
     """Choose candidates one after the other, each that adds most."""
     chosen: list[int] = []
     scores = []
@@ -197,13 +198,13 @@ def _greedy(covered: NDArray[np.bool_], weight: NDArray[np.float64], count: int)
     return chosen, scores
 
 
-def _swapped(covered: NDArray[np.bool_], weight: NDArray[np.float64], chosen: list[int]) -> list[int]:
+def _swapped(covered: Bools, weight: Floats, chosen: list[int]) -> list[int]:
     """Replace one transmitter by another candidate while the score rises."""
     best = _score(covered, weight, chosen)
     for _ in range(_SWAPS):
         others = [
-            [*chosen[:place], number, *chosen[place + 1 :]]
-            for place, number in itertools.product(range(len(chosen)), range(covered.shape[1]))
+            [*chosen[:index], number, *chosen[index + 1 :]]
+            for index, number in itertools.product(range(len(chosen)), range(covered.shape[1]))
             if number not in chosen
         ]
         scores = [_score(covered, weight, each) for each in others]

@@ -1,4 +1,4 @@
-"""Figures of coverage maps."""
+"""Figures of coverage maps, and of networks of several transmitters."""
 
 import itertools
 import math
@@ -16,9 +16,11 @@ from matplotlib.patches import Patch, Polygon
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.coverage_map import (
+    TX_COORDINATES,
     WALL_PARTS,
     probability_above,
     require_coverage,
@@ -26,12 +28,14 @@ from sionna_partial.coverage_map import (
     transmitters_of,
 )
 from sionna_partial.measurements.localisation import likely_region
-from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, shade, sheet_columns
+from sionna_partial.network import require_network
+from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, server_colours, shade, sheet_columns
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""
 
 _NARROW_IN, _WIDE_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 0.35, 170, 3000
+_NETWORK_WIDTH_IN, _NETWORK_DPI = 10.0, 130
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
@@ -51,7 +55,7 @@ class Layer:
     label: str = ""
 
 
-def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> NDArray[np.float64]:
+def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> Floats:
     """Mix the colours of the three link states by their probabilities (paper, Section IV-C): (..., 3) in [0, 1]."""
     colours = np.array([to_rgb(STATE_COLOURS[state]) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)])
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
@@ -282,14 +286,14 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset 
     axis.set(xlim=extent[:2], ylim=extent[2:], aspect="equal")
 
 
-def extent_m(coverage: xr.Dataset) -> tuple[float, float, float, float]:
-    """Limits x0, x1, y0, y1 of the map [m]."""
+def extent_m(coverage: xr.Dataset | xr.DataArray) -> tuple[float, float, float, float]:
+    """Limits x0, x1, y0, y1 of a map with the attribute `spacing_m` [m]."""
     half = coverage.attrs["spacing_m"] / 2
     x, y = coverage["x"].to_numpy(), coverage["y"].to_numpy()
     return x[0] - half, x[-1] + half, y[0] - half, y[-1] + half
 
 
-def wall_cells(coverage: xr.Dataset) -> NDArray[np.bool_]:
+def wall_cells(coverage: xr.Dataset) -> Bools:
     """Where walls are, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
@@ -300,12 +304,12 @@ def wall_cells(coverage: xr.Dataset) -> NDArray[np.bool_]:
     return wall.reshape(bits.shape[0] * fine, bits.shape[1] * fine)
 
 
-def outside(coverage: xr.Dataset) -> NDArray[np.bool_]:
+def outside(coverage: xr.Dataset) -> Bools:
     """Where nobody can be: the unknown cells of a complete map."""
     return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
 
 
-def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
     """Refine a picture to the size of `wall`, and fill cells without receiver from their nearest neighbour.
 
     A wall thinner than a cell leaves a strip of cells without receiver bare; this is for the eye alone.
@@ -318,12 +322,12 @@ def _fill(picture: NDArray[np.float64], valid: NDArray[np.bool_], wall: NDArray[
     return picture[row // fine, column // fine]
 
 
-def _hatched(coverage: xr.Dataset) -> NDArray[np.bool_]:
+def _hatched(coverage: xr.Dataset) -> Bools:
     """Unobserved cells that a receiver may be in."""
     return ~coverage["observed"].to_numpy() & ~outside(coverage)
 
 
-def unobserved_area(coverage: xr.Dataset) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def unobserved_area(coverage: xr.Dataset) -> tuple[Floats, Floats, Floats]:
     """Cell centres x (nx + 2,) and y (ny + 2,) with one cell around the map, and 1 where to hatch (ny + 2, nx + 2)."""
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
     x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
@@ -340,7 +344,7 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
     area.set_hatch_linewidth(0.5)
 
 
-def likely_area(coverage: xr.Dataset) -> list[tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]]:
+def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
     """As `unobserved_area`, the cells with 90 % of an unknown transmitter's posterior; nothing if it is known."""
     if "p_transmitter" not in coverage:
         return []
@@ -369,3 +373,75 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
             Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
         )
     legend_below(figure, handles, columns=4 if located else None)
+
+
+def plot_network(network: xr.Dataset) -> Figure:
+    """Draw best server, mean SINR, probability of enough SINR, and mean rate of a network.
+
+    Parameters
+    ----------
+    network : xarray.Dataset
+        From `network_map`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not registered with pyplot: it need not be closed.
+
+    Raises
+    ------
+    SettingsError
+        For something else than a network map.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> coverage = sp.predict_map(sp.make_home(7), {"a": (3.0, 4.0, 2.2), "b": (6.0, 3.0, 1.0)}, spacing_m=0.5)
+    >>> figure = sp.plot_network(sp.network_map(coverage))
+    >>> figure.savefig("network.png")
+    """
+    require_network(network)
+    aspect = network.sizes["x"] / network.sizes["y"]
+    height = min(max((_NETWORK_WIDTH_IN / 2 - 1.2) / aspect, 2.0), 9.0)
+    figure = Figure(figsize=(_NETWORK_WIDTH_IN, 2 * height + 1.6), dpi=_NETWORK_DPI, layout="constrained")
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    names = [str(name) for name in network["tx"].to_numpy()]
+    servers = ListedColormap(server_colours(len(names)))
+    best, norm = network["best_server"].to_numpy(), Normalize(-0.5, len(names) - 0.5)
+    _draw_network(axes[0, 0], network, np.where(best >= 0, best, np.nan), servers, norm)
+    axes[0, 0].set_title("Likeliest best server")
+    bar = figure.colorbar(ScalarMappable(norm, servers), ax=axes[0, 0], ticks=range(len(names)))
+    bar.ax.set_yticklabels(names, parse_math=False)
+    threshold_db = float(network.attrs["sinr_threshold_db"])
+    top_bit_s = float(np.nanmax(network["rate_bit_s"])) / 1e6 if np.isfinite(network["rate_bit_s"]).any() else 1.0
+    layers = (
+        (axes[0, 1], "sinr_mean_db", 1.0, Normalize(-20.0, 40.0), "Mean SINR [dB]"),
+        (axes[1, 0], "p_sinr_above", 1.0, Normalize(0.0, 1.0), f"P(SINR > {threshold_db:g} dB)"),
+        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), "Mean Shannon rate [Mbit/s]"),
+    )
+    for axis, name, scale, norm, title in layers:
+        _draw_network(axis, network, scale * network[name].to_numpy(), "viridis", norm)
+        figure.colorbar(ScalarMappable(norm, "viridis"), ax=axis)
+        axis.set_title(title)
+    for axis in axes.flat:
+        axis.label_outer()
+    seen = Line2D([], [], color="0.7", label="border of the observed part")
+    legend_below(figure, [Line2D([], [], label="transmitter", **_STAR), seen])
+    bandwidth_mhz = float(network.attrs["bandwidth_hz"]) / 1e6
+    figure.suptitle(f"Network of {len(names)} transmitters, {bandwidth_mhz:g} MHz, load {network.attrs['load']:g}")
+    return figure
+
+
+def _draw_network(
+    axis: Axes, network: xr.Dataset, picture: Floats, cmap: str | ListedColormap, norm: Normalize
+) -> None:
+    """Draw a layer, the walls and the transmitters."""
+    extent = extent_m(network)
+    shown = np.ma.masked_invalid(picture)
+    axis.imshow(shown, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)
+    axis.imshow(shade(wall_cells(network)), extent=extent, origin="lower", zorder=3)
+    unseen = ~network["observed"].to_numpy().astype(bool)
+    axis.contour(network["x"], network["y"], unseen, levels=[0.5], colors="0.7", linewidths=0.8)
+    x, y, _ = (network[name].to_numpy() for name in TX_COORDINATES)
+    axis.plot(x, y, zorder=4, **_STAR)
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")

@@ -125,8 +125,8 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
         layers["best_server"] = _best_server(maps)
         words["best_server"] = [*maps]
     source, shown, plot = _source(maps, layers), IndexFilter(indices=[0]), _empty_plot(one)
-    place = {"source": source, "view": CDSView(filter=shown)} | _rectangle(one)
-    parts = {name: _add_layer(plot, place, name, layer, words.get(name, ())) for name, layer in layers.items()}
+    geometry = {"source": source, "view": CDSView(filter=shown)} | _rectangle(one)
+    parts = {name: _add_layer(plot, geometry, name, layer, words.get(name, ())) for name, layer in layers.items()}
     _add_hover(plot, [images[0] for images in parts.values()], words)
     _add_map(plot, maps)
     titles = {name: layers[name].title for name in _LAYERS if name in layers}
@@ -207,7 +207,7 @@ def _rectangle(coverage: xr.Dataset) -> dict[str, float]:
     return {"x": x0, "y": y0, "dw": x1 - x0, "dh": y1 - y0}
 
 
-def _add_layer(plot: Any, place: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str]) -> list[Any]:
+def _add_layer(plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str]) -> list[Any]:
     """Draw a layer, of numbers or of words, with its colour bar, and return both; the first layer alone is visible."""
     from bokeh.models import FixedTicker, LinearColorMapper
     from bokeh.models.annotations.legends import ColorBar
@@ -219,7 +219,7 @@ def _add_layer(plot: Any, place: Mapping[str, Any], name: str, layer: Layer, wor
     low, high = float(layer.norm.vmin or 0.0) - half, float(layer.norm.vmax or 0.0) + half
     colours = LinearColorMapper(palette=palette, low=low, high=high, nan_color="#00000000")
     visible = name == _LAYERS[0]
-    image = plot.image(image=name, color_mapper=colours, visible=visible, **place)
+    image = plot.image(image=name, color_mapper=colours, visible=visible, **geometry)
     bar = ColorBar(color_mapper=colours, title=layer.label, visible=visible)
     if words:
         bar.ticker = FixedTicker(ticks=[*range(len(words))])

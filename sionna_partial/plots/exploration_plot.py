@@ -1,4 +1,4 @@
-"""Pictures of an exploration: what the robot has seen, its trajectory, and its field of view."""
+"""Pictures of an exploration: what the robot has seen, its trajectory and field of view, and where to drive next."""
 
 import io
 import math
@@ -10,21 +10,26 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, Polygon
+from matplotlib.patches import Patch, Polygon, Wedge
 from matplotlib.path import Path as MarkerPath
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
+from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.coverage_plot import extent_m
 from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import (
     BLUE,
     RED,
     STAR,
+    UNKNOWN,
+    WALL,
     YELLOW,
     Figure,
     corners_m,
@@ -42,9 +47,10 @@ FRAME_MS, LAST_FRAME_MS = 100, 2500
 MAX_PANELS = 12
 """Largest number of moments in one contact sheet."""
 
-_FREE, _WALL, _UNKNOWN, _UNSEEN_WALL = "white", "black", "0.86", "0.68"
+_FREE, _UNSEEN_WALL = "white", "0.68"
 _VIEW_OPACITY = 0.35
-_WIDTH_IN, _DPI = 8.0, 165
+_WIDTH_IN, _DPI, _VIEWS_DPI = 8.0, 165, 130
+_AROUND_M, _VIEW_M, _VIEW_DEG = 1.5, 0.9, 60.0
 _FRAME_IN, _FRAME_DPI = 5.6, 90
 _MIXED_COLOURS, _ALIKE = 128, 16
 _MAX_COVERAGE = Image.Quantize.MAXCOVERAGE
@@ -162,14 +168,12 @@ def _predicted(
     coverage = predict_map(partial, tx, spacing_m=_SPACING_M, progress=False)
     width, height, wide = size[0] - 0.6, size[1] - 0.7, 2 * size[0] + 1.0
     figure = Figure(figsize=(wide, size[1]), dpi=_FRAME_DPI)
-    x, y, half = coverage.x.to_numpy(), coverage.y.to_numpy(), _SPACING_M / 2
-    extent = (x[0] - half, x[-1] + half, y[0] - half, y[-1] + half)
     alpha = coverage.p_indoor.fillna(0.0).clip(_PALEST, 1.0).to_numpy()
     for column, (name, (title, colours, least, most)) in enumerate(_PREDICTED.items()):
         left = 0.1 + column * (size[0] + 0.5)
         panel = figure.add_axes((left / wide, 0.3 / size[1], width / wide, height / size[1]))
         draw_map(panel, partial)
-        limits: dict[str, Any] = {"vmin": least, "vmax": most, "extent": extent, "origin": "lower"}
+        limits: dict[str, Any] = {"vmin": least, "vmax": most, "extent": extent_m(coverage), "origin": "lower"}
         picture = panel.imshow(coverage[name], cmap=colours, alpha=alpha, zorder=2.0, **limits)
         panel.plot(*np.ravel(tx)[:2], markersize=15, zorder=5, **STAR)
         panel.set(xlim=window[:2], ylim=window[2:], aspect="equal", xticks=[], yticks=[])
@@ -188,7 +192,7 @@ def _beside(left: Image.Image, right: Image.Image) -> Image.Image:
 
 def _palette(frame: Image.Image) -> Image.Image:
     """Choose the colours of all frames: exactly those that are drawn, and the mixtures that the last frame has."""
-    drawn = np.array([to_rgb(colour) for colour in (_FREE, _WALL, _UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
+    drawn = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
     exact = np.rint(255 * drawn).astype(int)
     mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
     apart = np.abs(mixed[:, None] - exact).max(axis=2).min(axis=1) > _ALIKE
@@ -214,7 +218,7 @@ def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
         panel.add_patch(Polygon(view, color=YELLOW, alpha=_VIEW_OPACITY, linewidth=0))
     panel.plot(x, y, marker=_arrow(heading_deg), color=RED, markersize=10, markeredgecolor="white")
     window = _window_m(exploration)
-    panel.set(xlim=window[:2], ylim=window[2:], aspect="equal", facecolor=_UNKNOWN, xlabel="x [m]", ylabel="y [m]")
+    panel.set(xlim=window[:2], ylim=window[2:], aspect="equal", facecolor=UNKNOWN, xlabel="x [m]", ylabel="y [m]")
     panel.set_title(f"step {step}: {exploration.observed_fractions[index]:.0%} seen", fontsize=11)
 
 
@@ -224,9 +228,9 @@ def _arrow(heading_deg: float) -> MarkerPath:
     return MarkerPath(np.stack([np.cos(angles), np.sin(angles)], axis=1), closed=True)
 
 
-def _picture(state: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.float64]:
+def _picture(state: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Floats:
     """Colours of the cells, (ny, nx, 3): the map, and beneath it the walls that are not on it."""
-    picture = np.array([to_rgb(colour) for colour in (_FREE, _WALL, _UNKNOWN)])[state]
+    picture = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN)])[state]
     picture[(state == CellState.UNKNOWN) & (truth == CellState.WALL)] = to_rgb(_UNSEEN_WALL)
     return picture
 
@@ -247,11 +251,83 @@ def _add_legend(figure: Figure, exploration: Exploration) -> None:
         Line2D([], [], color=BLUE, marker="o", markersize=4, markevery=[0], label="trajectory"),
         Line2D([], [], color=RED, marker=_arrow(0.0), markersize=10, linestyle="none", label="robot"),
         *([Patch(color=YELLOW, alpha=_VIEW_OPACITY, label="field of view")] if any(exploration.steps) else []),
-        Patch(color=_WALL, label="wall, seen"),
+        Patch(color=WALL, label="wall, seen"),
         *([Patch(color=_UNSEEN_WALL, label="wall, not seen")] if (unseen & walls).any() else []),
-        Patch(color=_UNKNOWN, label="not seen"),
+        Patch(color=UNKNOWN, label="not seen"),
     ]
     if _drifts(exploration):
         handles[0].set_label("estimated trajectory")
         handles.insert(1, Line2D([], [], color=BLUE, linewidth=1.0, linestyle=":", label="true trajectory"))
     legend_below(figure, handles, 3)
+
+
+def plot_next_views(views: NextViews) -> Figure:
+    """Draw the map, the predicted uncertainty, and the ranked poses with their paths and frontiers.
+
+    Parameters
+    ----------
+    views : NextViews
+        From `next_views`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Not registered with pyplot: it need not be closed.
+
+    Raises
+    ------
+    SettingsError
+        For something else than NextViews.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> partial = sp.explore(sp.make_home(3), steps=(60,), seed=0)[0]
+    >>> figure = sp.plot_next_views(sp.next_views(partial, goal="area"))
+    >>> figure.savefig("next_views.png")
+    """
+    require_type("views", views, NextViews, "give what next_views returned.")
+    partial = views.partial
+    known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
+    low, high = np.array(partial.bounds_m).reshape(2, 2)
+    shown_m = [np.clip(known_m + side, low, high) for side in (-_AROUND_M, _AROUND_M)]
+    x0, x1, y0, y1 = window_m(np.vstack([*shown_m, views.tx_m[:, :2]]))
+    height = min(max((_WIDTH_IN - 1.8) * (y1 - y0) / (x1 - x0), 3.0), 12.0)
+    figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_VIEWS_DPI, layout="constrained")
+    axis = figure.add_subplot()
+    draw_map(axis, partial)
+    if len(views.tx_m):
+        _draw_uncertainty(figure, axis, views)
+    for rank, view in reversed([*enumerate(views, start=1)]):
+        _draw_view(axis, rank, view)
+    axis.plot(*views.start_m, marker="o", color=BLUE, markersize=7, markeredgecolor="white", zorder=5)
+    axis.plot(*views.tx_m[:, :2].T, markersize=15, zorder=5, **STAR)
+    axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axis.set_title(f"{len(views)} next views, the best first", fontsize="medium")
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=BLUE, marker="o", markevery=[0], label="start and path"),
+        Line2D([], [], color=RED, linewidth=3, label="frontier"),
+        Patch(color=YELLOW, label="next view"),
+        Patch(color=WALL, label="wall"),
+    ]
+    if len(views.tx_m):
+        handles.insert(0, Line2D([], [], label="transmitter", markersize=13, **STAR))
+    legend_below(figure, handles)
+    return figure
+
+
+def _draw_uncertainty(figure: Figure, axis: Axes, views: NextViews) -> None:
+    style: dict[str, Any] = {"extent": extent_m(views.uncertainty), "origin": "lower", "zorder": 0.7}
+    most = 1.0 if views.goal == "coverage" else math.log2(3)
+    picture = axis.imshow(views.uncertainty.mean("tx"), cmap="Purples", vmin=0.0, vmax=most, alpha=0.85, **style)
+    figure.colorbar(picture, ax=axis, label="uncertainty of the link [bit]", shrink=0.8)
+
+
+def _draw_view(axis: Axes, rank: int, view: NextView) -> None:
+    axis.plot(*view.path_m.T, color=BLUE, linewidth=1.0, alpha=0.7, zorder=3.5)
+    axis.plot(*view.frontier_m.T, color=RED, marker="s", markersize=2, linestyle="none", zorder=3.6)
+    ends_deg = view.heading_deg + np.array([-0.5, 0.5]) * _VIEW_DEG
+    axis.add_patch(Wedge(tuple(view.position_m), _VIEW_M, *ends_deg, color=YELLOW, alpha=0.8, linewidth=0, zorder=4))
+    label = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
+    x, y = view.position_m.tolist()
+    axis.text(x, y, str(rank), fontsize=8, ha="center", va="center", bbox=label, zorder=6)

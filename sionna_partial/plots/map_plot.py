@@ -4,8 +4,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import real_array
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PositionError
@@ -78,7 +79,7 @@ def draw_map(axis: Axes, partial: PartialMap) -> None:
         axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", zorder=order)
 
 
-def _positions(name: str, values: ArrayLike | None) -> NDArray[np.float64]:
+def _positions(name: str, values: ArrayLike | None) -> Floats:
     """Return x and y (N, 2) of positions [m]; none for None."""
     if values is None:
         return np.zeros((0, 2))

@@ -64,8 +64,8 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     _draw_gains(axes[1], calibration)
     for which in range(count):
         _draw_reflection(axes[2 + which], calibration, which)
-    doubts = ", ".join(calibration.undetermined)
-    note = f"; the measurements cannot determine {doubts}" if doubts else ""
+    undetermined = ", ".join(calibration.undetermined)
+    note = f"; the measurements cannot determine {undetermined}" if undetermined else ""
     used, count = int(calibration.used.sum()), len(calibration.used)
     figure.suptitle(f"Material from {used} of {count} measured links, noise {calibration.noise_db:.1f} dB{note}")
     return figure

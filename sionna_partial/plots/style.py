@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import LinkState
 
 YELLOW, RED, BLUE = "#ddaa33", "#bb5566", "#004488"
@@ -54,20 +55,20 @@ def figure_png(figure: matplotlib.figure.Figure, width_px: float = math.inf) -> 
     return buffer.getvalue()
 
 
-def shade(where: NDArray[np.bool_], grey: int = 0, opacity: float = 1.0) -> NDArray[np.uint8]:
+def shade(where: Bools, grey: int = 0, opacity: float = 1.0) -> NDArray[np.uint8]:
     """Paint some cells grey, black by default, and leave the rest transparent: (ny, nx, 4)."""
     picture = np.full((*where.shape, 4), grey, dtype=np.uint8)
     picture[..., 3] = np.uint8(255 * opacity) * where
     return picture
 
 
-def window_m(points_m: NDArray[np.float64]) -> tuple[float, float, float, float]:
+def window_m(points_m: Floats) -> tuple[float, float, float, float]:
     """Limits x0, x1, y0, y1 of a picture of points (N, 2) with a border [m]."""
     (x0, y0), (x1, y1) = points_m.min(axis=0) - BORDER_M, points_m.max(axis=0) + BORDER_M
     return float(x0), float(x1), float(y0), float(y1)
 
 
-def corners_m(cells: NDArray[np.bool_], origin_m: tuple[float, float], resolution_m: float) -> NDArray[np.float64]:
+def corners_m(cells: Bools, origin_m: tuple[float, float], resolution_m: float) -> Floats:
     """Lower-left and upper-right corners of cells (2N, 2) [m]."""
     corners = np.argwhere(cells)[:, ::-1]
     return np.vstack([corners, corners + 1]) * resolution_m + origin_m

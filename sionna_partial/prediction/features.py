@@ -6,13 +6,14 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import require_bool, require_type
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.link_context import IndirectPaths, LinkContext
-from sionna_partial.prediction.unobserved import Bools, Floats, unobserved_lengths_m
+from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import link_summary

@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.unobserved import (
     GRAZE,
-    Bools,
-    Floats,
     in_cells,
     is_enclosed,
     lengths_in_unknown_m,
@@ -76,7 +75,7 @@ class LinkContext(Shown):
     possible: Bools
     indirect_gain_db: Floats
     strongest_unobserved_m: Floats
-    window_index: NDArray[np.intp]
+    window_index: Indices
     windows: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
@@ -210,7 +209,7 @@ def path_unobserved_m(
     return total_m
 
 
-def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: NDArray[np.intp]) -> Floats:
+def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:
     """Return the same length (P,) [m] of some paths of traced links, by their numbers (P,)."""
     tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
     return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)

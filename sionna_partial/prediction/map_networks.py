@@ -18,13 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
 from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
-from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 
@@ -270,7 +270,7 @@ def evaluate_context_networks(
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
-def _by_window(networks: Networks, context: LinkContext) -> Iterator[tuple[list[Any], NDArray[np.intp]]]:
+def _by_window(networks: Networks, context: LinkContext) -> Iterator[tuple[list[Any], Indices]]:
     """Yield what the map networks read around each transmitter, and its links; without them nothing, and all links."""
     if not reads_maps(networks):
         yield [], np.arange(len(context))
@@ -284,7 +284,7 @@ def _by_window(networks: Networks, context: LinkContext) -> Iterator[tuple[list[
             yield [each[here : here + 1] for each in maps], links[number]
 
 
-def _links_by_window(context: LinkContext) -> tuple[NDArray[np.intp], list[NDArray[np.intp]]]:
+def _links_by_window(context: LinkContext) -> tuple[Indices, list[Indices]]:
     """Return which windows (U,) links have, and the links of each of them."""
     used, counts = np.unique(context.window_index, return_counts=True)
     return used, np.split(np.argsort(context.window_index, kind="stable"), np.cumsum(counts)[:-1])

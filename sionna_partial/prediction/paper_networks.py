@@ -21,11 +21,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
@@ -33,7 +34,6 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
-from sionna_partial.prediction.unobserved import Bools, Floats
 from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings

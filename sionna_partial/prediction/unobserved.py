@@ -1,18 +1,16 @@
 """Fractions of straight lines in each kind of cell: the grid integral behind d_unobs (paper, Section III-C)."""
 
 import itertools
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import CellState
 from sionna_partial.cores import core_count, in_order
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
 from sionna_partial.process import njit
-
-Floats: TypeAlias = NDArray[np.float64]
-Bools: TypeAlias = NDArray[np.bool_]
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 

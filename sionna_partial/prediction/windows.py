@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.planar import grid_edges
-from sionna_partial.prediction.unobserved import GRAZE, Floats, in_cells, line_fractions
+from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
 """Number of cells along each side of a window, and their edge in each of a transmitter's windows, near to far [m]."""
@@ -36,7 +37,7 @@ _LONGEST_DETOUR = 40.0
 """[cells]"""
 
 
-def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, NDArray[np.intp]]:
+def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, Indices]:
     """Return map, x and y (W, 3) of the transmitters of links, and which is each link's (N,).
 
     `map_index` (N,) is the map of each link, `tx_m` (N, 3) its transmitter [m].

@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from sionna_partial.arrays import Floats
 from sionna_partial.planar import cross, span_in_strip
 from sionna_partial.process import njit
 
@@ -26,7 +27,7 @@ class WallIndex(NamedTuple):
     of a cell are `piece` (E,) from `start` (B + 1,) of the cell to that of the next.
     """
 
-    grid: NDArray[np.float64]
+    grid: Floats
     start: NDArray[np.int64]
     piece: NDArray[np.int32]
 
@@ -38,7 +39,7 @@ class Plan(NamedTuple):
     and `line` (K,) the numbers of the infinite lines that they lie on.
     """
 
-    pieces_m: NDArray[np.float64]
+    pieces_m: Floats
     owner: NDArray[np.int32]
     line: NDArray[np.int32]
     cells: WallIndex
@@ -51,19 +52,19 @@ class PointBins(NamedTuple):
     the corner x0 and y0 and the edge of the bins [m], and the number of columns.
     """
 
-    points_m: NDArray[np.float64]
+    points_m: Floats
     order: NDArray[np.int64]
     start: NDArray[np.int64]
-    grid: NDArray[np.float64]
+    grid: Floats
 
 
-def prepare_plan(walls_m: NDArray[np.float64]) -> Plan:
+def prepare_plan(walls_m: Floats) -> Plan:
     """Cut walls (S, 2, 2) [m] where they cross, and find collinear ones."""
     pieces_m, owner = _split_at_crossings(walls_m)
     return Plan(pieces_m, owner, _line_ids(pieces_m), _index(pieces_m))
 
 
-def bin_points(points_m: NDArray[np.float64]) -> PointBins:
+def bin_points(points_m: Floats) -> PointBins:
     """Sort points (N, 2) [m] into bins of a few points each."""
     if len(points_m) == 0:
         return PointBins(points_m, np.zeros(0, np.int64), np.zeros(2, np.int64), np.array([0.0, 0.0, 1.0, 1.0]))
@@ -88,7 +89,7 @@ def grow(array, size):  # type: ignore[no-untyped-def]
     return larger
 
 
-def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
     """Cut segments where others cross them: the pieces (K, 2, 2), which meet only at ends, and their owners (K,)."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     lines = shapely.linestrings(walls)
@@ -107,7 +108,7 @@ def _split_at_crossings(walls: NDArray[np.float64]) -> tuple[NDArray[np.float64]
     return np.stack([ends[piece], ends[piece + 1]], axis=1), owner[piece].astype(np.int32)
 
 
-def _line_ids(walls: NDArray[np.float64]) -> NDArray[np.int32]:
+def _line_ids(walls: Floats) -> NDArray[np.int32]:
     """Give numbers to the infinite lines that the segments lie on; collinear segments share one."""
     if len(walls) == 0:
         return np.zeros(0, np.int32)
@@ -127,7 +128,7 @@ def _line_ids(walls: NDArray[np.float64]) -> NDArray[np.int32]:
     return np.asarray(connected_components(pairs, directed=False)[1], dtype=np.int32)
 
 
-def _index(walls: NDArray[np.float64]) -> WallIndex:
+def _index(walls: Floats) -> WallIndex:
     """Sort wall pieces into cells."""
     if len(walls) == 0:
         return WallIndex(np.array([0.0, 0.0, 1.0, 1.0, 1.0]), np.zeros(2, np.int64), np.zeros(0, np.int32))

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 
 RAGGED_FACTOR = 2.0
@@ -18,7 +19,7 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 """Corners (slope, offset) of the polygon of lines that are not steep and pass near the origin."""
 
 
-def fit_runs(points: NDArray[np.float64], tolerance: float) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
     A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, measured along x or
@@ -62,7 +63,7 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
     """Lengthen the run that begins at `start` while a line fits, and note where that makes a split cheaper."""
     near, near_size = _all_lines()
     far, far_size = _all_lines()
-    sums = np.zeros(6)
+    moments = np.zeros(6)
     sign, turn, reversals = 0.0, 0.0, 0
     for k in range(start, len(points) - 1):
         ahead, aside = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
@@ -76,10 +77,10 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
         far_size = _clip_element(far, far_size, element, RAGGED_FACTOR * tolerance)
         if far_size == 0:
             return
-        _accumulate(sums, element)
+        _accumulate(moments, element)
         length = abs(points[k + 1, 0] - points[start, 0])
         if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
-            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(sums) / max(tolerance, 0.25) ** 2
+            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(moments) / max(tolerance, 0.25) ** 2
             if total < cost[k + 1] - 1e-12:
                 cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
 
@@ -88,18 +89,18 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
 def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
     """Point on and direction of the line that fits a run; a ragged one is parallel to an axis if that is as good."""
     for factor in (1.0, RAGGED_FACTOR):
-        limit, sums = factor * tolerance, np.zeros(6)
+        limit, moments = factor * tolerance, np.zeros(6)
         polygon, size = _all_lines()
         for k in range(start, end):
             element = _middles(points, start, k)
             size = _clip_element(polygon, size, element, limit)
-            _accumulate(sums, element)
+            _accumulate(moments, element)
         ragged = factor > 1.0
         if size > 0:
             break
-    mean_x, mean_y = sums[1] / sums[0], sums[2] / sums[0]
-    spread = sums[3] - sums[1] * mean_x
-    slope = (sums[4] - sums[1] * mean_y) / spread if spread > 1e-9 else 0.0
+    mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
+    spread = moments[3] - moments[1] * mean_x
+    slope = (moments[4] - moments[1] * mean_y) / spread if spread > 1e-9 else 0.0
     if ragged and abs(slope * (points[end, 0] - points[start, 0])) <= _LEVEL_CELLS:
         slope = 0.0
     offset = mean_y - slope * mean_x
@@ -141,27 +142,27 @@ def _middles(points, origin, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _accumulate(sums, element):  # type: ignore[no-untyped-def]
-    """Add the middles of an element's unit edges to the sums of 1, x, y, xx, xy, yy."""
+def _accumulate(moments, element):  # type: ignore[no-untyped-def]
+    """Add the middles of an element's unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
     x0, y0, x1, y1, steps = element
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     spread = (steps + 1.0) / (12.0 * (steps - 1.0)) if steps > 1 else 0.0
     dx, dy = x1 - x0, y1 - y0
-    sums[0] += steps
-    sums[1] += steps * x
-    sums[2] += steps * y
-    sums[3] += steps * (x * x + spread * dx * dx)
-    sums[4] += steps * (x * y + spread * dx * dy)
-    sums[5] += steps * (y * y + spread * dy * dy)
+    moments[0] += steps
+    moments[1] += steps * x
+    moments[2] += steps * y
+    moments[3] += steps * (x * x + spread * dx * dx)
+    moments[4] += steps * (x * y + spread * dx * dy)
+    moments[5] += steps * (y * y + spread * dy * dy)
 
 
 @njit(cache=True)
-def _residual_variance(sums):  # type: ignore[no-untyped-def]
+def _residual_variance(moments):  # type: ignore[no-untyped-def]
     """Mean squared distance from the best line: the smaller eigenvalue of the covariance."""
-    mean_x, mean_y = sums[1] / sums[0], sums[2] / sums[0]
-    xx = sums[3] / sums[0] - mean_x * mean_x
-    xy = sums[4] / sums[0] - mean_x * mean_y
-    yy = sums[5] / sums[0] - mean_y * mean_y
+    mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
+    xx = moments[3] / moments[0] - mean_x * mean_x
+    xy = moments[4] / moments[0] - mean_x * mean_y
+    yy = moments[5] / moments[0] - mean_y * mean_y
     return max(0.0, 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)))
 
 

@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.planar import cross
@@ -23,7 +24,7 @@ _REACH_CELLS = 1.0
 _OFFSET_CELLS = 1.0
 _MIN_SHIFT_CELLS = 0.25
 
-Points = NDArray[np.float64]
+Points = Floats
 """Points (n, 2) [cells]."""
 
 
@@ -40,7 +41,7 @@ class Outlines:
         begins.
     """
 
-    vertices_m: NDArray[np.float64]
+    vertices_m: Floats
     segments: NDArray[np.int64]
 
 
@@ -52,7 +53,7 @@ class _Graph:
     edges: NDArray[np.int64]
 
     @cached_property
-    def degree(self) -> NDArray[np.intp]:
+    def degree(self) -> Indices:
         """Number of edges (V,) at every point."""
         return np.bincount(self.edges.ravel(), minlength=len(self.points))
 
@@ -66,17 +67,17 @@ class _FittedChain:
     """
 
     points: NDArray[np.int64]
-    corners: NDArray[np.intp]
-    first: NDArray[np.intp]
-    lines: NDArray[np.float64]
-    plain: NDArray[np.bool_]
+    corners: Indices
+    first: Indices
+    lines: Floats
+    plain: Bools
 
     @property
     def closed(self) -> bool:
         return bool(self.points[0] == self.points[-1])
 
     @cached_property
-    def beside(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def beside(self) -> tuple[Indices, Indices]:
         """Runs before and after each of the points."""
         k = np.arange(len(self.points))
         before, after = np.searchsorted(self.first, k) - 1, np.searchsorted(self.first, k, side="right") - 1
@@ -153,7 +154,7 @@ def _canonical(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], bool, tuple
     return turned(*best), best[0], (best[2], best[1])
 
 
-def _wall_graph(wall: NDArray[np.bool_], *, cut_spurs: bool) -> _Graph:
+def _wall_graph(wall: Bools, *, cut_spurs: bool) -> _Graph:
     """Connect the centres of boundary wall cells (ny, nx).
 
     Edges join wall cells that touch by a side, unless both blocks of two by two cells beside the edge are full, and
@@ -253,13 +254,13 @@ def _onward(graph: _Graph, beside: list[list[int]]) -> dict[tuple[int, int], int
     return onward
 
 
-def _turns(points: NDArray[np.generic]) -> NDArray[np.bool_]:
+def _turns(points: NDArray[np.generic]) -> Bools:
     """Whether a polyline (n, 2) turns at each of its inner points (n - 2,)."""
     step = np.diff(points.astype(np.float64), axis=0)
     return cross(step[1:], step[:-1]) != 0.0
 
 
-def _layer_shift(points: NDArray[np.int64], peeled: NDArray[np.bool_]) -> Points:
+def _layer_shift(points: NDArray[np.int64], peeled: Bools) -> Points:
     """Vectors from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
     peeled = np.pad(peeled, 2)
     column, row = points.T // 2 + 2
@@ -282,7 +283,7 @@ def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: f
     return _FittedChain(chain, corners, first, lines, np.full(len(lines), is_square))
 
 
-def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points], list[NDArray[np.intp]]]:
+def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points], list[Indices]]:
     """Vertices of every chain, and the run that each of its segments belongs to."""
     nodes = _placed_nodes(graph, chains)
     lines, runs = [], []
@@ -313,7 +314,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
 
 def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points]:
     """Positions of chain ends and junctions: where the lines that meet there come closest."""
-    lines: dict[int, list[NDArray[np.float64]]] = {}
+    lines: dict[int, list[Floats]] = {}
     pinned: set[int] = set()
     for chain in chains:
         before, after = chain.beside
@@ -329,7 +330,7 @@ def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points
     return nodes
 
 
-def _closest(lines: NDArray[np.float64], near: Points) -> Points:
+def _closest(lines: Floats, near: Points) -> Points:
     """Point of least squared distance to lines (k, 4), or the middle of the feet of `near` if that is far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
     offset = (normal * (lines[:, :2] - near)).sum(axis=1)
@@ -337,7 +338,7 @@ def _closest(lines: NDArray[np.float64], near: Points) -> Points:
     return near + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
 
 
-def _meeting(pair: NDArray[np.float64], near: Points) -> Points:
+def _meeting(pair: Floats, near: Points) -> Points:
     """Vertices (1 or 2, 2) where two runs with lines (2, 4) meet near a point."""
     direction = pair[:, 2:]
     feet = pair[:, :2] + ((near - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
@@ -351,7 +352,7 @@ def _meeting(pair: NDArray[np.float64], near: Points) -> Points:
     return feet.mean(axis=0)[None]
 
 
-def _make_crossing_plain(lines: list[Points], runs: list[NDArray[np.intp]], chains: list[_FittedChain]) -> bool:
+def _make_crossing_plain(lines: list[Points], runs: list[Indices], chains: list[_FittedChain]) -> bool:
     """Make runs plain whose segments meet others away from a shared vertex; return whether there were any."""
     if not lines:
         return False

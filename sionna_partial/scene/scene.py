@@ -14,6 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
@@ -56,10 +57,10 @@ class SceneGeometry:
         World x and y of the local frame's origin [m].
     """
 
-    vertices_m: NDArray[np.float64]
+    vertices_m: Floats
     segments: NDArray[np.int64]
-    open_end: NDArray[np.bool_]
-    floor_m: NDArray[np.float64]
+    open_end: Bools
+    floor_m: Floats
     cell_m: float
     height_m: float
     ceiling: bool
@@ -67,7 +68,7 @@ class SceneGeometry:
     origin_m: tuple[float, float]
 
     @property
-    def walls_m(self) -> NDArray[np.float64]:
+    def walls_m(self) -> Floats:
         """End points (S, 2, 2) of the walls [m]."""
         return self.vertices_m[self.segments]
 
@@ -87,7 +88,7 @@ class SceneGeometry:
         return self.floor_face + len(self.floor_mesh[1]) if len(self.floor_m) and self.ceiling else -1
 
     @cached_property
-    def floor_mesh(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def floor_mesh(self) -> tuple[Floats, NDArray[np.int64]]:
         """Corners (K, 2) [m] and counterclockwise triangles (T, 3) of the floor."""
         return _triangles(self.floor_m, self.cell_m)
 
@@ -275,7 +276,7 @@ def _write_xml(scene: ET.Element, folder: Path) -> Path:
     return path
 
 
-def _write_ply(path: Path, vertices_m: NDArray[np.float64], triangles: NDArray[np.integer]) -> None:
+def _write_ply(path: Path, vertices_m: Floats, triangles: NDArray[np.integer]) -> None:
     """Write a mesh with all digits of its vertices (trimesh would round them to float32)."""
     faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, triangles
@@ -309,7 +310,7 @@ def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz
     ET.SubElement(bsdf, "float", name="thickness", value=repr(float(material.thickness_m)))
 
 
-def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDArray[np.int64]]]:
+def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64]]]:
     """Vertices (V, 3) [m] and triangles (F, 3) of each mesh, in the local frame."""
     low = np.column_stack([geometry.vertices_m, np.zeros(len(geometry.vertices_m))])
     up = np.array([0.0, 0.0, geometry.height_m])
@@ -321,7 +322,7 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[NDArray[np.float64], NDA
     return meshes | ({"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {})
 
 
-def _open_ends(partial: PartialMap, outlines: Outlines) -> NDArray[np.bool_]:
+def _open_ends(partial: PartialMap, outlines: Outlines) -> Bools:
     """Find the vertices (V,) where one wall ends and the cell beyond its end is not free."""
     ends, tails = outlines.segments.ravel(), outlines.segments[:, ::-1].ravel()
     along = outlines.vertices_m[ends] - outlines.vertices_m[tails]
@@ -332,7 +333,7 @@ def _open_ends(partial: PartialMap, outlines: Outlines) -> NDArray[np.bool_]:
     return is_open & (np.bincount(ends, minlength=len(is_open)) == 1)
 
 
-def _triangles(rectangles_m: NDArray[np.float64], cell_m: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _triangles(rectangles_m: Floats, cell_m: float) -> tuple[Floats, NDArray[np.int64]]:
     """Corners (V, 2) and counterclockwise triangles (F, 3) of an area.
 
     Triangles share whole edges: an edge inside the area must not look like the rim of a screen, which diffracts.
@@ -357,7 +358,7 @@ def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
             strips = shapely.intersection(area, shapely.box([x0, *cuts], y0, [*cuts, x1], y1))
 
 
-def _floor_cells(partial: PartialMap, extent: str) -> NDArray[np.bool_]:
+def _floor_cells(partial: PartialMap, extent: str) -> Bools:
     """Cells (ny, nx) that floor and ceiling cover."""
     if extent == "none":
         return np.zeros(partial.shape, dtype=bool)
@@ -368,7 +369,7 @@ def _floor_cells(partial: PartialMap, extent: str) -> NDArray[np.bool_]:
     return free | (beside & (partial.state == CellState.WALL))
 
 
-def _rectangles(mask: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _rectangles(mask: Bools) -> NDArray[np.int64]:
     """Cover the cells of a mask exactly by few rectangles x0, y0, x1, y1 in cells: equal runs of rows merge."""
     row, start, end = row_runs(mask)
     order = np.lexsort((row, end, start))

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap, row_runs
 
@@ -38,8 +38,8 @@ class CleanWalls(NamedTuple):
     `noise` is 0 where walls are exact, to 1 where range noise thickened and roughened them.
     """
 
-    cells: NDArray[np.bool_]
-    peeled: NDArray[np.bool_]
+    cells: Bools
+    peeled: Bools
     noise: float
 
 
@@ -67,7 +67,7 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
     return CleanWalls(thinned, peeled, noise)
 
 
-def _level(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> float:
+def _level(wall: Bools, free: Bools) -> float:
     """Level faces in place, and return the noise of `CleanWalls`.
 
     Rays that end at a wall without noise mark one layer of cells with smooth faces; with noise they mark several, with
@@ -85,7 +85,7 @@ def _level(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> float:
     return min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
 
 
-def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longest: int) -> NDArray[np.bool_]:
+def _close_unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     """Fill, in place, gaps of UNKNOWN cells between two pieces of wall, and return the cells filled.
 
     A gap is a row of UNKNOWN cells beside FREE ones, at most `longest`, that ends at two pieces. The shortest line
@@ -112,20 +112,20 @@ def _close_unknown_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], longes
     return filled
 
 
-def _orientations(*masks: NDArray[np.bool_]) -> Iterator[tuple[NDArray[np.bool_], ...]]:
+def _orientations(*masks: Bools) -> Iterator[tuple[Bools, ...]]:
     """Yield views of masks with each of their four sides at row 0."""
     for turned in (lambda m: m, lambda m: m[::-1], lambda m: m.T, lambda m: m.T[::-1]):
         yield tuple(turned(mask) for mask in masks)
 
 
-def _fill_pinholes(wall: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _fill_pinholes(wall: Bools) -> Bools:
     label, count = ndimage.label(np.pad(~wall, 1, constant_values=True))
     size = np.bincount(label.ravel(), minlength=count + 1)
     size[[0, label[0, 0]]] = PINHOLE_CELLS + 1
     return wall | (size <= PINHOLE_CELLS)[label[1:-1, 1:-1]]
 
 
-def _fill_notches(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+def _fill_notches(wall: Bools, free: Bools) -> None:
     """Fill, in place, notches of one or two FREE cells in faces that look towards larger rows."""
     before = wall.copy()
     row, start, end = row_runs(free)
@@ -135,7 +135,7 @@ def _fill_notches(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
             wall[i, a:b], free[i, a:b] = True, False
 
 
-def _shave_bumps(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
+def _shave_bumps(wall: Bools, free: Bools) -> None:
     """Move, in place, bumps of one or two cells back into faces that look towards larger rows."""
     before, was_free = wall.copy(), free.copy()
     row, start, end = row_runs(wall)
@@ -146,7 +146,7 @@ def _shave_bumps(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
             wall[i, a:b], free[i, a:b], wall[i - 1, a:b] = False, True, True
 
 
-def _close_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], resolution_m: float, bridge_gap_m: float) -> None:
+def _close_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: float) -> None:
     """Close, in place, short horizontal gaps between walls that are longer than they are thick."""
     row, start, end = row_runs(wall)
     gap = np.where(row[1:] == row[:-1], start[1:] - end[:-1], 0)
@@ -166,7 +166,7 @@ def _close_gaps(wall: NDArray[np.bool_], free: NDArray[np.bool_], resolution_m: 
             wall[row[k], end[k] : start[k + 1]] = True
 
 
-def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Thin walls of two cells to one, keeping the cells that face FREE ones where only one side does."""
     label, _ = ndimage.label(wall, structure=_SQUARE)
     small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
@@ -185,7 +185,7 @@ def _thin(wall: NDArray[np.bool_], free: NDArray[np.bool_]) -> tuple[NDArray[np.
     return thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing
 
 
-def _peel(wall: NDArray[np.bool_], candidates: NDArray[np.bool_]) -> None:
+def _peel(wall: Bools, candidates: Bools) -> None:
     """Remove, in place, the candidates whose removal neither parts the wall nor opens it nor shortens it."""
     rows, columns = np.nonzero(candidates)
     for parity in range(4):

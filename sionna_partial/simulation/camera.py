@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.process import njit
@@ -44,7 +45,7 @@ class Camera:
         self._log_odds = np.zeros(truth.shape)
         self.seen = np.full_like(self._truth, _UNKNOWN)
 
-    def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: NDArray[np.intp]) -> None:
+    def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: Indices) -> None:
         """Add one picture to the map, taken at x, y but believed to be taken `shift` from there.
 
         The cells `under` the robot (N, 2), rows and columns where it believes to be, are free.
@@ -71,11 +72,11 @@ class Camera:
 
 def unknown_in_view(
     state: NDArray[np.uint8],
-    cell: NDArray[np.intp],
-    headings_deg: NDArray[np.float64],
+    cell: Indices,
+    headings_deg: Floats,
     cell_m: float,
     sensor: SensorSettings,
-) -> list[NDArray[np.intp]]:
+) -> list[Indices]:
     """Unknown cells (N, 2) that a picture taken in a cell would show if none of them were walls, for each heading."""
     reach = sensor.range_m / cell_m
     low = np.maximum(cell - math.ceil(reach) - 2, 0)
@@ -92,7 +93,7 @@ def unknown_in_view(
     return shown
 
 
-def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSettings) -> NDArray[np.float64]:
+def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Floats:
     """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
     reach = sensor.range_m / home.resolution_m
@@ -103,7 +104,7 @@ def view_corners_m(home: PartialMap, pose: NDArray[np.float64], sensor: SensorSe
     return np.concatenate([pose[None, :2], ends])
 
 
-def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> NDArray[np.float64]:
+def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> Floats:
     """Directions of the rays [radian], at most half a cell apart where they end."""
     rays = int(2 * math.radians(view_deg) * reach) + 2
     return math.radians(heading_deg) + math.radians(view_deg) * (np.arange(rays) / (rays - 1) - 0.5)
@@ -114,8 +115,8 @@ class _Rays(NamedTuple):
 
     start: tuple[float, float]
     shift: tuple[float, float]
-    angles: NDArray[np.float64]
-    noise: NDArray[np.float64]
+    angles: Floats
+    noise: Floats
     reach: float
 
 

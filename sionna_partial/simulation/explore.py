@@ -9,6 +9,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, are_stages, is_whole, require, require_choice, settings_or_default
 from sionna_partial.constants import CellState
 from sionna_partial.display import Pictured, later
@@ -66,8 +67,8 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     sensor: SensorSettings
     steps: tuple[int, ...]
     states: NDArray[np.uint8]
-    poses: NDArray[np.float64]
-    believed_poses: NDArray[np.float64]
+    poses: Floats
+    believed_poses: Floats
 
     @property
     def maps(self) -> list[PartialMap]:
@@ -79,7 +80,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
         return [cut_to_known(replace(self.home, state=state, interior_cells=free)) for state in self.states]
 
     @property
-    def observed_fractions(self) -> NDArray[np.float64]:
+    def observed_fractions(self) -> Floats:
         """The `observed_fraction` of each of `maps`, (M,) in [0, 1]."""
         seen = (self.states == _FREE).sum(axis=(1, 2))
         return np.minimum(1.0, seen / (self.home.state == _FREE).sum())
@@ -223,7 +224,7 @@ def explore_trajectory(
     best, last_progress = 0.0, 0
     reached: list[int] = []
     states: list[NDArray[np.uint8]] = []
-    poses: list[NDArray[np.float64]] = []
+    poses: list[Floats] = []
     with reporting(progress) as report:
         for step in itertools.count():
             if step:

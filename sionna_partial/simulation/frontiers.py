@@ -1,4 +1,4 @@
-"""Frontiers between seen and unseen cells, the way to them, and what would be seen from there."""
+"""Frontiers between seen and unseen cells, and the routes to them."""
 
 import math
 from collections.abc import Sequence
@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.planar import grid_edges
@@ -26,10 +27,10 @@ _TIGHT_COST = 15.0
 
 
 class Frontier(NamedTuple):
-    """Free cells (n, 2) beside unseen ones, and the way (m, 2) to the one in their middle, rows and columns."""
+    """Free cells (n, 2) beside unseen ones, and the route (m, 2) to the one in their middle, rows and columns."""
 
-    cells: NDArray[np.intp]
-    route: NDArray[np.intp]
+    cells: Indices
+    route: Indices
     cost_m: float
     """Length of the route [m], where cells beside walls are longer."""
 
@@ -39,8 +40,8 @@ def find_frontiers(
     start: tuple[int, int],
     cell_m: float,
     radius: float,
-    tight: NDArray[np.bool_],
-    left_out: NDArray[np.bool_],
+    tight: Bools,
+    left_out: Bools,
 ) -> list[Frontier]:
     """Find the frontiers of a map (ny, nx) that a robot of some radius [cells] can reach.
 
@@ -77,9 +78,7 @@ def part_of(low: Sequence[int], high: Sequence[int]) -> tuple[slice, slice]:
     return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
-def _travel_cost(
-    state: NDArray[np.uint8], cell_m: float, radius: float, tight: NDArray[np.bool_]
-) -> NDArray[np.float64]:
+def _travel_cost(state: NDArray[np.uint8], cell_m: float, radius: float, tight: Bools) -> Floats:
     """Cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
     distance = ndimage.distance_transform_edt(state != _WALL) - 0.5
     nearness = np.clip(1.0 - distance * cell_m / _COMFORT_M, 0.0, 1.0)
@@ -92,7 +91,7 @@ def _travel_cost(
 class _Router:
     """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross."""
 
-    def __init__(self, cost: NDArray[np.float64], start: tuple[int, ...]) -> None:
+    def __init__(self, cost: Floats, start: tuple[int, ...]) -> None:
         self._cells = np.argwhere(cost > 0)
         self._index = np.full(cost.shape, -1)
         self._index[tuple(self._cells.T)] = np.arange(len(self._cells))
@@ -103,7 +102,7 @@ class _Router:
         self.costs = np.full(cost.shape, np.inf)
         self.costs[tuple(self._cells.T)] = cheapest
 
-    def path_to(self, cell: NDArray[np.intp]) -> NDArray[np.intp]:
+    def path_to(self, cell: Indices) -> Indices:
         """Cells (n, 2) from the start to `cell`."""
         path = [self._index[tuple(cell)]]
         while self._before[path[-1]] >= 0:

@@ -21,6 +21,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
@@ -183,7 +184,7 @@ class _Plan:
     doors: shapely.Geometry
     swelling_m: float
     raggedness: float
-    waves: NDArray[np.float64]
+    waves: Floats
 
 
 def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
@@ -226,8 +227,8 @@ def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
 
 def _closed(rng: Rng, openings: list[LineString]) -> list[LineString]:
     """Doors that are closed."""
-    share = rng.choice([0.0, rng.random(), 1.0], p=CLOSED_DOORS)
-    return [opening for opening in openings if opening.length <= DOOR_M[1] and rng.random() < share]
+    fraction = rng.choice([0.0, rng.random(), 1.0], p=CLOSED_DOORS)
+    return [opening for opening in openings if opening.length <= DOOR_M[1] and rng.random() < fraction]
 
 
 def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.GeometryCollection:
@@ -396,7 +397,7 @@ def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> 
     return np.where(inside, CellState.FREE, np.where(beside, CellState.WALL, CellState.UNKNOWN)).astype(np.uint8)
 
 
-def _swollen(inside: NDArray[np.bool_], resolution_m: float, plan: _Plan) -> NDArray[np.bool_]:
+def _swollen(inside: Bools, resolution_m: float, plan: _Plan) -> Bools:
     """Cells that walls and furniture take by swelling: as far everywhere, or farther here than there."""
     y, x = np.indices(inside.shape) * resolution_m
     wave = np.zeros(inside.shape)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.planar import largest_part
@@ -79,7 +80,7 @@ class Robot:
         self._goal_steps = max(1, int(GOAL_RANGES * sensor.range_m / FORWARD_M))
         self._given_up = np.zeros(truth.shape, dtype=bool)
         self._bumps = np.zeros(truth.shape, dtype=bool)
-        self._route: NDArray[np.intp] | None = None  # cells (n, 2), the last of them the goal
+        self._route: Indices | None = None  # cells (n, 2), the last of them the goal
         self._route_steps = 0
         self.is_finished = False
         row, column = self._rng.choice(np.argwhere(self._roomy))
@@ -137,7 +138,7 @@ class Robot:
         (x, y), (ny, nx) = self.believed_position, self.seen.shape
         return min(max(int(y), 0), ny - 1), min(max(int(x), 0), nx - 1)
 
-    def _turn_to(self, cell: NDArray[np.intp]) -> float:
+    def _turn_to(self, cell: Indices) -> float:
         """Turn that would make the robot face a cell [degree], from -180 to 180."""
         x, y = self.believed_position
         bearing_deg = math.degrees(math.atan2(int(cell[0]) + 0.5 - y, int(cell[1]) + 0.5 - x))
@@ -157,12 +158,12 @@ class Robot:
         odds = np.array(promises) ** GOAL_SHARPNESS
         return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
 
-    def _distances_to(self, cells: NDArray[np.intp]) -> NDArray[np.float64]:
+    def _distances_to(self, cells: Indices) -> Floats:
         x, y = self.believed_position
-        distances: NDArray[np.float64] = np.hypot(cells[..., 0] + 0.5 - y, cells[..., 1] + 0.5 - x)
+        distances: Floats = np.hypot(cells[..., 0] + 0.5 - y, cells[..., 1] + 0.5 - x)
         return distances
 
-    def _is_done(self, goal: NDArray[np.intp]) -> bool:
+    def _is_done(self, goal: Indices) -> bool:
         around = part_of((goal[0] - 1, goal[1] - 1), (goal[0] + 2, goal[1] + 2))
         middle = min(int(goal[0]), 1), min(int(goal[1]), 1)
         arrived = self._distances_to(goal) * self._cell_m < _ARRIVAL_M
@@ -191,7 +192,7 @@ class Robot:
         beside = self._roomy[row, cell[1]] or self._roomy[cell[0], column]
         return bool(self._roomy[row, column] and beside)
 
-    def _bump(self, goal: NDArray[np.intp]) -> None:
+    def _bump(self, goal: Indices) -> None:
         """Avoid what stopped the robot; take no frontier any more at a goal that is too near to be approached."""
         reach = _BUMP_M / self._cell_m
         angle, (x, y) = math.radians(self.heading_deg), self.believed_position
@@ -203,7 +204,7 @@ class Robot:
             self._given_up[rows, columns] |= np.hypot(rows - goal[0], columns - goal[1]) <= reach
         self._route = None
 
-    def _cells_around(self, row: float, column: float, reach: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _cells_around(self, row: float, column: float, reach: float) -> tuple[Indices, Indices]:
         """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
         ny, nx = self.seen.shape
         rows = np.arange(max(0, int(row - reach)), max(0, min(ny, int(row + reach) + 2)))
@@ -211,7 +212,7 @@ class Robot:
         return rows[:, None], columns[None]
 
 
-def _fitting_radius(free: NDArray[np.bool_], resolution_m: float) -> tuple[float, NDArray[np.bool_]]:
+def _fitting_radius(free: Bools, resolution_m: float) -> tuple[float, Bools]:
     """Largest radius [cells] of a robot that gets around, and the cells where its centre can be."""
     distance = ndimage.distance_transform_edt(free) - 0.5
     part = largest_part(free)

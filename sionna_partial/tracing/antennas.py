@@ -7,10 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import real_array, require, require_choice, require_whole
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import SettingsError
 from sionna_partial.tracing.engine import load_sionna, to_device
+from sionna_partial.tracing.paths import zenith_azimuth
 
 PATTERNS, POLARISATIONS = ("iso", "dipole", "hw_dipole", "tr38901"), ("V", "H", "VH", "cross")
 """Antenna patterns and polarisations that Sionna RT has."""
@@ -33,9 +35,9 @@ class Antennas:
     Rotations from the array to the world are (1, 3, 3), or one for each of E ends.
     """
 
-    positions_m: NDArray[np.float64]
+    positions_m: Floats
     patterns: list[Any]
-    rotation: NDArray[np.float64]
+    rotation: Floats
 
     @classmethod
     def of(
@@ -63,32 +65,31 @@ class Antennas:
         """Return the number of antennas, K A."""
         return len(self.patterns) * len(self.positions_m)
 
-    def rotations(self, end: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    def rotations(self, end: NDArray[np.integer[Any]]) -> Floats:
         """Rotation (P, 3, 3) at the end of each path (P,), or (1, 3, 3) if all are the same."""
         return self.rotation if len(self.rotation) == 1 else self.rotation[end]
 
-    def advance_m(self, angles_rad: NDArray[np.float64], end: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    def advance_m(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> Floats:
         """How much shorter plane waves from zenith and azimuth (P, 2) are at each antenna position: (P, A) [m]."""
         return self._local(directions(angles_rad)[0], end) @ self.positions_m.T
 
-    def fields(self, angles_rad: NDArray[np.float64], end: NDArray[np.integer[Any]]) -> NDArray[np.complex128]:
+    def fields(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> NDArray[np.complex128]:
         """Patterns (P, K, 2) along the world's theta and phi, in directions of zenith and azimuth (P, 2)."""
         toward, theta, phi = directions(angles_rad)
-        x, y, z = self._local(toward, end).T
-        local_rad = np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)
+        local_rad = zenith_azimuth(self._local(toward, end))
         local_theta = np.einsum("pij,pj->pi", self.rotations(end), directions(local_rad)[1])
         cosine, sine = np.sum(theta * local_theta, axis=1), np.sum(phi * local_theta, axis=1)
         found = [_evaluated(pattern, local_rad) for pattern in self.patterns]
         return np.stack([np.stack([cosine * t - sine * p, sine * t + cosine * p], axis=1) for t, p in found], axis=1)
 
-    def _local(self, vectors: NDArray[np.float64], end: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    def _local(self, vectors: Floats, end: NDArray[np.integer[Any]]) -> Floats:
         """Vectors (P, 3) of the world in the coordinates of the array."""
         if len(self.rotation) == 1:
             return vectors @ self.rotation[0]
         return np.einsum("pji,pj->pi", self.rotation[end], vectors)
 
 
-def _evaluated(pattern: Any, local_rad: NDArray[np.float64]) -> list[NDArray[np.complex128]]:
+def _evaluated(pattern: Any, local_rad: Floats) -> list[NDArray[np.complex128]]:
     """Zenith and azimuth component (P,) of a pattern, which Sionna RT evaluates."""
     import mitsuba as mi
 
@@ -99,8 +100,8 @@ def _evaluated(pattern: Any, local_rad: NDArray[np.float64]) -> list[NDArray[np.
 
 
 def directions(
-    angles_rad: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    angles_rad: Floats,
+) -> tuple[Floats, Floats, Floats]:
     """Return the unit vectors r, theta and phi (P, 3) of zenith and azimuth angles (P, 2)."""
     (sin_t, sin_p), (cos_t, cos_p) = np.sin(angles_rad).T, np.cos(angles_rad).T
     return (

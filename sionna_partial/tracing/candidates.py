@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats, Indices
+
 EDGE = -2
 """Stands for the face of an interaction in a candidate where that is a diffraction."""
 
@@ -22,10 +24,10 @@ class Wedges:
     which point into the sector.
     """
 
-    edge_m: NDArray[np.float64]
+    edge_m: Floats
     height_m: float
     face: NDArray[np.int32]
-    normal: NDArray[np.float64]
+    normal: Floats
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Candidates:
 
     rx: NDArray[np.int32]
     face: NDArray[np.int32]
-    vertices_m: NDArray[np.float64]
+    vertices_m: Floats
     wedge: NDArray[np.int32] | None = None
     wedges: Wedges | None = None
 
@@ -57,7 +59,7 @@ class Candidates:
         )
         return cls(rx, face, vertices_m, wedge, parts[0].wedges)
 
-    def rows(self, index: NDArray[np.intp]) -> "Candidates":
+    def rows(self, index: Indices) -> "Candidates":
         """Pick some of the candidates."""
         wedge = None if self.wedges is None or self.wedge is None else self.wedge[index]
         return replace(self, rx=self.rx[index], face=self.face[index], vertices_m=self.vertices_m[index], wedge=wedge)

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.process import signals_held
@@ -94,7 +95,7 @@ def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> 
 class _IncoherentScene:
     """A Mitsuba scene that traces every ray for itself.
 
-    `ImageMethod` tells Embree that its rays are coherent. Neighbours in a packet then decide whether a wall is hit: one
+    `ImageMethod` declares its rays coherent. For Embree, neighbours in a packet then decide whether a wall is hit: one
     path in 600 was lost, and which ones depended on the other receivers.
     """
 
@@ -212,8 +213,8 @@ class Variables:
 class HeldPaths:
     """Paths that stay where they are: functions that give their power (C,).
 
-    `evaluate` runs one of the chains. `repeat` has no derivatives, and replays the kernels that Dr.Jit has recorded:
-    the tracing in Python takes most of the time.
+    `evaluate` runs the field calculator of a verification. `repeat` has no derivatives, and replays the kernels that
+    Dr.Jit has recorded: the tracing in Python takes most of the time.
     """
 
     evaluate: Callable[[_Verification], Any]
@@ -245,7 +246,7 @@ class SceneSolver:
         self._symbolic, self._evaluated = _Verification("symbolic"), _Verification("evaluated")
 
     @property
-    def materials(self) -> dict[str, NDArray[np.float64]]:
+    def materials(self) -> dict[str, Floats]:
         """Relative permittivity, conductivity [S/m] and thickness [m] (3,) of each material, by name."""
         constants = ("relative_permittivity", "conductivity", "thickness")
         return {
@@ -258,9 +259,7 @@ class SceneSolver:
         """The Mitsuba scene."""
         return self._scene.mi_scene
 
-    def verify(
-        self, candidates: Candidates, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-    ) -> tuple[SolvedPaths, NDArray[np.intp]]:
+    def verify(self, candidates: Candidates, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
         """Verify candidates and compute their coefficients: the paths, and the candidate (P,) that each was.
 
         The transmitter (3,) and the receivers (N, 3) are in scene coordinates [m].
@@ -276,8 +275,8 @@ class SceneSolver:
         self,
         candidates: Candidates,
         tx_index: NDArray[np.int32],
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
         variables: Variables,
         *,
         differentiable: bool,
@@ -301,8 +300,8 @@ class SceneSolver:
         self,
         candidates: Candidates,
         tx_index: NDArray[np.int32],
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
     ) -> HeldPaths:
         """Verify candidates once, for `power`."""
         import drjit as dr
@@ -410,7 +409,7 @@ class SceneSolver:
         x, y = wedges.edge_m[index % len(wedges.edge_m)].T
         face, normal, flat = wedges.face[index], wedges.normal[index], np.zeros(len(index))
 
-        def vectors(kind: Any, *columns: NDArray[np.float64]) -> Any:
+        def vectors(kind: Any, *columns: Floats) -> Any:
             return kind(*(to_device(mi.Float, column.astype(np.float32)) for column in columns))
 
         return WedgeGeometry(
@@ -436,7 +435,7 @@ def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
         yield dr.grad(results)
 
 
-def _points(positions_m: NDArray[np.float64]) -> Any:
+def _points(positions_m: Floats) -> Any:
     """Hand positions (N, 3) over to Dr.Jit."""
     import drjit as dr
     import mitsuba as mi
@@ -446,9 +445,7 @@ def _points(positions_m: NDArray[np.float64]) -> Any:
     return points
 
 
-def _read_buffer(
-    buffer: Any, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> tuple[SolvedPaths, NDArray[np.intp]]:
+def _read_buffer(buffer: Any, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
     """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
     a = buffer.a[0][0]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER
 from sionna_partial.display import Shown, later
@@ -16,23 +17,74 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
-class ChannelPaths:
-    """Channels of paths with antennas, for classes that have the arrays of `TracedLinks`.
+@dataclass(frozen=True)
+class TracedLinks(Shown):
+    """Every traced path from one or T transmitters to N receivers.
 
-    Paths are ordered by transmitter and receiver.
+    Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
+
+    Parameters
+    ----------
+    tx : (3,) or (T, 3) float64 array
+        Transmitter positions [m].
+    rx : (N, 3) float64 array
+        Receiver positions [m].
+    link_state : (N,) or (T, N) uint8 array of LinkState
+        255 where a link was not traced (``invalid="nan"``).
+    gain_db : (N,) or (T, N) float64 array
+        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where a link was not traced.
+    path_tx, path_rx : (P,) int32 arrays
+        Indices of the transmitter and the receiver that each path joins.
+    transfer : (P, 2, 2) complex128 array
+        Transfer matrix of each path between isotropic antennas: [at the receiver, at the transmitter] along the
+        spherical unit vectors theta and phi of its arrival and departure, without the phase -2 pi f delay_s.
+    delay_s : (P,) float64 array
+        Propagation delay [s].
+    departure_rad, arrival_rad : (P, 2) float64 arrays
+        Zenith and azimuth of departure at the transmitter and of arrival at the receiver [rad].
+    interactions : (P, D) uint8 array
+        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
+    vertices_m : (P, D, 3) float64 array
+        Points of interaction [m]; NaN where there is none.
+    settings : TraceSettings
+        With `diffraction` True or False.
+    scene_settings : SceneSettings
+        With the map's material, if it has one.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
+    >>> links = sp.trace_links(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5), (3.5, 1.5, 1.5)])
+    >>> links.link_state.tolist(), links.path_rx.max().item()
+    ([1, 1], 1)
     """
 
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
+    tx: Floats
+    rx: Floats
+    link_state: NDArray[np.uint8]
+    gain_db: Floats
     path_tx: NDArray[np.int32]
     path_rx: NDArray[np.int32]
     transfer: NDArray[np.complex128]
-    delay_s: NDArray[np.float64]
-    departure_rad: NDArray[np.float64]
-    arrival_rad: NDArray[np.float64]
+    delay_s: Floats
+    departure_rad: Floats
+    arrival_rad: Floats
     interactions: NDArray[np.uint8]
-    vertices_m: NDArray[np.float64]
+    vertices_m: Floats
     settings: TraceSettings
+    scene_settings: SceneSettings
+
+    @property
+    def a(self) -> NDArray[np.complex128]:
+        """Complex path gain (P,) between isotropic, vertically polarised antennas: ``transfer[:, 0, 0]``."""
+        return self.transfer[:, 0, 0]
+
+    @property
+    def valid(self) -> Bools:
+        """Which links were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
+        return self.link_state != NO_RECEIVER
 
     @property
     def path_link(self) -> NDArray[np.int64]:
@@ -209,76 +261,6 @@ class ChannelPaths:
         options = {key: value for key, value in locals().items() if key != "self"}
         return later("channels.beams:beam_gains")(self, **options)
 
-
-@dataclass(frozen=True)
-class TracedLinks(ChannelPaths, Shown):
-    """Every traced path from one or T transmitters to N receivers.
-
-    Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
-
-    Parameters
-    ----------
-    tx : (3,) or (T, 3) float64 array
-        Transmitter positions [m].
-    rx : (N, 3) float64 array
-        Receiver positions [m].
-    link_state : (N,) or (T, N) uint8 array of LinkState
-        255 where a link was not traced (``invalid="nan"``).
-    gain_db : (N,) or (T, N) float64 array
-        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where a link was not traced.
-    path_tx, path_rx : (P,) int32 arrays
-        Indices of the transmitter and the receiver that each path joins.
-    transfer : (P, 2, 2) complex128 array
-        Transfer matrix of each path between isotropic antennas: [at the receiver, at the transmitter] along the
-        spherical unit vectors theta and phi of its arrival and departure, without the phase -2 pi f delay_s.
-    delay_s : (P,) float64 array
-        Propagation delay [s].
-    departure_rad, arrival_rad : (P, 2) float64 arrays
-        Zenith and azimuth of departure at the transmitter and of arrival at the receiver [rad].
-    interactions : (P, D) uint8 array
-        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
-    vertices_m : (P, D, 3) float64 array
-        Points of interaction [m]; NaN where there is none.
-    settings : TraceSettings
-        With `diffraction` True or False.
-    scene_settings : SceneSettings
-        With the map's material, if it has one.
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> links = sp.trace_links(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5), (3.5, 1.5, 1.5)])
-    >>> links.link_state.tolist(), links.path_rx.max().item()
-    ([1, 1], 1)
-    """
-
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
-    link_state: NDArray[np.uint8]
-    gain_db: NDArray[np.float64]
-    path_tx: NDArray[np.int32]
-    path_rx: NDArray[np.int32]
-    transfer: NDArray[np.complex128]
-    delay_s: NDArray[np.float64]
-    departure_rad: NDArray[np.float64]
-    arrival_rad: NDArray[np.float64]
-    interactions: NDArray[np.uint8]
-    vertices_m: NDArray[np.float64]
-    settings: TraceSettings
-    scene_settings: SceneSettings
-
-    @property
-    def a(self) -> NDArray[np.complex128]:
-        """Complex path gain (P,) between isotropic, vertically polarised antennas: ``transfer[:, 0, 0]``."""
-        return self.transfer[:, 0, 0]
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """Which links were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
-        return self.link_state != NO_RECEIVER
-
     def to_xarray(self) -> "xr.Dataset":
         """Return the links and their paths as a labelled Dataset.
 
@@ -350,7 +332,7 @@ class TracedLinks(ChannelPaths, Shown):
         >>> bool(links.spreads().k_factor_db > 0)
         True
         """
-        return later("channels.spreads:spreads")(self)
+        return later("channels.responses:spreads")(self)
 
     def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
         """Return a row for each link, or for each path, as a pandas.DataFrame.
@@ -406,13 +388,13 @@ class TracedLinks(ChannelPaths, Shown):
 
     def _path_columns(self) -> dict[str, NDArray[Any]]:
         angles = {"departure": self.departure_rad, "arrival": self.arrival_rad}
-        kinds = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
+        types = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
         return {
             **{"tx": self.path_tx, "rx": self.path_rx},
             **{"gain_db": 20.0 * np.log10(np.abs(self.a)), "phase_rad": np.angle(self.a), "delay_s": self.delay_s},
             **{f"{end}_zenith_rad": values[:, 0] for end, values in angles.items()},
             **{f"{end}_azimuth_rad": values[:, 1] for end, values in angles.items()},
-            "interactions": np.array(kinds, dtype=object),
+            "interactions": np.array(types, dtype=object),
         }
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Shown
@@ -52,11 +53,11 @@ class PathParameters(Shown):
         Carrier frequency [Hz].
     """
 
-    tx_m: NDArray[np.float64]
-    relative_permittivity: NDArray[np.float64]
-    conductivity_s_m: NDArray[np.float64]
-    thickness_m: NDArray[np.float64]
-    frequency_hz: NDArray[np.float64]
+    tx_m: Floats
+    relative_permittivity: Floats
+    conductivity_s_m: Floats
+    thickness_m: Floats
+    frequency_hz: Floats
 
 
 PARAMETERS = tuple(field.name for field in fields(PathParameters))
@@ -112,10 +113,10 @@ class PathScene:
 
     def blocks(
         self,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
         report: Progress,
-        rx_of_tx: Sequence[NDArray[np.intp]] | None = None,
+        rx_of_tx: Sequence[Indices] | None = None,
     ) -> Iterator["PathSet"]:
         """Find the same paths some at a time, which bounds the memory, for positions that have been checked.
 
@@ -156,9 +157,7 @@ class PathSet:
         Positions of the interactions at `base` [m]; NaN where there is none.
     """
 
-    def __init__(
-        self, scene: PathScene, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], parts: list[Part]
-    ) -> None:
+    def __init__(self, scene: PathScene, tx_m: Floats, rx_m: Floats, parts: list[Part]) -> None:
         self.base, self.rx_m, self._scene, self._parts = scene.parameters(tx_m), rx_m, scene, _merged(parts)
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
@@ -178,18 +177,13 @@ class PathSet:
         first = sets[0]
         return cls(first._scene, first.base.tx_m, first.rx_m, [part for each in sets for part in each._parts])
 
-    def kept(self, mask: NDArray[np.bool_]) -> "PathSet":
+    def kept(self, mask: Bools) -> "PathSet":
         """Return the paths of a mask (P,)."""
         parts = []
         for (candidates, paths), rows in zip(self._parts, self._rows, strict=True):
             index = np.flatnonzero(mask[rows])
             parts.append((candidates.rows(index), paths.take(index)))
         return PathSet(self._scene, self.base.tx_m, self.rx_m, parts)
-
-    @property
-    def materials(self) -> tuple[str, ...]:
-        """Names of the M radio materials, in the order of `PathParameters`."""
-        return self._scene.materials
 
     def links(self) -> TracedLinks:
         """Return the links as `trace_links` does."""
@@ -210,7 +204,7 @@ class PathSet:
             scene_settings=self._scene.scene_settings,
         )
 
-    def at(self, parameters: PathParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def at(self, parameters: PathParameters) -> tuple[Floats, Floats]:
         """Evaluate power (P,), 0 where a path is not valid any more, and vertices (P, D, 3) for other parameters.
 
         For a frequency that a material does not cover this raises a SettingsError; so do the derivatives.
@@ -232,7 +226,7 @@ class PathSet:
 
     def slopes(
         self, parameters: PathParameters, names: Sequence[str] = PARAMETERS, *, together: bool = False
-    ) -> dict[str, NDArray[np.float64]]:
+    ) -> dict[str, Floats]:
         """Differentiate the power of each path with respect to the K entries of fields of `PathParameters`: (P, K).
 
         Of the transmitters, that is the x, y, z of each path's own; with `together` all materials change by as much.
@@ -245,7 +239,7 @@ class PathSet:
             power[name][rows, entry] = of_power.numpy()
         return power
 
-    def transmitter_slopes(self, parameters: PathParameters) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def transmitter_slopes(self, parameters: PathParameters) -> tuple[Floats, Floats]:
         """Differentiate power (P, 3) and vertices (P, D, 3, 3) with respect to the x, y, z of the transmitter.
 
         The last axis is the transmitter's; derivatives are 0 where there is no vertex.
@@ -282,7 +276,7 @@ class PathSet:
     def _moves(self, parameters: PathParameters) -> bool:
         return not np.array_equal(parameters.tx_m, self.base.tx_m)
 
-    def _ends(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _ends(self) -> tuple[Floats, Floats]:
         """Transmitters (T, 3) and receivers (N, 3) at `base`, in scene coordinates [m]."""
         return self.base.tx_m.reshape(-1, 3) - self._scene.shift_m, self.rx_m - self._scene.shift_m
 
@@ -401,15 +395,15 @@ class GainGradients(Shown):
     ((1, 3), (1,))
     """
 
-    tx: NDArray[np.float64]
-    rx: NDArray[np.float64]
+    tx: Floats
+    rx: Floats
     link_state: NDArray[np.uint8]
-    gain_db: NDArray[np.float64]
-    tx_db_per_m: NDArray[np.float64]
-    relative_permittivity_db: NDArray[np.float64]
-    conductivity_db_per_s_m: NDArray[np.float64]
-    thickness_db_per_m: NDArray[np.float64]
-    frequency_db_per_hz: NDArray[np.float64]
+    gain_db: Floats
+    tx_db_per_m: Floats
+    relative_permittivity_db: Floats
+    conductivity_db_per_s_m: Floats
+    thickness_db_per_m: Floats
+    frequency_db_per_hz: Floats
     settings: TraceSettings
     scene_settings: SceneSettings
 

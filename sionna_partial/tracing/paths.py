@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats
+
 REFLECTION, DIFFUSE, DIFFRACTION = 1, 2, 8
 """Sionna RT's `InteractionType` of specular and diffuse reflections and diffractions."""
 
@@ -23,9 +25,9 @@ class SolvedPaths:
     path_tx: NDArray[np.int32]
     path_rx: NDArray[np.int32]
     transfer: NDArray[np.complex128]
-    delay_s: NDArray[np.float64]
-    departure_rad: NDArray[np.float64]
-    arrival_rad: NDArray[np.float64]
+    delay_s: Floats
+    departure_rad: Floats
+    arrival_rad: Floats
     interactions: NDArray[np.uint8]
     vertices_m: NDArray[Any]
 
@@ -35,7 +37,7 @@ class SolvedPaths:
         return self.transfer[:, 0, 0]
 
     @property
-    def is_direct(self) -> NDArray[np.bool_]:
+    def is_direct(self) -> Bools:
         """Whether each path (P,) is the line of sight."""
         return (self.interactions == 0).all(axis=1)
 
@@ -61,12 +63,12 @@ class SolvedPaths:
         cls,
         path_rx: NDArray[np.int32],
         transfer: NDArray[np.complex128],
-        delay_s: NDArray[np.float64],
+        delay_s: Floats,
         interactions: NDArray[np.uint8],
         vertices_m: NDArray[Any],
         *,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
     ) -> "SolvedPaths":
         """Make paths of one transmitter, with NaN where there is no interaction and the angles at both ends."""
         vertices_m = np.where(interactions[:, :, None] > 0, vertices_m, np.float32(math.nan))
@@ -78,8 +80,8 @@ class SolvedPaths:
             path_rx=path_rx,
             transfer=transfer,
             delay_s=delay_s,
-            departure_rad=_zenith_azimuth(np.where(direct, rx_m[path_rx], first) - tx_m),
-            arrival_rad=_zenith_azimuth(np.where(direct, tx_m, last) - rx_m[path_rx]),
+            departure_rad=zenith_azimuth(np.where(direct, rx_m[path_rx], first) - tx_m),
+            arrival_rad=zenith_azimuth(np.where(direct, tx_m, last) - rx_m[path_rx]),
             interactions=interactions,
             vertices_m=vertices_m,
         )
@@ -184,7 +186,7 @@ def path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
     return np.argsort(link << np.uint64(32) | delay_s.astype(np.float32).view(np.uint32), kind="stable")
 
 
-def _zenith_azimuth(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Zenith and azimuth angles [rad] (P, 2) of direction vectors (P, 3)."""
+def zenith_azimuth(direction: Floats) -> Floats:
+    """Return zenith and azimuth [rad] (P, 2) of direction vectors (P, 3)."""
     x, y, z = direction.T
     return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)

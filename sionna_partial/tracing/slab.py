@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import require
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 
@@ -23,7 +24,7 @@ def reflection_loss_db(
     frequency_hz: float,
     angle_deg: ArrayLike,
     polarisation: Polarisation = "te",
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return the loss [dB] of a wave that is reflected off a slab, with all reflections inside it.
 
     All arrays are broadcast together; angles of incidence are from the normal, 0 to 90 degrees. The loss is at least 0

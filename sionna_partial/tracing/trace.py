@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, no_progress, require_choice, settings_or_default
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
@@ -217,10 +218,10 @@ class Tracer:
 
     def links(
         self,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
         report: Progress,
-        valid: NDArray[np.bool_] | None = None,
+        valid: Bools | None = None,
     ) -> TracedLinks:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
         columns = PathColumns(max(1, self.settings.max_depth), self.polarisations)
@@ -233,11 +234,11 @@ class Tracer:
     def fill(
         self,
         columns: PathColumns | PathFiles,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
         report: Progress,
-        valid: NDArray[np.bool_] | None = None,
-    ) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+        valid: Bools | None = None,
+    ) -> tuple[NDArray[np.uint8], Floats]:
         """Trace the same links into columns of paths; return their states and gains [dB], (N,) or (T, N)."""
         at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
         sources, count = tx_m.reshape(-1, 3), len(rx_m)
@@ -263,10 +264,10 @@ class Tracer:
 
     def require_memory(
         self,
-        tx_m: NDArray[np.float64],
-        rx_m: NDArray[np.float64],
+        tx_m: Floats,
+        rx_m: Floats,
         memory_gb: float | None,
-        valid: NDArray[np.bool_],
+        valid: Bools,
     ) -> None:
         """Log how much memory the paths of a large job take, estimated from some of its receivers.
 
@@ -287,7 +288,7 @@ class Tracer:
                 "a folder for the paths, fewer receivers, or more memory_gb."
             )
 
-    def paths(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator[SolvedPaths]:
+    def paths(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
         """Find all paths between a transmitter (3,) and receivers (N, 3), some paths at a time."""
         shift_m = np.array([*self.partial.origin_m, 0.0])
         find = self._shot if self._solver is None else self._verified
@@ -296,13 +297,11 @@ class Tracer:
                 yield replace(paths, vertices_m=paths.vertices_m + shift_m)
         report(1.0, "traced")
 
-    def _verified(
-        self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
-    ) -> Iterator[SolvedPaths]:
+    def _verified(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
         assert self._solver is not None
         return (found.paths for found in self._scene.paths(self._solver, tx_m, rx_m, report))
 
-    def _shot(self, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress) -> Iterator[SolvedPaths]:
+    def _shot(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
         found = stock_paths(self._scene.xml, self.settings, tx_m, rx_m, self.polarisations)
         for number, paths in enumerate(found, start=1):
             report(number / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
@@ -334,17 +333,15 @@ def nearest_m(frequency_hz: float) -> float:
     return max(SHORTEST_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi))
 
 
-def clear_of_walls(partial: PartialMap, points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
-    clear: NDArray[np.bool_] = partial.state_at(points_m) != CellState.WALL
+    clear: Bools = partial.state_at(points_m) != CellState.WALL
     for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
         clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
     return clear
 
 
-def checked_positions(
-    partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats]:
     """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
     tx_m, rx_m = partial.require_positions("tx", tx), _receivers(rx)
     partial.require_positions("rx", rx_m)
@@ -360,30 +357,26 @@ def checked_positions(
     return tx_m, rx_m
 
 
-def valid_links(
-    partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats, Bools]:
     """Return transmitters (T, 3) and receivers (N, 3) [m], and whether `checked_positions` takes each link (T, N)."""
     tx_m, rx_m = partial.require_positions("tx", tx).reshape(-1, 3), _receivers(rx)
     far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
     return tx_m, rx_m, far & partial.radios_can_stand(rx_m)
 
 
-def _receivers(rx: ArrayLike) -> NDArray[np.float64]:
+def _receivers(rx: ArrayLike) -> Floats:
     with suppress(ValueError):  # nested lists of unequal lengths have no size
         rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
     return position_array("rx", rx).reshape(-1, 3)
 
 
-def path_gain_db(power: NDArray[np.float64]) -> NDArray[np.float64]:
+def path_gain_db(power: Floats) -> Floats:
     """Omnidirectional path gain [dB], at least -150, of links whose paths have |a|^2 in sum (paper, eq. 5)."""
     with np.errstate(divide="ignore"):
         return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
 
 
-def link_summary(
-    power: NDArray[np.float64], is_direct: NDArray[np.bool_]
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
+def link_summary(power: Floats, is_direct: Bools) -> tuple[NDArray[np.uint8], Floats]:
     """Link state and path gain [dB] of links, from the sum of |a|^2 and whether one path has no interaction."""
     gain_db = path_gain_db(power)
     link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
@@ -394,8 +387,8 @@ def link_summary(
 def stock_paths(
     scene_xml: Path,
     settings: TraceSettings,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
+    tx_m: Floats,
+    rx_m: Floats,
     polarisations: int = 1,
 ) -> Iterator[SolvedPaths]:
     """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
@@ -425,7 +418,7 @@ def stock_paths(
         ) from error
 
 
-def _point(position_m: NDArray[np.float64]) -> Any:
+def _point(position_m: Floats) -> Any:
     """Position as an array on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
     import mitsuba as mi
 
@@ -450,9 +443,7 @@ def _options(settings: TraceSettings) -> dict[str, Any]:
     }
 
 
-def _read_paths(
-    found: Any, depth: int, index: int, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]
-) -> SolvedPaths:
+def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) -> SolvedPaths:
     """Copy the valid paths of one receiver out of Dr.Jit, each once."""
     real, imaginary = (np.transpose(part.numpy()[0, :, 0], (2, 0, 1)) for part in found.a)
     transfer = real + 1j * imaginary
@@ -471,10 +462,10 @@ def _read_paths(
     )
 
 
-def listed_before(interactions: NDArray[np.uint8], vertices_m: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+def listed_before(interactions: NDArray[np.uint8], vertices_m: NDArray[np.floating[Any]]) -> Bools:
     """Find the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
 
-    Sionna RT tells sequences apart by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
+    Sionna RT identifies sequences by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
     a diffuse reflection are samples of a rough surface, however close, and never repeats.
     """
     repeated = np.zeros(len(interactions), dtype=bool)
@@ -487,7 +478,7 @@ def listed_before(interactions: NDArray[np.uint8], vertices_m: NDArray[np.floati
     return repeated
 
 
-def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> NDArray[np.bool_]:
+def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> Bools:
     """Whether each path (P,) is diffracted as exact candidates are, if it is at all.
 
     Sionna RT's rays are diffracted at the rims of floor and ceiling and at junctions of walls as well, and with any

@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -75,7 +76,7 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     return partial if reading.observed is None else cut_to_known(partial)
 
 
-def require_metres(what: str, bounds_m: NDArray[np.float64], height_band_m: object) -> None:
+def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
     """Raise a MapError for lowest and highest x, y, z (2, 3) that seem to be in another unit."""
     x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
@@ -100,16 +101,16 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
     return replace(partial, mesh=partial.mesh.within(area))
 
 
-def narrow_areas(free: NDArray[np.bool_], resolution_m: float) -> NDArray[np.bool_]:
+def narrow_areas(free: Bools, resolution_m: float) -> Bools:
     """Find the cells (ny, nx) of free areas that are nowhere `RIM_M` wide."""
     area, count = ndimage.label(np.pad(free, 1))
     to_border_m = (ndimage.distance_transform_edt(area > 0) - 0.5) * resolution_m
     widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
-    narrow: NDArray[np.bool_] = (widest_m < RIM_M)[area][1:-1, 1:-1] & free
+    narrow: Bools = (widest_m < RIM_M)[area][1:-1, 1:-1] & free
     return narrow
 
 
-def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
+def _rims(state: NDArray[np.uint8], resolution_m: float) -> Bools:
     """Find the cells (ny, nx) of narrow free areas beside unknown cells."""
     free = state == CellState.FREE
     unknown = np.pad(state == CellState.UNKNOWN, 1)
@@ -119,7 +120,7 @@ def _rims(state: NDArray[np.uint8], resolution_m: float) -> NDArray[np.bool_]:
     return narrow_areas(free, resolution_m) & beside[area]
 
 
-def fitted_grid(bounds_m: NDArray[np.float64], resolution_m: float) -> PartialMap:
+def fitted_grid(bounds_m: Floats, resolution_m: float) -> PartialMap:
     """Map of unknown cells around the lowest and highest x and y, on multiples of the resolution, with a margin."""
     one = PartialMap(np.full((1, 1), CellState.UNKNOWN), resolution_m)
     cell = one.resolution_m
@@ -145,7 +146,7 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
     return low, high
 
 
-def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> NDArray[np.bool_]:
+def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools:
     """Cells (ny, nx) whose centre is in the polygon, or in a known cell of the other map."""
     (ny, nx), cell = empty.shape, empty.resolution_m
     x = empty.origin_m[0] + cell * (np.arange(nx) + 0.5)
@@ -180,7 +181,7 @@ def _polygon(observed: ArrayLike) -> Any:
     return polygon
 
 
-def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> NDArray[np.bool_]:
+def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:
     """Cells (ny, nx) in which the mesh has a surface between two heights; touching borders does not count."""
     corners = mesh.corners_m
     z = corners[..., 2]

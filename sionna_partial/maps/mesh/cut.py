@@ -9,6 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.planar import cross
 from sionna_partial.process import njit
 
@@ -24,14 +25,11 @@ MERGE_M = 1e-6
 SEAM_M = 1e-4
 """Distance within which a cut point lies on a vertex or an edge beside it [m]: as far as `UPRIGHT_M` moves it."""
 
-Triangles = NDArray[np.float64]
+Triangles = Floats
 """Corners (F, 3, 3) of triangles [m]."""
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 
-
-def cut_triangles(corners_m: Triangles, area: Any) -> tuple[NDArray[np.bool_], Triangles, Ints]:
+def cut_triangles(corners_m: Triangles, area: Any) -> tuple[Bools, Triangles, Indices]:
     """Cut triangles at the border of an area (shapely, world x and y [m]) seen from above.
 
     Returns a mask (F,) of the triangles that lie in the area or on its border (within `BORDER_M`), the pieces in the
@@ -86,7 +84,7 @@ def clip_slab(corners_m, values, low, high):  # type: ignore[no-untyped-def]
     return polygons, sizes
 
 
-def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Ints:
+def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
     """Index (V,) of the first point that each point is one with: its own where there is none before it."""
     unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
     if not len(unique):
@@ -99,7 +97,7 @@ def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Ints:
     return lowest[labels][inverse.ravel()]
 
 
-def close_seams(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[Ints, Ints]:
+def close_seams(vertices_m: Floats, triangles: Indices, first_new: int) -> tuple[Indices, Indices]:
     """Split triangles at the vertices from `first_new` on that lie on their open edges, so that neighbours share edges.
 
     An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns the
@@ -128,7 +126,9 @@ def close_seams(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[In
         triangles, source = np.concatenate([triangles[kept], parts])[order], source[origin[order]]
 
 
-def _points_on_edges(vertices_m: Floats, triangles: Ints, first_new: int) -> tuple[Ints, Ints, Ints, Floats]:
+def _points_on_edges(
+    vertices_m: Floats, triangles: Indices, first_new: int
+) -> tuple[Indices, Indices, Indices, Floats]:
     """Triangle, corner at which its open edge starts, new vertex on that edge, and where on it (fraction of length)."""
     edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     _, index, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
@@ -150,7 +150,7 @@ def _points_on_edges(vertices_m: Floats, triangles: Ints, first_new: int) -> tup
     return edge // 3, edge % 3, point[order], fraction[order]
 
 
-def _seen_from_above(flat_m: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _seen_from_above(flat_m: Floats) -> tuple[Floats, Bools]:
     """Longest edge (F, 2, 2) of triangles (F, 3, 2), and whether they are upright."""
     edges = np.stack([flat_m, np.roll(flat_m, -1, axis=1)], axis=2)
     lengths = np.linalg.norm(edges[:, :, 1] - edges[:, :, 0], axis=2)
@@ -163,7 +163,7 @@ def _doubled_area(flat_m: Floats) -> Floats:
     return cross(flat_m[:, 1] - flat_m[:, 0], flat_m[:, 2] - flat_m[:, 0])
 
 
-def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Ints]:
+def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Indices]:
     """Cut triangles that have a width seen from above; the height of new corners is that of the triangle's plane."""
     parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
     wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
@@ -181,7 +181,7 @@ def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Tr
     return cut, source
 
 
-def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Triangles, Ints]:
+def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Triangles, Indices]:
     """Cut triangles that are lines seen from above, where these lines leave the area."""
     source, low, high = _spans_inside(ends_m, area)
     start, along = ends_m[source, 0], ends_m[source, 1] - ends_m[source, 0]
@@ -193,7 +193,7 @@ def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Trian
     return pieces, np.concatenate([source[rows] for rows, _ in fans])
 
 
-def _spans_inside(ends_m: Floats, area: Any) -> tuple[Ints, Floats, Floats]:
+def _spans_inside(ends_m: Floats, area: Any) -> tuple[Indices, Floats, Floats]:
     """Line, start and end (fractions of its length) of every stretch of lines (L, 2, 2) in an area or on its border."""
     lengths = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
     line, fraction = _border_stops(ends_m, area)
@@ -215,7 +215,7 @@ def _spans_inside(ends_m: Floats, area: Any) -> tuple[Ints, Floats, Floats]:
     return line[first], low[first], high[last]
 
 
-def _border_stops(ends_m: Floats, area: Any) -> tuple[Ints, Floats]:
+def _border_stops(ends_m: Floats, area: Any) -> tuple[Indices, Floats]:
     """Line, and fraction of its length, where lines (L, 2, 2) cross the border of an area or touch its corners."""
     rings, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
     edges = np.stack([rings[:-1], rings[1:]], axis=1)[ring[:-1] == ring[1:]]

@@ -22,6 +22,7 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.transformations import rotation_matrix, translation_matrix
 
+from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, read_bytes
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, merged_mesh
@@ -63,7 +64,7 @@ _SHAPES = {
 }
 """Corners and triangles of the shapes that need no file, as Mitsuba has them."""
 
-Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
+Triangles = tuple[Floats, NDArray[np.int64]]
 """Vertices (V, 3) [m], and triangles (F, 3) of indices into them."""
 
 
@@ -167,7 +168,7 @@ def _joined(path: Path, parts: list[Triangles], index: list[int], materials: tup
     return mesh
 
 
-def _looks_y_up(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> bool:
+def _looks_y_up(vertices_m: Floats, triangles: NDArray[np.int64]) -> bool:
     """Whether the mesh is lowest along y, yet as high as a room, and more of it faces along y than z, as floors do."""
     corners = vertices_m[triangles]
     if not np.isfinite(corners).all():
@@ -260,7 +261,7 @@ def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles
 
 
-def _step(step: ET.Element) -> NDArray[np.float64]:
+def _step(step: ET.Element) -> Floats:
     """Matrix (4, 4) of one step of a to_world."""
     if not {*step.attrib} <= {"value", "x", "y", "z", "angle"}:
         raise ValueError(step.attrib)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
 from sionna_partial.display import Shown
@@ -56,7 +57,7 @@ class SceneMesh(Shown):
         For arrays of other shapes, values that are not finite, or indices out of range.
     """
 
-    vertices_m: NDArray[np.float64]
+    vertices_m: Floats
     triangles: NDArray[np.int64]
     material: NDArray[np.uint8]
     materials: tuple[Material | None, ...] = (None,)
@@ -93,14 +94,14 @@ class SceneMesh(Shown):
         return equal_fields(self, other)
 
     @property
-    def bounds_m(self) -> NDArray[np.float64]:
+    def bounds_m(self) -> Floats:
         """Lowest and highest x, y, z (2, 3) [m]; NaN where there is no triangle."""
         if not len(self.triangles):
             return np.full((2, 3), np.nan)
         return np.stack([self.vertices_m.min(axis=0), self.vertices_m.max(axis=0)])
 
     @property
-    def corners_m(self) -> NDArray[np.float64]:
+    def corners_m(self) -> Floats:
         """Corners (F, 3, 3) of every triangle [m]."""
         return self.vertices_m[self.triangles]
 
@@ -128,7 +129,7 @@ class SceneMesh(Shown):
 
 
 def merged_mesh(
-    vertices_m: NDArray[np.float64],
+    vertices_m: Floats,
     triangles: NDArray[np.int64],
     material: NDArray[np.integer],
     materials: tuple[Material | None, ...],
@@ -148,7 +149,7 @@ def equal_fields(one: Any, other: Any) -> bool:
     return all(np.array_equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
 
 
-def _vertices(values: ArrayLike) -> NDArray[np.float64]:
+def _vertices(values: ArrayLike) -> Floats:
     vertices = real_array("vertices_m", values, MapError, "give x, y, z in metres, (V, 3).").astype(np.float64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MapError(f"vertices_m has shape {vertices.shape}: give x, y, z in metres, (V, 3).")
@@ -188,7 +189,7 @@ def _materials(values: tuple[Material | None, ...]) -> tuple[Material | None, ..
     return materials
 
 
-def _is_wide(corners_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _is_wide(corners_m: Floats) -> Bools:
     """Triangles (F, 3, 3) that are not degenerate."""
     edges = np.roll(corners_m, -1, axis=1) - corners_m
     longest = np.linalg.norm(edges, axis=2).max(axis=1, initial=0.0)
@@ -196,7 +197,7 @@ def _is_wide(corners_m: NDArray[np.float64]) -> NDArray[np.bool_]:
     return doubled_area > DEGENERATE_M * longest
 
 
-def _height_range(given: tuple[float, float] | None, vertices_m: NDArray[np.float64]) -> tuple[float, float]:
+def _height_range(given: tuple[float, float] | None, vertices_m: Floats) -> tuple[float, float]:
     if given is None:
         z = vertices_m[:, 2] if len(vertices_m) else np.zeros(1)
         low, high = float(z.min()), float(z.max())

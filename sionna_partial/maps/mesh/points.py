@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
@@ -162,7 +163,7 @@ def is_cloud(path: Path) -> bool:
     return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
 
 
-def _las(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+def _las(stream: IO[bytes]) -> Iterator[Floats]:
     import laspy  # type: ignore[import-untyped]
 
     with laspy.open(stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
@@ -190,7 +191,7 @@ def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
     stream.seek(here)
 
 
-def _pcd(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+def _pcd(stream: IO[bytes]) -> Iterator[Floats]:
     from pypcd4.pypcd4 import MetaData, PointCloud
 
     lines = [line.decode("ascii").strip() for line in itertools.takewhile(_before_data(), stream)]
@@ -221,7 +222,7 @@ def _before_data() -> Any:
     return is_header
 
 
-def _ply(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+def _ply(stream: IO[bytes]) -> Iterator[Floats]:
     import trimesh
 
     header, _, _ = stream.read(100_000).partition(b"end_header")
@@ -238,7 +239,7 @@ def _ply(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
         yield vertices[start : start + PART]
 
 
-def _text(stream: IO[bytes]) -> Iterator[NDArray[np.float64]]:
+def _text(stream: IO[bytes]) -> Iterator[Floats]:
     """Read the first three columns of a text, after a header or a number of points, if there are any."""
     separator, first = None, True
     while block := stream.read(PART_BYTES):
@@ -302,7 +303,7 @@ def _cloud_map(
     return replace(empty, state=state, wall_height_m=round(height_m, 2))
 
 
-def _sensors(given: ArrayLike | None, up: str | None) -> NDArray[np.float64] | None:
+def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
     """Return positions (M, 2) of a sensor in the plan."""
     if given is None:
         return None
@@ -355,7 +356,7 @@ def _merged(
     return keys, np.bincount(inverse, np.concatenate([counts for _, counts in pending])).astype(np.int64)
 
 
-def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, int]) -> Bools:
     """Cells (ny, nx) with points in enough layers of the height band, and not much fewer than those beside them."""
     size = shape[0] * shape[1]
     layers = np.bincount(cell, minlength=size).reshape(shape)
@@ -381,7 +382,7 @@ def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | N
     return floor_m, next((slab for slab in slabs_m if slab >= floor_m + LOWEST_CEILING_M), None)
 
 
-def _looks_y_up(voxels: NDArray[np.int64], bounds: NDArray[np.float64]) -> bool:
+def _looks_y_up(voxels: NDArray[np.int64], bounds: Floats) -> bool:
     """Whether the cloud is lowest along y, yet as high as a room, and its fullest layers lie across y, not z."""
     x, y, z = np.ptp(bounds, axis=0)
     layers = [np.bincount(voxels[:, axis] - voxels[:, axis].min()) for axis in (1, 2)]
@@ -389,7 +390,7 @@ def _looks_y_up(voxels: NDArray[np.int64], bounds: NDArray[np.float64]) -> bool:
     return bool(LOWEST_CEILING_M <= y < min(x, z) and fullest[0] > fullest[1])
 
 
-def _without_strays(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+def _without_strays(free: Bools, cell_m: float) -> Bools:
     """Leave out cells that have few others around them."""
     size = 2 * round(WINDOW_M / cell_m / 2) + 1
     around = ndimage.uniform_filter(free.astype(np.float32), size, mode="constant")
@@ -397,7 +398,7 @@ def _without_strays(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]
     return np.asarray(free & (around >= STRAY_FRACTION * usual))
 
 
-def _closed(free: NDArray[np.bool_], wall: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+def _closed(free: Bools, wall: Bools, cell_m: float) -> Bools:
     """Close narrow gaps and small holes of a scanned floor, not through walls, nor what walls enclose."""
     steps = max(1, round(GAP_M / cell_m))
     grown = ndimage.binary_dilation(free, iterations=steps, mask=~wall)
@@ -413,14 +414,14 @@ def _closed(free: NDArray[np.bool_], wall: NDArray[np.bool_], cell_m: float) -> 
     return closed | small[hole]
 
 
-def _enclosed(free: NDArray[np.bool_], cell_m: float) -> NDArray[np.bool_]:
+def _enclosed(free: Bools, cell_m: float) -> Bools:
     """Cells of free areas that are narrow or small, as within walls, pillars and shelves."""
     area, count = ndimage.label(free)
     small = np.bincount(area.ravel(), minlength=count + 1) * cell_m**2 < HOLE_M2
     return narrow_areas(free, cell_m) | (free & small[area])
 
 
-def _beside(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _beside(cells: Bools) -> Bools:
     return np.pad(ndimage.binary_dilation(cells), 1)
 
 

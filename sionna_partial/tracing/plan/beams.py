@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
@@ -44,19 +45,17 @@ class Beams(NamedTuple):
 
     parent: NDArray[np.int32]
     segment: NDArray[np.int32]
-    source: NDArray[np.float64]
+    source: Floats
     pair_node: NDArray[np.int32]
     pair_rx: NDArray[np.int32]
 
 
-def trace_beams(plan: Plan, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], max_depth: int) -> Beams:
+def trace_beams(plan: Plan, tx_m: Floats, rx_m: Floats, max_depth: int) -> Beams:
     """Find every sequence of at most `max_depth` walls from a transmitter (2,), and receivers (N, 2) it can reach."""
     return trace_beams_in(plan, bin_points(rx_m), tx_m[None], np.array([max_depth]))
 
 
-def trace_beams_in(
-    plan: Plan, receivers: PointBins, sources_m: NDArray[np.float64], max_depth: NDArray[np.int64]
-) -> Beams:
+def trace_beams_in(plan: Plan, receivers: PointBins, sources_m: Floats, max_depth: NDArray[np.int64]) -> Beams:
     """Do the work of `trace_beams` for several sources (E, 2) [m], each with its own largest depth (E,)."""
     beam, node, pair = _trace_beams(plan, _root_beams(sources_m), max_depth, receivers)
     parent, piece, depth = node[:, :3].T.copy()
@@ -81,7 +80,7 @@ def _sequence_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDA
     return sequence
 
 
-def _root_beams(sources: NDArray[np.float64]) -> NDArray[np.float64]:
+def _root_beams(sources: Floats) -> Floats:
     """Four quadrants of the view from each source, with a window at 1 m."""
     low = [_ROOT_ANGLE_RAD + 0.5 * np.pi * root for root in range(4)]
     window = [(0.0, 0.0, math.cos(angle), math.sin(angle), -math.sin(angle), math.cos(angle)) for angle in low]
@@ -91,12 +90,12 @@ def _root_beams(sources: NDArray[np.float64]) -> NDArray[np.float64]:
 class _Scratch(NamedTuple):
     """Arrays that one beam after the other is worked out in; `visit` ends with the number of the present beam."""
 
-    found: NDArray[np.float64]
+    found: Floats
     wall: NDArray[np.int32]
     order: NDArray[np.int32]
     active: NDArray[np.int32]
-    edge: NDArray[np.float64]
-    piece: NDArray[np.float64]
+    edge: Floats
+    piece: Floats
     piece_wall: NDArray[np.int32]
     visit: NDArray[np.int64]
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.cores import in_order
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
@@ -60,21 +61,21 @@ class _Arrivals(NamedTuple):
 
     start: NDArray[np.int64]
     reflections: NDArray[np.int64]
-    length_m: NDArray[np.float64]
+    length_m: Floats
     walls: NDArray[np.int64]
-    points: NDArray[np.float64]
-    cosine: NDArray[np.float64]
-    angle_rad: NDArray[np.float64]
-    lit: NDArray[np.bool_]
+    points: Floats
+    cosine: Floats
+    angle_rad: Floats
+    lit: Bools
 
 
 class _Edges(NamedTuple):
     """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4)."""
 
-    position_m: NDArray[np.float64]
-    face_rad: NDArray[np.float64]
-    exterior_rad: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    position_m: Floats
+    face_rad: Floats
+    exterior_rad: Floats
+    normals: Floats
 
 
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
@@ -127,7 +128,7 @@ class DiffractionCandidates:
         reached = np.flatnonzero(np.diff(self._arrivals.start))
         groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
-        def listed(number: int) -> tuple[Candidates, NDArray[np.float64]]:
+        def listed(number: int) -> tuple[Candidates, Floats]:
             if number not in self._beams:
                 beams = self._trace(groups[number], receivers)
                 self._beams[number] = beams, np.zeros(len(beams.pair_rx), np.uint8)
@@ -141,7 +142,7 @@ class DiffractionCandidates:
             strengths.power[:] += power
             yield candidates, (number + 1) / len(groups)
 
-    def _trace(self, group: NDArray[np.intp], receivers: PointBins) -> Beams:
+    def _trace(self, group: Indices, receivers: PointBins) -> Beams:
         """Trace the beams from a group of edges."""
         arrivals = self._arrivals
         fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
@@ -31,15 +32,15 @@ class Room(NamedTuple):
     reflect.
     """
 
-    walls_m: NDArray[np.float64]
+    walls_m: Floats
     height_m: float
     floor: bool
     ceiling: bool
-    tx_m: NDArray[np.float64]
-    rx_m: NDArray[np.float64]
+    tx_m: Floats
+    rx_m: Floats
 
     @classmethod
-    def of(cls, geometry: SceneGeometry, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> "Room":
+    def of(cls, geometry: SceneGeometry, tx_m: Floats, rx_m: Floats) -> "Room":
         """Take it from a scene."""
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m)
