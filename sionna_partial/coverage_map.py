@@ -86,10 +86,7 @@ class Receivers:
 
 
 def coverage_map(
-    partial: PartialMap,
-    receivers: Receivers,
-    columns: Mapping[str, NDArray[Any]],
-    attributes: Mapping[str, Any],
+    partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
     """Put the values (N,) of the valid receivers, by name, on their grid, with what the map shows there."""
     layers: dict[str, NDArray[Any]] = {

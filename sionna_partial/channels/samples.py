@@ -354,13 +354,7 @@ class _Draws:
         kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
         return paths[kept], at[kept], power[kept]
 
-    def _analogues(
-        self,
-        draws: Indices,
-        state: NDArray[np.uint8],
-        gain_db: Floats,
-        survivors: Floats,
-    ) -> Indices:
+    def _analogues(self, draws: Indices, state: NDArray[np.uint8], gain_db: Floats, survivors: Floats) -> Indices:
         """Analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
         analogue = np.full(survivors.shape, -1)
         for each in (LinkState.LOS, LinkState.NLOS):
@@ -370,13 +364,7 @@ class _Draws:
             analogue[row, link] = self._model.analogues(each, keys, self._analogue_quantile[draws[row], link])
         return analogue
 
-    def _of_analogues(
-        self,
-        draws: Indices,
-        analogue: Indices,
-        power: Floats,
-        rng: np.random.Generator,
-    ) -> SolvedPaths:
+    def _of_analogues(self, draws: Indices, analogue: Indices, power: Floats, rng: np.random.Generator) -> SolvedPaths:
         """Paths of analogues (D, U) with a power in sum (D, U), mirrored at random for each link and draw."""
         row, link = np.nonzero(power > 0.0)
         chosen, mirror = analogue[row, link], rng.choice([-1.0, 1.0], len(row))
@@ -398,11 +386,7 @@ class _Draws:
         )
 
     def _copies(
-        self,
-        draw: Indices,
-        paths: Indices,
-        scale: Floats | None,
-        rng: np.random.Generator | None,
+        self, draw: Indices, paths: Indices, scale: Floats | None, rng: np.random.Generator | None
     ) -> SolvedPaths:
         """Traced paths in some draws; what crosses the unseen has a random phase."""
         columns = {name: getattr(self.traced, name).take(paths, axis=0) for name in _COLUMNS}

@@ -104,11 +104,7 @@ def settings_of(
 
 
 def _read_map(
-    map_path: Map,
-    strict: Strict = False,
-    height_band: HeightBand = None,
-    up: Up = None,
-    wall_height: WallHeight = None,
+    map_path: Map, strict: Strict = False, height_band: HeightBand = None, up: Up = None, wall_height: WallHeight = None
 ) -> Any:
     return sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
 

@@ -128,9 +128,7 @@ def explore(
     opt.print_files(out, [*maps, "exploration.png", "exploration.gif"])
 
 
-def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-output"),
-) -> None:
+def demo(out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-output")) -> None:
     """Predict a half-explored home, and compare with the truth."""
     require_writable(out)
     with reporting(None, command=True) as report:

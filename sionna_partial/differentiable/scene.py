@@ -429,12 +429,7 @@ def _once_only(slopes: Any) -> Any:
     return tf.raw_ops.PreventGradient(input=slopes, message="links have first derivatives only.")
 
 
-def moved_lengths_m(
-    lengths: SmoothLengths,
-    exact_m: Floats,
-    base: tuple[Floats, Floats],
-    ends: tuple[Any, Any],
-) -> Any:
+def moved_lengths_m(lengths: SmoothLengths, exact_m: Floats, base: tuple[Floats, Floats], ends: tuple[Any, Any]) -> Any:
     """Return lengths (N,) that change from exact ones as smooth ones do while the ends of their segments move.
 
     Exact lengths [m] are those in cells of one kind at the ends `base` (N, 3), and `ends` are the present ones [m].

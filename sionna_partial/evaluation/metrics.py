@@ -136,12 +136,7 @@ def reliability(prediction: LinkPrediction, link_state: NDArray[np.uint8]) -> Re
     return Reliability(links, *(total / np.maximum(links, 1) for total in sums))
 
 
-def pit_fractions(
-    prediction: LinkPrediction,
-    link_state: NDArray[np.uint8],
-    gain_db: Floats,
-    levels: Floats,
-) -> Floats:
+def pit_fractions(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats, levels: Floats) -> Floats:
     """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as

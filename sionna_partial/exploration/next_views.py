@@ -286,11 +286,7 @@ def coverage_choice(
 
 
 def _gains(
-    partial: PartialMap,
-    frontiers: list[Frontier],
-    tx_m: Floats,
-    uncertainty: xr.DataArray,
-    sensor: SensorSettings,
+    partial: PartialMap, frontiers: list[Frontier], tx_m: Floats, uncertainty: xr.DataArray, sensor: SensorSettings
 ) -> tuple[list[float], list[float]]:
     """Return what is gained at each frontier, and the heading with the largest unknown area in view [degree].
 

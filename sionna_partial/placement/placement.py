@@ -316,11 +316,7 @@ def _counted(fraction: Floats) -> Floats:
 
 
 def _refined(
-    search: Search,
-    area: PlacementArea,
-    starts_m: Floats,
-    start_scores: Floats,
-    report: Progress,
+    search: Search, area: PlacementArea, starts_m: Floats, start_scores: Floats, report: Progress
 ) -> list[tuple[Floats, Floats]]:
     """Move the best starts to better neighbours: positions (K, 3) [m] and scores (K,) of each route."""
     best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]

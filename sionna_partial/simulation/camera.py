@@ -71,11 +71,7 @@ class Camera:
 
 
 def unknown_in_view(
-    state: NDArray[np.uint8],
-    cell: Indices,
-    headings_deg: Floats,
-    cell_m: float,
-    sensor: SensorSettings,
+    state: NDArray[np.uint8], cell: Indices, headings_deg: Floats, cell_m: float, sensor: SensorSettings
 ) -> list[Indices]:
     """Unknown cells (N, 2) that a picture taken in a cell would show if none of them were walls, for each heading."""
     reach = sensor.range_m / cell_m

@@ -36,12 +36,7 @@ class Frontier(NamedTuple):
 
 
 def find_frontiers(
-    state: NDArray[np.uint8],
-    start: tuple[int, int],
-    cell_m: float,
-    radius: float,
-    tight: Bools,
-    left_out: Bools,
+    state: NDArray[np.uint8], start: tuple[int, int], cell_m: float, radius: float, tight: Bools, left_out: Bools
 ) -> list[Frontier]:
     """Find the frontiers of a map (ny, nx) that a robot of some radius [cells] can reach.
 

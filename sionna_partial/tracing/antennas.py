@@ -99,9 +99,7 @@ def _evaluated(pattern: Any, local_rad: Floats) -> list[NDArray[np.complex128]]:
     return [np.zeros(len(local_rad)) + (part.real.numpy() + 1j * part.imag.numpy()) for part in pattern(*angles)]
 
 
-def directions(
-    angles_rad: Floats,
-) -> tuple[Floats, Floats, Floats]:
+def directions(angles_rad: Floats) -> tuple[Floats, Floats, Floats]:
     """Return the unit vectors r, theta and phi (P, 3) of zenith and azimuth angles (P, 2)."""
     (sin_t, sin_p), (cos_t, cos_p) = np.sin(angles_rad).T, np.cos(angles_rad).T
     return (

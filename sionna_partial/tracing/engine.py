@@ -296,13 +296,7 @@ class SceneSolver:
             power = self._power(verification, buffer, ends, candidates.wedges is not None)
             return power, mi.Point3f(buffer.vertices_x.array, buffer.vertices_y.array, buffer.vertices_z.array)
 
-    def held(
-        self,
-        candidates: Candidates,
-        tx_index: NDArray[np.int32],
-        tx_m: Floats,
-        rx_m: Floats,
-    ) -> HeldPaths:
+    def held(self, candidates: Candidates, tx_index: NDArray[np.int32], tx_m: Floats, rx_m: Floats) -> HeldPaths:
         """Verify candidates once, for `power`."""
         import drjit as dr
 

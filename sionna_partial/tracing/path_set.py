@@ -71,11 +71,7 @@ class PathScene:
     """
 
     def __init__(
-        self,
-        partial: PartialMap,
-        *,
-        settings: TraceSettings | None = None,
-        scene_settings: SceneSettings | None = None,
+        self, partial: PartialMap, *, settings: TraceSettings | None = None, scene_settings: SceneSettings | None = None
     ) -> None:
         self.partial = partial
         self.settings, self.scene_settings = path_settings(partial, settings, scene_settings)
@@ -112,11 +108,7 @@ class PathScene:
         return found
 
     def blocks(
-        self,
-        tx_m: Floats,
-        rx_m: Floats,
-        report: Progress,
-        rx_of_tx: Sequence[Indices] | None = None,
+        self, tx_m: Floats, rx_m: Floats, report: Progress, rx_of_tx: Sequence[Indices] | None = None
     ) -> Iterator["PathSet"]:
         """Find the same paths some at a time, which bounds the memory, for positions that have been checked.
 

@@ -41,11 +41,7 @@ def reflection_loss_db(
 
 
 def reflection_coefficients(
-    permittivity: ArrayLike,
-    conductivity_s_m: ArrayLike,
-    thickness_m: ArrayLike,
-    frequency_hz: float,
-    cosine: ArrayLike,
+    permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Return the reflection coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
     loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)

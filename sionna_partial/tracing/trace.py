@@ -216,13 +216,7 @@ class Tracer:
             return None
         return SceneSolver(self._scene.xml, self._scene.shapes, self.settings, self.polarisations)
 
-    def links(
-        self,
-        tx_m: Floats,
-        rx_m: Floats,
-        report: Progress,
-        valid: Bools | None = None,
-    ) -> TracedLinks:
+    def links(self, tx_m: Floats, rx_m: Floats, report: Progress, valid: Bools | None = None) -> TracedLinks:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
         columns = PathColumns(max(1, self.settings.max_depth), self.polarisations)
         link_state, gain_db = self.fill(columns, tx_m, rx_m, report, valid)
@@ -232,12 +226,7 @@ class Tracer:
         )
 
     def fill(
-        self,
-        columns: PathColumns | PathFiles,
-        tx_m: Floats,
-        rx_m: Floats,
-        report: Progress,
-        valid: Bools | None = None,
+        self, columns: PathColumns | PathFiles, tx_m: Floats, rx_m: Floats, report: Progress, valid: Bools | None = None
     ) -> tuple[NDArray[np.uint8], Floats]:
         """Trace the same links into columns of paths; return their states and gains [dB], (N,) or (T, N)."""
         at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
@@ -262,13 +251,7 @@ class Tracer:
         shape = (*tx_m.shape[:-1], count)
         return link_state.reshape(shape), gain_db.reshape(shape)
 
-    def require_memory(
-        self,
-        tx_m: Floats,
-        rx_m: Floats,
-        memory_gb: float | None,
-        valid: Bools,
-    ) -> None:
+    def require_memory(self, tx_m: Floats, rx_m: Floats, memory_gb: float | None, valid: Bools) -> None:
         """Log how much memory the paths of a large job take, estimated from some of its receivers.
 
         Raises a MemoryLimitError if that is more than `memory_gb`.
@@ -385,11 +368,7 @@ def link_summary(power: Floats, is_direct: Bools) -> tuple[NDArray[np.uint8], Fl
 
 
 def stock_paths(
-    scene_xml: Path,
-    settings: TraceSettings,
-    tx_m: Floats,
-    rx_m: Floats,
-    polarisations: int = 1,
+    scene_xml: Path, settings: TraceSettings, tx_m: Floats, rx_m: Floats, polarisations: int = 1
 ) -> Iterator[SolvedPaths]:
     """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
 

@@ -348,9 +348,7 @@ def _occupied_voxels(
     return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts
 
 
-def _merged(
-    pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Merge sorted keys with the counts of each."""
     keys, inverse = np.unique(np.concatenate([keys for keys, _ in pending]), return_inverse=True)
     return keys, np.bincount(inverse, np.concatenate([counts for _, counts in pending])).astype(np.int64)
