@@ -117,12 +117,7 @@ def channels(
         else:
             receivers_m = _read_positions(Path(rx))
         links = sp.trace_links(
-            partial,
-            position,
-            receivers_m,
-            **settings,
-            memory_gb=memory,
-            progress=part_of(report, 0.0, 0.5),
+            partial, position, receivers_m, **settings, memory_gb=memory, progress=part_of(report, 0.0, 0.5)
         )
         sp.save_channels(
             links,
