@@ -13,8 +13,7 @@ from sionna_partial import coverage as coverage_module
 from sionna_partial.constants import LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import IndirectPaths
+from sionna_partial.prediction.features import IndirectPaths, LinkFeatures
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import PredictorSettings, SceneSettings, TraceSettings

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
 from sionna_partial.settings import DatasetSettings
 
 KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670

@@ -28,7 +28,7 @@ ROOMS = {
         *("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.points", "mesh.files", "ros_map"),
         *("drawings", "bags", "map_files"),
     ),
-    "simulation": ("furniture", "buildings", "homes", "camera", "frontiers", "robot", "explore"),
+    "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
         *("candidates", "paths", "links", "engine", "slab"),
@@ -38,7 +38,7 @@ ROOMS = {
         "antennas",
     ),
     "prediction": (
-        *("unobserved", "windows", "link_context", "features"),
+        *("unobserved", "windows", "features"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),

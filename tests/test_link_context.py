@@ -14,8 +14,7 @@ from predictor_links import features
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import link_features
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, link_features
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSettings
 from sionna_partial.simulation.homes import make_home

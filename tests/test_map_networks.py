@@ -10,7 +10,7 @@ from predictor_links import FREQUENCY_HZ, NLOS, QUIET, features, make_seen_links
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M
 from sionna_partial.prediction.map_networks import (
     CONTEXT_SHAPES,
     LINK_INPUTS,

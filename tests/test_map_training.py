@@ -15,8 +15,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkFeatures
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     context_networks,

@@ -11,7 +11,7 @@ from sionna_partial.checks import Progress
 from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.prediction.link_context import SEEN_M, path_unobserved_m
+from sionna_partial.prediction.features import SEEN_M, path_unobserved_m
 from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import itu_constants
 from sionna_partial.settings import Material, SceneSettings, TraceSettings

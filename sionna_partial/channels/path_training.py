@@ -19,7 +19,7 @@ from sionna_partial.channels.path_model import (
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.link_context import traced_unobserved_m
+from sionna_partial.prediction.features import traced_unobserved_m
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home

@@ -21,8 +21,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MemoryLimitError
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import link_features
-from sionna_partial.prediction.link_context import traced_unobserved_m
+from sionna_partial.prediction.features import link_features, traced_unobserved_m
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.progress import reporting

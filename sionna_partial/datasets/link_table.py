@@ -11,8 +11,7 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states
-from sionna_partial.prediction.link_context import LinkContext
+from sionna_partial.prediction.features import LinkContext, LinkFeatures, link_numbers, link_states
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,8 +20,7 @@ from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"

@@ -35,8 +35,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import link_features
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, attenuation
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, link_features
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,

@@ -38,8 +38,15 @@ from sionna_partial.planar import largest_part
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SensorSettings
 from sionna_partial.simulation.camera import unknown_in_view
-from sionna_partial.simulation.frontiers import Frontier, find_frontiers, wide_frontiers
-from sionna_partial.simulation.robot import FORWARD_M, ROBOT_RADII_M, Choice, Robot
+from sionna_partial.simulation.robot import (
+    FORWARD_M,
+    ROBOT_RADII_M,
+    Choice,
+    Frontier,
+    Robot,
+    find_frontiers,
+    wide_frontiers,
+)
 from sionna_partial.tracing.trace import clear_of_walls
 
 GOALS = ("coverage", "state", "area")

@@ -22,8 +22,7 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.link_context import ATTENUATION_LENGTHS_M, LinkContext
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
 from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
