@@ -10,8 +10,7 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
-from sionna_partial.files import require_writable
-from sionna_partial.progress import counting, reporting
+from sionna_partial.progress import counting
 from sionna_partial.settings import (
     HOME_KINDS,
     SHORT_LINK_M,
@@ -124,9 +123,7 @@ def train(
     RUN gets predictor.keras, which `predict --predictor` takes, baselines fitted to the same links, and the split of
     the homes.
     """
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "reading links")
+    with opt.reporting_to(out, "reading links") as report:
         from sionna_partial.datasets.dataset_links import open_links, settings_for
         from sionna_partial.reports import summary
 
@@ -151,9 +148,7 @@ def evaluate(
     REPORT gets all figures of merit with their definitions (report.md, report.json), and pictures. Homes of the data
     set that the predictor was not trained on are test homes.
     """
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "reading links")
+    with opt.reporting_to(out, "reading links") as report:
         from sionna_partial.reports import REPORT_FILES, save_report, summary
 
         result = sp.evaluate(predictor, folders, progress=report)

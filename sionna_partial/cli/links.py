@@ -11,8 +11,8 @@ import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.errors import PositionError
-from sionna_partial.files import atomic_files, read_columns, require_writable
-from sionna_partial.progress import part_of, reporting
+from sionna_partial.files import atomic_files, read_columns
+from sionna_partial.progress import part_of
 
 COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
 """Columns of positions, by any of these names."""
@@ -46,9 +46,7 @@ def network(
     positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
     powers_dbm = transmit_powers_dbm(tx_power, len(positions))
     budget = LinkBudget(noise_figure, bandwidth, load, sinr_threshold)
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "loading the predictor")
+    with opt.reporting_to(out, "loading the predictor") as report:
         coverage = sp.predict_map(
             partial,
             positions,
@@ -99,9 +97,7 @@ def channels(
     """Trace a map, and write the channel impulse responses between antenna arrays."""
     position = (*opt.parse_position(tx), DEFAULT_HEIGHT_M)[:3]
     shapes = [_parse_shape(name, text) for name, text in (("array", array), ("rx-array", rx_array))]
-    require_writable(out.parent)
-    with reporting(None, command=True) as report:
-        report(0.0, "loading Sionna RT")
+    with opt.reporting_to(out.parent, "loading Sionna RT") as report:
         from sionna_partial.channels.files import checked_target
         from sionna_partial.tracing.antennas import planar_array
         from sionna_partial.tracing.trace import valid_links

@@ -3,7 +3,8 @@
 import functools
 import inspect
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,7 +12,10 @@ import typer
 from typer.core import TyperCommand
 
 import sionna_partial as sp
+from sionna_partial.checks import Progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
+from sionna_partial.files import require_writable
+from sionna_partial.progress import reporting
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
 _MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
@@ -155,6 +159,15 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+@contextmanager
+def reporting_to(folder: Path, message: str) -> Iterator[Progress]:
+    """Check that a folder can be written, and report the progress of the work whose files go there."""
+    require_writable(folder)
+    with reporting(None, command=True) as report:
+        report(0.0, message)
+        yield report
 
 
 def print_files(folder: Path, names: Sequence[str]) -> None:

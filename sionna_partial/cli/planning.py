@@ -9,8 +9,7 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
-from sionna_partial.files import CALIBRATED_FILE, atomic_files, require_writable
-from sionna_partial.progress import reporting
+from sionna_partial.files import CALIBRATED_FILE, atomic_files
 from sionna_partial.settings import Objective, SensorSettings
 
 TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
@@ -42,9 +41,7 @@ def calibrate(
     from sionna_partial.measurements.measurements import measurements_of
 
     measured = measurements_of(measurements)
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "loading Sionna RT")
+    with opt.reporting_to(out, "loading Sionna RT") as report:
         result = sp.calibrate_materials(
             partial,
             measured,
@@ -77,9 +74,7 @@ def place(
 
     The folder --out gets the position and the search as JSON, and a picture.
     """
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "loading the predictor")
+    with opt.reporting_to(out, "loading the predictor") as report:
         result = sp.place_transmitter(
             partial,
             objective=objective,
@@ -127,9 +122,7 @@ def next_views(
 
     The folder --out gets the poses as YAML, as in a geometry_msgs/PoseArray, and a picture.
     """
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "predicting")
+    with opt.reporting_to(out, "predicting"):
         views = sp.next_views(
             partial,
             opt.parse_position(tx) if tx else None,

@@ -8,8 +8,8 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
-from sionna_partial.files import atomic_files, require_writable
-from sionna_partial.progress import part_of, reporting
+from sionna_partial.files import atomic_files
+from sionna_partial.progress import part_of
 from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
@@ -43,9 +43,7 @@ def predict(
     """Predict the coverage of a transmitter on a partial map."""
     position = opt.parse_position(tx) if tx else None
     suffixes = [_parse_format(name) for name in formats]
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "loading the predictor")
+    with opt.reporting_to(out, "loading the predictor") as report:
         coverage = sp.predict_map(
             partial,
             position,
@@ -101,9 +99,7 @@ def explore(
     The folder --out gets the partial maps, the complete one, a picture and an animation.
     """
     position = opt.parse_position(tx) if tx else None
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "reading the home" if home else "making a home")
+    with opt.reporting_to(out, "reading the home" if home else "making a home") as report:
         complete = sp.load_map(home, height_band_m=height_band, up=up) if home else sp.make_home(seed)
         frames = range(0, max(steps) + 1, max(1, max(steps) // FRAMES))
         exploration = sp.explore_trajectory(
@@ -130,9 +126,7 @@ def explore(
 
 def demo(out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo-output")) -> None:
     """Predict a half-explored home, and compare with the truth."""
-    require_writable(out)
-    with reporting(None, command=True) as report:
-        report(0.0, "loading the predictor")
+    with opt.reporting_to(out, "loading the predictor") as report:
         from sionna_partial.demo import run_demo
 
         files, table = run_demo(out, report)
