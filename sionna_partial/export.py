@@ -20,7 +20,7 @@ from sionna_partial.constants import NO_RECEIVER
 from sionna_partial.coverage_map import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes
-from sionna_partial.maps.ros_map import FREE_THRESHOLD, OCCUPIED_THRESHOLD
+from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
 from sionna_partial.network import VARIABLES, require_network
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
 from sionna_partial.plots.coverage_viewer import coverage_page
@@ -253,24 +253,11 @@ def _encode_table(table: Any) -> bytes:
 def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
     """Write the YAML and its PGM of a probability; if one cannot be written, neither is."""
     spacing_m = float(coverage.attrs["spacing_m"])
-    corner = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
-    image = path.with_suffix(".pgm")
-    sheet: dict[str, Any] = {
-        "image": image.name,
-        "mode": "raw",
-        "resolution": spacing_m,
-        "origin": [*corner, 0.0],
-        "negate": 0,
-        "occupied_thresh": OCCUPIED_THRESHOLD,
-        "free_thresh": FREE_THRESHOLD,
-        "quantity": "probability of outage in percent; 255 where no receiver can stand",
-    }
+    corner_m = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
+    quantity = {"quantity": "probability of outage in percent; 255 where no receiver can stand"}
+    sheet = ros_sheet(path, "raw", spacing_m, corner_m) | quantity
     percent = np.rint(100 * coverage[p_outage].fillna(NO_RECEIVER / 100).to_numpy()).astype(np.uint8)
-    header = b"P5\n%d %d\n255\n" % (coverage.sizes["x"], coverage.sizes["y"])
-    with atomic_write(path, "w") as text, atomic_write(image) as picture:
-        yaml.safe_dump(sheet, text, sort_keys=False, default_flow_style=None)
-        text.flush()
-        picture.write(header + np.flipud(percent).tobytes())
+    write_ros_files(path, yaml.safe_dump(sheet, sort_keys=False, default_flow_style=None), percent)
 
 
 _ENCODERS: dict[str, Callable[[xr.Dataset], bytes]] = {

@@ -4,7 +4,7 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -131,31 +131,38 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
 
     Of a mesh, the YAML has what the exported scene beside it does not.
     """
-    image = path.with_suffix(".pgm")
-    sheet: dict[str, object] = {
-        "image": image.name,
-        "mode": "trinary",
-        "resolution": partial.resolution_m,
-        "origin": [*partial.origin_m, 0.0],
-        "negate": 0,
-        "occupied_thresh": OCCUPIED_THRESHOLD,
-        "free_thresh": FREE_THRESHOLD,
-        "wall_height": partial.wall_height_m,
-    }
+    sheet: dict[str, object] = {"wall_height": partial.wall_height_m}
     if partial.interior_cells is not None:
         sheet["interior_cells"] = int(partial.interior_cells)
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
     if partial.mesh is not None:
         sheet["mesh"] = {"height_range": [*partial.height_range_m], "materials": material_records(partial.mesh)}
-    content = _yaml_text(sheet, {} if extra is None else extra)
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
-    ny, nx = partial.shape
-    with atomic_write(path, "w") as text, atomic_write(image) as picture:
-        text.write(content)
-        picture.write(b"P5\n%d %d\n255\n" % (nx, ny))
-        picture.write(np.flipud(shades[partial.state]).tobytes())
+    sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet
+    write_ros_files(path, _yaml_text(sheet, {} if extra is None else extra), shades[partial.state])
+
+
+def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[float]) -> dict[str, object]:
+    """Return the keys that the YAML at `path` must have, of a map with a PGM image of the same stem."""
+    return {
+        "image": path.with_suffix(".pgm").name,
+        "mode": mode,
+        "resolution": resolution_m,
+        "origin": [*origin_m, 0.0],
+        "negate": 0,
+        "occupied_thresh": OCCUPIED_THRESHOLD,
+        "free_thresh": FREE_THRESHOLD,
+    }
+
+
+def write_ros_files(path: Path, text: str, pixels: NDArray[np.uint8]) -> None:
+    """Write a YAML, and the PGM beside it whose pixels (ny, nx) begin with the smallest y, or neither."""
+    with atomic_write(path, "w") as sheet, atomic_write(path.with_suffix(".pgm")) as picture:
+        sheet.write(text)
+        picture.write(b"P5\n%d %d\n255\n" % pixels.shape[::-1])
+        picture.write(np.flipud(pixels).tobytes())
 
 
 def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:

@@ -57,14 +57,9 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, height + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
     draw_map(axis, placement.partial)
-    scale = _draw_receivers(axis, placement)
+    _draw_receivers(figure, axis, placement, f"probability of more than {placement.settings.threshold_db:g} dB")
     _draw_search(axis, placement)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=_headline(placement))
-    coverage = placement.settings.objective == "coverage"
-    label = f"probability of more than {placement.settings.threshold_db:g} dB" if coverage else "mean path gain [dB]"
-    bar = figure.colorbar(scale, ax=axis, label=label, shrink=0.8)
-    if coverage:
-        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
     handles: list[Line2D | Patch] = [
         Line2D([], [], label="transmitter", **_STAR),
         Line2D([], [], color=RED, marker="o", markersize=4, label="refinement"),
@@ -108,14 +103,11 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     figure = Figure(figsize=(_WIDTH_IN, min(max(7.0 * ny / nx, 3.0), 14.0) + 1.2), dpi=_DPI, layout="constrained")
     axis = figure.add_subplot()
     draw_map(axis, placement.partial)
-    scale = _draw_receivers(axis, placement)
+    _draw_receivers(figure, axis, placement, f"probability that one is above {placement.settings.threshold_db:g} dB")
     axis.plot(*placement.candidates_m[:, :2].T, "o", markerfacecolor="white", markeredgecolor="black", markersize=5)
     axis.plot(*placement.positions_m[:, :2].T, zorder=6, **_STAR)
     title = f"{len(placement.positions_m)} transmitters, predicted coverage {placement.score:.1%}"
     axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
-    label = f"probability that one is above {placement.settings.threshold_db:g} dB"
-    bar = figure.colorbar(scale, ax=axis, label=label, shrink=0.8)
-    bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
     candidate = {"marker": "o", "linestyle": "none", "markerfacecolor": "white", "markeredgecolor": "black"}
     handles = [
         Line2D([], [], label="transmitter", markersize=12, **STAR),
@@ -141,8 +133,10 @@ def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, flo
     return window_m(np.vstack([known_m, counting_m - half, counting_m + half]))
 
 
-def _draw_receivers(axis: Axes, placement: TransmitterPlacement | NetworkPlacement) -> ScalarMappable:
-    """Draw a square for each receiver, and return the colour scale."""
+def _draw_receivers(
+    figure: Figure, axis: Axes, placement: TransmitterPlacement | NetworkPlacement, probability: str
+) -> None:
+    """Draw a square for each receiver, and the colour scale of the probability, or of the mean gain."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.settings.objective == "coverage"
@@ -151,7 +145,10 @@ def _draw_receivers(axis: Axes, placement: TransmitterPlacement | NetworkPlaceme
     squares.set_array(placement.values)
     squares.set_alpha((0.15 + 0.75 * np.clip(placement.weight, 0.0, 1.0)).tolist())
     axis.add_collection(squares)
-    return ScalarMappable(norm, "viridis")
+    label = probability if coverage else "mean path gain [dB]"
+    bar = figure.colorbar(ScalarMappable(norm, "viridis"), ax=axis, label=label, shrink=0.8)
+    if coverage:
+        bar.ax.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
 def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:

@@ -83,7 +83,8 @@ def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
 
     Format, features and hash are added to the entries of `card`.
     """
-    _require_suffix(path)
+    if path.suffix != SUFFIX:
+        raise PredictorError(f"path = '{path}' is no predictor: give the path of a {SUFFIX} file.")
     entries = {**_FIXED_ENTRIES, "sha256": digest(archive), **card}
     with atomic_write(path.with_suffix(".json"), "w") as text, atomic_write(path) as stream:
         text.write(json.dumps(entries, indent=2, allow_nan=False) + "\n")
@@ -92,7 +93,6 @@ def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
 
 def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
     """Return model, archive and card of the predictor in the `.keras` file at `path` and its card, checked."""
-    _require_suffix(path)
     archive = _read(path)
     card = _read_card(path.with_suffix(".json"))
     if card["sha256"] != digest(archive):
@@ -102,11 +102,6 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
         )
     _require_our_kind(path, archive)
     return _unpack(path, archive), archive, card
-
-
-def _require_suffix(path: Path) -> None:
-    if path.suffix != SUFFIX:
-        raise PredictorError(f"path = '{path}' is no predictor: give the path of a {SUFFIX} file.")
 
 
 def _read(path: Path) -> bytes:
