@@ -20,8 +20,8 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
 
-REACH_M = 1.0
-"""Distance over which the field decorrelates: its correlation is exp(-(d / reach)^2 / 2) [m]."""
+DECORRELATION_M = 1.0
+"""Distance over which the field decorrelates: its correlation is exp(-(d / DECORRELATION_M)^2 / 2) [m]."""
 
 KNOWN_WEIGHT = 0.1
 """Weight of a known cell, in weights of an unknown one."""
@@ -100,7 +100,7 @@ class JointLatents:
             rows = np.zeros((len(index), len(self._weight)), np.float32)
             np.add.at(rows, (np.arange(len(index))[:, None], index), self._weight[index])
             smooth = ndimage.gaussian_filter(
-                rows.reshape(-1, *self._shape), (0.0, *2 * (REACH_M / math.sqrt(2.0) / edge_m,)), mode="constant"
+                rows.reshape(-1, *self._shape), (0.0, *2 * (DECORRELATION_M / math.sqrt(2.0) / edge_m,)), mode="constant"
             ).reshape(rows.shape)
             yield smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
 

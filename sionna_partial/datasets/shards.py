@@ -263,5 +263,5 @@ def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:
 
 
 def _few(names: list[str]) -> str:
-    shown = ", ".join(map(repr, names[:5])) or "nothing, no home has been built"
-    return shown + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+    listed = ", ".join(map(repr, names[:5])) or "nothing, no home has been built"
+    return listed + (f" and {len(names) - 5} more" if len(names) > 5 else "")

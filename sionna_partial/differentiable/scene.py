@@ -342,7 +342,7 @@ class _Legs:
     """The straight legs of the Q indirect paths: what moves with the transmitter, and how much of it is unobserved.
 
     `paths` are their numbers (Q,), `rx` their receivers (Q,), `unobserved_m` their lengths in unknown cells as traced
-    (Q,) [m], also of links that a complete map encloses, which nobody asks for, and `strongest` is the strongest of
+    (Q,) [m], also of links that a complete map encloses, which are not used, and `strongest` is the strongest of
     them to each receiver (N,), -1 where there is none. Legs join nodes, which are numbered in this order: the
     transmitter, the receivers, and all vertices, path by path.
     """

@@ -311,12 +311,12 @@ def _gains(
         links.append((starts[counts], rx[counts], bits.ravel()[counts] / unobserved[counts] * each_m2))
     gains, headings_deg = [], []
     for frontier in frontiers:
-        shown = unknown_in_view(partial.state, frontier.route[-1], _HEADINGS_DEG, partial.resolution_m, sensor)
-        best = int(np.argmax([len(cells) for cells in shown]))
+        in_view = unknown_in_view(partial.state, frontier.route[-1], _HEADINGS_DEG, partial.resolution_m, sensor)
+        best = int(np.argmax([len(cells) for cells in in_view]))
         headings_deg.append(float(_HEADINGS_DEG[best]))
-        gain = len(shown[best]) * partial.resolution_m**2 if not links else 0.0
+        gain = len(in_view[best]) * partial.resolution_m**2 if not links else 0.0
         view = np.full(partial.shape, np.uint8(CellState.FREE))
-        view[tuple(shown[best].T)] = CellState.UNKNOWN
+        view[tuple(in_view[best].T)] = CellState.UNKNOWN
         for starts, ends, bits in links:
             gain += float(line_fractions(view, starts, ends)[:, CellState.UNKNOWN] @ bits)
         gains.append(gain)

@@ -83,7 +83,7 @@ def load_map(
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
-        wall. Other files have no such doubts.
+        wall. Other files are unambiguous.
     wall_height_m : float or None
         Wall height [m] in place of the file's. For a mesh, the height above its lowest point up to which radios may
         be (by default its highest point), as on roofs.
