@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.process import njit
 from sionna_partial.tracing.slab import reflection_coefficients
@@ -34,14 +33,14 @@ class Strengths(NamedTuple):
     """
 
     wavelength_m: float
-    reflection: Floats
+    reflection: NDArray[np.float64]
     first: NDArray[np.int64]
     last: NDArray[np.int64]
-    power: Floats
-    reflected: Floats
+    power: NDArray[np.float64]
+    reflected: NDArray[np.float64]
 
 
-def strengths_of(material: Floats, frequency_hz: float, receivers: int) -> Strengths:
+def strengths_of(material: NDArray[np.float64], frequency_hz: float, receivers: int) -> Strengths:
     """Prepare the bounds for one material, (3,) permittivity, conductivity and thickness, asking for all candidates."""
     cosine = np.linspace(0.0, 1.0, 8 * _ANGLES + 1)
     permittivity, conductivity_s_m, thickness_m = material.tolist()
@@ -58,18 +57,18 @@ def strengths_of(material: Floats, frequency_hz: float, receivers: int) -> Stren
     )
 
 
-def levels_needed(power: Floats, allowed: Floats) -> NDArray[np.int64]:
+def levels_needed(power: NDArray[np.float64], allowed: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return up to which level (N,) candidates are needed, if those beyond may add up to `allowed` (N,) at most."""
     beyond = np.cumsum(power[:, ::-1], axis=1)[:, ::-1]
     return 1 + np.sum(beyond[:, 1:] > allowed[:, None], axis=1)
 
 
-def expected_power(power: Floats, reflected: Floats) -> Floats:
+def expected_power(power: NDArray[np.float64], reflected: NDArray[np.float64]) -> NDArray[np.float64]:
     """Guess the power (N,) of the indirect paths from sums of bounds: reflections reach theirs, diffractions do not."""
     return reflected + _DIFFRACTED_FRACTION * np.maximum(power[:, 1:].sum(axis=1) - reflected, 0.0)
 
 
-def dropped_power(found: Floats, tolerance_db: float) -> Floats:
+def dropped_power(found: NDArray[np.float64], tolerance_db: float) -> NDArray[np.float64]:
     """Return the power (N,) that links may lack whose indirect paths have the power `found` (N,).
 
     It changes that power by `tolerance_db` at most; a link without any may lack what no receiver could notice.
