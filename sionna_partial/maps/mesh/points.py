@@ -45,6 +45,9 @@ MAX_WHOLE_BYTES = 2_000_000_000
 PART, PART_BYTES = 1_000_000, 32_000_000
 """Points, and bytes of text, that are read at a time."""
 
+MAX_HEADER_LINES = 100
+"""Lines of a PCD in which its header must end."""
+
 LAYER_M = 0.05
 """Height of a voxel [m]."""
 
@@ -194,7 +197,9 @@ def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
 def _pcd(stream: IO[bytes]) -> Iterator[Floats]:
     from pypcd4.pypcd4 import MetaData, PointCloud
 
-    lines = [line.decode("ascii").strip() for line in itertools.takewhile(_before_data(), stream)]
+    lines = [""]
+    while len(lines) < MAX_HEADER_LINES and not lines[-1].startswith("DATA"):
+        lines.append(stream.readline(1000).decode("ascii").strip())
     header = MetaData.parse_header([line for line in lines if line and not line.startswith("#")])
     size = header.points * header.build_dtype().itemsize
     inside = os.fstat(stream.fileno()).st_size
@@ -208,18 +213,6 @@ def _pcd(stream: IO[bytes]) -> Iterator[Floats]:
     _require_count(len(data), header.points)
     for start in range(0, len(data), PART):
         yield np.column_stack([data[axis][start : start + PART] for axis in "xyz"]).astype(np.float64)
-
-
-def _before_data() -> Any:
-    """Predicate that is true for the lines of a PCD header, its DATA line included."""
-    state = {"lines": 0, "ended": False}
-
-    def is_header(line: bytes) -> bool:
-        before, state["ended"] = not state["ended"], line.startswith(b"DATA")
-        state["lines"] += 1
-        return before and state["lines"] < 100
-
-    return is_header
 
 
 def _ply(stream: IO[bytes]) -> Iterator[Floats]:
