@@ -171,19 +171,15 @@ def calibrate_materials(
 ) -> MaterialCalibration:
     """Find the permittivity and the conductivity of walls, floor and ceiling from measured path gains.
 
-    Paths are traced once, from the side with fewer ends: where diffraction dominates, the side matters (median 2.4
-    dB), as Sionna RT's diffraction is not reciprocal. The power of a link is the sum of the powers of its paths, which
-    Sionna RT evaluates for any material. Measured gains differ from it by noise, by paths that the map does not show,
-    and by obstacles; the prior of the material is wide (see `calibration.material_fit`). The whole plane of
+    Paths are traced once, and Sionna RT evaluates the sum of their powers for any material. The whole plane of
     permittivity and conductivity is searched, so that the result does not depend on the start; then Newton's method
-    follows the derivatives from Dr.Jit to the likeliest material. The result is the material whose reflection losses
-    are nearest to their posterior mean: where the measurements determine little, the likeliest material would follow
-    the noise. The thickness is fixed.
+    follows the derivatives from Dr.Jit. The result is the material whose reflection losses are nearest to their
+    posterior mean: where the measurements determine little, the likeliest material would follow the noise. The
+    thickness is fixed.
 
-    Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged; their scatter shows how much of
-    the noise averages out. Links of a partial map are used where the line of sight, or half of the power without one,
-    runs through observed space. On incomplete maps the power 0.35 of the likelihood is taken, because links have the
-    errors of missing paths in common. Outages contain no information on the material.
+    Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged. Links of a partial map are used
+    where the line of sight, or half of the power without one, runs through observed space. Outages contain no
+    information on the material. The likelihood, the prior and their limits are explained in `docs/calibration.md`.
 
     Parameters
     ----------

@@ -41,7 +41,7 @@ class _Positions:
     anywhere: list[Bools]
 
 
-def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = None) -> LinkTable:
+def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
     """Trace the links of a complete home on what a robot has seen of it at every stage, and on the whole of it.
 
     Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
@@ -56,7 +56,6 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings | None = N
     settings, and not on other homes. The table is ordered by stage, in each by transmitter.
     """
     require_map("home", home)
-    settings = settings or DatasetSettings()
     home = map_area(closed_home(home, name), settings.margin_m)
     rng = np.random.default_rng(_home_seed(name, settings))
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)

@@ -24,7 +24,8 @@ MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
 OFFICES = ("mixed", "open")
 """Indoor scenarios of 3GPP TR 38.901."""
 
-_INDOOR_STD_DB = {LinkState.LOS: 3.0, LinkState.NLOS: 8.03}
+_INDOOR_STD_DB = (0.0, 3.0, 8.03)
+"""Shadow fading by LinkState [dB]."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +138,11 @@ def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkP
     are taken to be at the same height, so that the horizontal distance is the distance.
     """
     p_los, gains_db = indoor_los_probability(phi.distance_m, office), indoor_gain_db(phi.distance_m, frequency_hz)
-    floor, none = np.full(len(phi), GAIN_FLOOR_DB), np.zeros(len(phi))
-    means_db = {LinkState.OUTAGE: floor} | gains_db
-    return LinkPrediction.of_parts(
-        np.stack([none, p_los, 1.0 - p_los]),
-        np.stack([np.maximum(means_db[state], GAIN_FLOOR_DB) for state in LinkState]),
-        np.stack([np.full(len(phi), _INDOOR_STD_DB.get(state, 0.0)) for state in LinkState]),
-    )
+    nothing = np.zeros(len(phi))
+    means_db = np.stack([nothing + GAIN_FLOOR_DB, gains_db[LinkState.LOS], gains_db[LinkState.NLOS]])
+    stds_db = np.stack([nothing + std_db for std_db in _INDOOR_STD_DB])
+    probabilities = np.stack([nothing, p_los, 1.0 - p_los])
+    return LinkPrediction.of_parts(probabilities, np.maximum(means_db, GAIN_FLOOR_DB), stds_db)
 
 
 def baseline_predictions(
