@@ -27,7 +27,6 @@ from sionna_partial.coverage_map import (
     with_posterior,
 )
 from sionna_partial.errors import MemoryLimitError, PositionError
-from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.assimilation import Assimilation
@@ -178,9 +177,9 @@ def predict_map(
     measured_of_each = measurements_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
     provenance = _provenance(partial, model, scene_settings, trace_settings)
     maps = []
-    with reporting(progress) as report, temporary_folder() as work:
+    links = _Links(partial, Tracer(partial, trace_settings, scene_settings), model, at_once)
+    with reporting(progress) as report:
         report(0.0, "building the scene")
-        links = _Links(partial, Tracer(partial, work, trace_settings, scene_settings), model, at_once)
         for number, (tx_m, grid, measured) in enumerate(zip(sources_m, grids, measured_of_each, strict=True)):
             part = part_of(report, number / len(grids), (number + 1) / len(grids))
             posterior = _located(links, measured, part) if to_be_found and measured is not None else None

@@ -198,7 +198,7 @@ class Posterior(Shown):
         return float(np.sqrt(self.weight @ (values - best) ** 2))
 
     def typical(self, thickness_m: float, frequency_hz: float) -> Floats:
-        """Return the values (2,) whose reflection losses are nearest to their mean: the likeliest may be far from it."""
+        """Return the values (2,) whose reflection losses are nearest to the mean; the likeliest may be far from it."""
         loss_db = reflection_loss_db(
             self.permittivity[:, None], self.conductivity_s_m[:, None], thickness_m, frequency_hz, TYPICAL_DEG
         )

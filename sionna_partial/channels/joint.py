@@ -100,7 +100,9 @@ class JointLatents:
             rows = np.zeros((len(index), len(self._weight)), np.float32)
             np.add.at(rows, (np.arange(len(index))[:, None], index), self._weight[index])
             smooth = ndimage.gaussian_filter(
-                rows.reshape(-1, *self._shape), (0.0, *2 * (DECORRELATION_M / math.sqrt(2.0) / edge_m,)), mode="constant"
+                rows.reshape(-1, *self._shape),
+                (0.0, *2 * (DECORRELATION_M / math.sqrt(2.0) / edge_m,)),
+                mode="constant",
             ).reshape(rows.shape)
             yield smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
 

@@ -13,7 +13,7 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, no_progress
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
-from sionna_partial.files import atomic_write, temporary_folder
+from sionna_partial.files import atomic_write
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.placement.area import PlacementArea, placement_area
@@ -184,18 +184,17 @@ def place_transmitter(
     """
     settings = PlacementSettings(**options)
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    with temporary_folder() as folder:
-        search = Search.on(partial, folder, settings, predictor, scene_settings, trace_settings)
-        area, model = search.area, search.model
-        thinned = area.thinned(RECEIVERS)
-        with reporting(progress) as report:
-            report(0.0, "comparing positions")
-            starts_m = search.starts(thinned, _per_area(thinned, *STARTS))
-            start_scores = search.scores(starts_m, thinned)
-            routes = _refined(search, thinned, starts_m, start_scores, report)
-            report(0.9, "evaluating the best positions")
-            values = [search.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
-            report(1.0, "done")
+    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
+    area, model = search.area, search.model
+    some = area.thinned(RECEIVERS)
+    with reporting(progress) as report:
+        report(0.0, "comparing positions")
+        starts_m = search.starts(some, _per_area(some, *STARTS))
+        start_scores = search.scores(starts_m, some)
+        routes = _refined(search, some, starts_m, start_scores, report)
+        report(0.9, "evaluating the best positions")
+        values = [search.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
+        report(1.0, "done")
     scores = [placement_score(each, area.weight, settings) for each in values]
     best = int(np.argmax(scores))
     return TransmitterPlacement(
@@ -233,14 +232,13 @@ class Search:
     def on(
         cls,
         partial: PartialMap,
-        folder: Path,
         settings: PlacementSettings,
         predictor: Predictor | str | Path | None,
         scene_settings: SceneSettings | None,
         trace_settings: TraceSettings | None,
     ) -> "Search":
-        """Check the settings against a map, whose scene will be written to an existing folder."""
-        tracer = Tracer(partial, folder, *checked_settings(partial, trace_settings, scene_settings))
+        """Check the settings against a map."""
+        tracer = Tracer(partial, *checked_settings(partial, trace_settings, scene_settings))
         for name in ("tx_height_m", "rx_height_m"):
             require_height(partial, name, getattr(settings, name))
         model = None if partial.is_complete else Predictor.load(predictor)

@@ -13,7 +13,6 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Progress, require, require_whole
 from sionna_partial.display import Pictured
-from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import PlacementArea
@@ -130,23 +129,22 @@ def place_transmitters(
     settings = PlacementSettings(**options)
     require(settings.objective == "coverage", "objective", settings.objective, "several are placed for 'coverage'.")
     partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    with temporary_folder() as folder:
-        search = Search.on(partial, folder, settings, predictor, scene_settings, trace_settings)
-        area = search.area
-        if rx is not None:
-            rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
-            area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
-        some = area.thinned(2 * RECEIVERS)
-        with reporting(progress) as report:
-            report(0.0, "predicting candidates")
-            candidates_m = _candidates(search, some, max(CANDIDATES, 2 * count))
-            covered = _covered(search, some, candidates_m)
-            weight = some.weight / some.weight.sum()
-            chosen, scores = _greedy(covered, weight, count)
-            chosen = _swapped(covered, weight, chosen)
-            report(0.9, "evaluating the best positions")
-            values = _covered(search, area, candidates_m[chosen]).any(axis=1).mean(axis=0)
-            report(1.0, "done")
+    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
+    area = search.area
+    if rx is not None:
+        rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
+        area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
+    some = area.thinned(2 * RECEIVERS)
+    with reporting(progress) as report:
+        report(0.0, "predicting candidates")
+        candidates_m = _candidates(search, some, max(CANDIDATES, 2 * count))
+        covered = _covered(search, some, candidates_m)
+        weight = some.weight / some.weight.sum()
+        chosen, scores = _greedy(covered, weight, count)
+        chosen = _swapped(covered, weight, chosen)
+        report(0.9, "evaluating the best positions")
+        values = _covered(search, area, candidates_m[chosen]).any(axis=1).mean(axis=0)
+        report(1.0, "done")
     return NetworkPlacement(
         positions_m=candidates_m[chosen],
         score=float(values @ area.weight / area.weight.sum()),

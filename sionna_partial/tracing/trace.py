@@ -149,9 +149,9 @@ def trace_links(
         tx_m, rx_m = checked_positions(partial, tx, rx, settings.frequency_hz)
         valid = np.ones((len(tx_m), len(rx_m)), dtype=bool)
     shape = np.shape(tx)
-    with reporting(progress) as report, temporary_folder() as work:
+    with reporting(progress) as report:
         report(0.0, "building the scene")
-        tracer = Tracer(partial, work, settings, scene_settings, polarisations=2)
+        tracer = Tracer(partial, settings, scene_settings, polarisations=2)
         tracer.require_memory(tx_m, rx_m, None if folder is not None else memory_gb, valid)
         if folder is None:
             return tracer.links(tx_m.reshape(shape), rx_m, report, valid)
@@ -178,31 +178,25 @@ def trace_each(
     """Trace from each of T transmitters (3,) to receivers (N, 3) of its own, in a scene that is built once."""
     settings, scene_settings = checked_settings(partial, settings, scene_settings)
     ends = [checked_positions(partial, *each, settings.frequency_hz) for each in zip(tx, rx, strict=True)]
-    with temporary_folder() as folder:
-        tracer = Tracer(partial, folder, settings, scene_settings)
-        return [tracer.links(tx_m[0], rx_m, no_progress) for tx_m, rx_m in ends]
+    tracer = Tracer(partial, settings, scene_settings)
+    return [tracer.links(tx_m[0], rx_m, no_progress) for tx_m, rx_m in ends]
 
 
 @dataclass(frozen=True)
 class Tracer:
-    """Finds paths in one scene, which is written to `folder` when the first are asked for.
+    """Finds paths in one scene, which Sionna RT loads when the first are asked for.
 
     Settings come from `checked_settings`, positions [m] from `checked_positions`.
     """
 
     partial: PartialMap
-    folder: Path
     settings: TraceSettings
     scene_settings: SceneSettings
     polarisations: int = 1
 
     @cached_property
-    def _scene(self) -> PlanScene | MeshScene:
-        return write_scene_of(self.partial, self.folder, self.settings, self.scene_settings)
-
-    @cached_property
-    def _solver(self) -> SceneSolver | None:
-        """Solver of candidates; None if only rays find the paths, and a warning is logged."""
+    def _loaded(self) -> tuple[PlanScene | MeshScene, SceneSolver] | None:
+        """The scene and the solver of its candidates; None if only rays find the paths, and a warning is logged."""
         wanted = {
             "refraction": self.settings.refraction,
             "diffuse reflection": self.settings.diffuse_reflection,
@@ -214,7 +208,9 @@ class Tracer:
             _log.warning(message, " and ".join(names), self.settings.samples_per_tx)
         if names or engine_fault():
             return None
-        return SceneSolver(self._scene.xml, self._scene.shapes, self.settings, self.polarisations)
+        with temporary_folder() as folder:
+            scene = write_scene_of(self.partial, folder, self.settings, self.scene_settings)
+            return scene, SceneSolver(scene.xml, scene.shapes, self.settings, self.polarisations)
 
     def links(self, tx_m: Floats, rx_m: Floats, report: Progress, valid: Bools | None = None) -> TracedLinks:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
@@ -274,23 +270,24 @@ class Tracer:
     def paths(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
         """Find all paths between a transmitter (3,) and receivers (N, 3), some paths at a time."""
         shift_m = np.array([*self.partial.origin_m, 0.0])
-        find = self._shot if self._solver is None else self._verified
-        for paths in find(tx_m - shift_m, rx_m - shift_m, report):
+        for paths in self._paths(tx_m - shift_m, rx_m - shift_m, report):
             if len(paths.a):
                 yield replace(paths, vertices_m=paths.vertices_m + shift_m)
         report(1.0, "traced")
 
-    def _verified(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
-        assert self._solver is not None
-        return (found.paths for found in self._scene.paths(self._solver, tx_m, rx_m, report))
-
-    def _shot(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
-        found = stock_paths(self._scene.xml, self.settings, tx_m, rx_m, self.polarisations)
-        for number, paths in enumerate(found, start=1):
-            report(number / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
-            if isinstance(self._scene, PlanScene):
-                yield paths.take(diffracted_as_exact(self._scene.wedges, paths, self.settings.diffraction_walls))
-            else:
+    def _paths(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
+        """Find the same paths in scene coordinates."""
+        if self._loaded is not None:
+            scene, solver = self._loaded
+            yield from (found.paths for found in scene.paths(solver, tx_m, rx_m, report))
+            return
+        with temporary_folder() as folder:
+            scene = write_scene_of(self.partial, folder, self.settings, self.scene_settings)
+            found_by_rays = stock_paths(scene.xml, self.settings, tx_m, rx_m, self.polarisations)
+            for number, paths in enumerate(found_by_rays, start=1):
+                report(number / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
+                if isinstance(scene, PlanScene):
+                    paths = paths.take(diffracted_as_exact(scene.wedges, paths, self.settings.diffraction_walls))
                 yield paths
 
 
