@@ -19,17 +19,15 @@ from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, PositionError
-from sionna_partial.files import temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.engine import REMEDY, HeldPaths, SceneSolver, Variables, engine_fault, forward_passes
-from sionna_partial.tracing.finder import write_scene_of
+from sionna_partial.tracing.engine import REMEDY, HeldPaths, Variables, engine_fault, forward_passes
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
-from sionna_partial.tracing.trace import checked_positions, checked_settings, link_summary
+from sionna_partial.tracing.trace import checked_positions, checked_settings, link_summary, load_scene
 
 PATHS_PER_BLOCK = 50_000
 """Number of paths that are evaluated together, which bounds the memory."""
@@ -78,9 +76,7 @@ class PathScene:
         if engine_fault():
             raise BackendError(f"Gradients need the fast engine, and {engine_fault()}: {REMEDY}")
         self.shift_m = np.array([*partial.origin_m, 0.0])
-        with temporary_folder() as folder:
-            self._written = write_scene_of(partial, folder, self.settings, self.scene_settings)
-            self.solver = SceneSolver(self._written.xml, self._written.shapes, self.settings)
+        self._finder, self.solver = load_scene(partial, self.settings, self.scene_settings)
 
     @property
     def materials(self) -> tuple[str, ...]:
@@ -121,7 +117,7 @@ class PathScene:
                 continue
             ends = position_m - self.shift_m, rx_m[chosen] - self.shift_m
             part_report = part_of(report, number / len(positions_m), (number + 1) / len(positions_m))
-            for candidates, paths in self._written.paths(self.solver, *ends, part_report):
+            for candidates, paths in self._finder.paths(self.solver, *ends, part_report):
                 rx = chosen[candidates.rx].astype(np.int32)
                 path_tx = np.full(len(rx), number, np.int32)
                 part = replace(candidates, rx=rx), replace(paths, path_tx=path_tx, path_rx=rx)

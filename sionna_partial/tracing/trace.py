@@ -208,9 +208,7 @@ class Tracer:
             _log.warning(message, " and ".join(names), self.settings.samples_per_tx)
         if names or engine_fault():
             return None
-        with temporary_folder() as folder:
-            scene = write_scene_of(self.partial, folder, self.settings, self.scene_settings)
-            return scene, SceneSolver(scene.xml, scene.shapes, self.settings, self.polarisations)
+        return load_scene(self.partial, self.settings, self.scene_settings, self.polarisations)
 
     def links(self, tx_m: Floats, rx_m: Floats, report: Progress, valid: Bools | None = None) -> TracedLinks:
         """Trace the links between transmitters (3,) or (T, 3) and receivers (N, 3), or those of a mask (T, N)."""
@@ -289,6 +287,15 @@ class Tracer:
                 if isinstance(scene, PlanScene):
                     paths = paths.take(diffracted_as_exact(scene.wedges, paths, self.settings.diffraction_walls))
                 yield paths
+
+
+def load_scene(
+    partial: PartialMap, settings: TraceSettings, scene_settings: SceneSettings, polarisations: int = 1
+) -> tuple[PlanScene | MeshScene, SceneSolver]:
+    """Let Sionna RT load the scene of a map; settings come from `checked_settings`."""
+    with temporary_folder() as folder:
+        scene = write_scene_of(partial, folder, settings, scene_settings)
+        return scene, SceneSolver(scene.xml, scene.shapes, settings, polarisations)
 
 
 def checked_settings(
