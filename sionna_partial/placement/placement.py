@@ -247,7 +247,7 @@ class Search:
 
     def starts(self, area: PlacementArea, count: int) -> Floats:
         """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
-        positions_m, range_m = area.positions(int(self.settings.seed)), math.inf
+        positions_m, range_m = area.positions(self.settings.seed), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
             loss = 10.0 ** (-self.settings.threshold_db / 20.0)
             range_m = SPEED_OF_LIGHT_M_S / self.tracer.settings.frequency_hz / (4.0 * math.pi) * loss

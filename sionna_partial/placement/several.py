@@ -161,7 +161,7 @@ def place_transmitters(
 
 def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
     """Positions (C, 3) [m]: half of them good alone, the others each as far as possible from those before."""
-    chosen_m, positions_m = search.starts(area, count // 2), area.positions(int(search.settings.seed))
+    chosen_m, positions_m = search.starts(area, count // 2), area.positions(search.settings.seed)
     apart_m = np.linalg.norm(positions_m[:, None] - chosen_m, axis=2).min(axis=1)
     while len(chosen_m) < count and apart_m.max() > 0.0:
         farthest_m = positions_m[apart_m.argmax()]
@@ -174,7 +174,7 @@ def _covered(search: Search, area: PlacementArea, candidates_m: Floats) -> Bools
     """Whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
     links, far = search.links(candidates_m, area)
     latents = JointLatents(area.partial)
-    gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [int(search.settings.seed)])[1]
+    gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [search.settings.seed])[1]
     return (gain_db > search.settings.threshold_db) | ~far
 
 
