@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import number_of, real_array, require, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.display import later, picture_html
@@ -80,7 +80,7 @@ class Receivers:
 
     x_m: Floats
     y_m: Floats
-    cell_state: NDArray[np.uint8]
+    cell_state: States
     valid: Bools
     rx_m: Floats
 

@@ -11,11 +11,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtri
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -61,7 +60,7 @@ class JointLatents:
 
     def draw(
         self, links: LinkPrediction, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]
-    ) -> tuple[NDArray[np.uint8], Floats]:
+    ) -> tuple[States, Floats]:
         """Draw states and gains (count, T, N) [dB] of predicted links (T, N) from `tx_m` (T, 3) to `rx_m` (N, 3)."""
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
         quantiles = self.quantiles(*ends, count, [[*seed, 0], [*seed, 1]])
@@ -107,7 +106,7 @@ class JointLatents:
             yield smooth / np.linalg.norm(smooth, axis=1, keepdims=True)
 
 
-def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -> tuple[NDArray[np.uint8], Floats]:
+def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -> tuple[States, Floats]:
     """States and gains (n, ...) [dB] of predicted links (...) at quantiles of both.
 
     The lowest quantiles of a link are its outages, the highest its LOS. The gain of each state has quantiles of its

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
-from sionna_partial.arrays import Floats, Indices
+from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.channels.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.checks import Progress, require_number, require_whole
@@ -65,7 +65,7 @@ class ChannelSamples(Shown):
         How much memory all paths of `drawn` may take [GB].
     """
 
-    link_state: NDArray[np.uint8]
+    link_state: States
     gain_db: Floats
     memory_gb: float
     _draws: "_Draws" = field(repr=False)
@@ -353,7 +353,7 @@ class _Draws:
         kept = power >= strongest[at] * 10.0 ** (-RANGE_DB / 10.0)
         return paths[kept], at[kept], power[kept]
 
-    def _analogues(self, draws: Indices, state: NDArray[np.uint8], gain_db: Floats, survivors: Floats) -> Indices:
+    def _analogues(self, draws: Indices, state: States, gain_db: Floats, survivors: Floats) -> Indices:
         """Analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
         analogue = np.full(survivors.shape, -1)
         for each in (LinkState.LOS, LinkState.NLOS):

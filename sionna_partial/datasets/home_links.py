@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import MapError
@@ -175,9 +174,7 @@ def _points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng:
     return np.column_stack([home.origin_m + points * home.resolution_m, np.full(count, height_m)])
 
 
-def _truth(
-    home: PartialMap, positions: _Positions, settings: DatasetSettings
-) -> tuple[Bools, NDArray[np.uint8], Floats]:
+def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -> tuple[Bools, States, Floats]:
     """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
@@ -47,7 +47,7 @@ class LinkTable(Shown):
     features: LinkFeatures
     maps: tuple[PartialMap, ...]
     map_index: NDArray[np.int64]
-    link_state: NDArray[np.uint8]
+    link_state: States
     gain_db: Floats
     inside: Bools
     anywhere: Bools

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.display import Shown
@@ -40,7 +39,7 @@ class Majority:
     stds_db: tuple[float, ...]
 
     @classmethod
-    def fit(cls, link_state: NDArray[np.uint8], gain_db: Floats) -> "Majority":
+    def fit(cls, link_state: States, gain_db: Floats) -> "Majority":
         """Count true link states (N,), and average true gains (N,) [dB]."""
         groups = [gain_db[link_state == state] for state in LinkState]
         known = [group if len(group) else np.array([GAIN_FLOOR_DB]) for group in groups]

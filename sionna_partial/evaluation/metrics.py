@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -97,7 +97,7 @@ class Calibration(Shown):
     gain_pit: Floats
 
 
-def measure(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats) -> Metrics:
+def measure(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Metrics:
     """Compare a prediction of N links with their true link states and gains [dB]; outages count as -150 dB."""
     outage = link_state == LinkState.OUTAGE
     errors_db = gain_errors_db(prediction, link_state, gain_db)
@@ -115,18 +115,18 @@ def measure(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: 
     )
 
 
-def calibration(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats) -> Calibration:
+def calibration(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Calibration:
     """Measure the calibration of link state and gain."""
     fractions = pit_fractions(prediction, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
     return Calibration(reliability(prediction, link_state), np.diff(fractions))
 
 
-def gain_errors_db(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats) -> Floats:
+def gain_errors_db(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Floats:
     """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB."""
     return prediction.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
 
 
-def reliability(prediction: LinkPrediction, link_state: NDArray[np.uint8]) -> Reliability:
+def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
     """Compare confidence and accuracy of the link state, bin by bin."""
     confidence = np.max([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
     bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
@@ -136,7 +136,7 @@ def reliability(prediction: LinkPrediction, link_state: NDArray[np.uint8]) -> Re
     return Reliability(links, *(total / np.maximum(links, 1) for total in sums))
 
 
-def pit_fractions(prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats, levels: Floats) -> Floats:
+def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Floats, levels: Floats) -> Floats:
     """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
@@ -166,9 +166,7 @@ def _gain_probabilities(prediction: LinkPrediction, gain_db: Floats) -> tuple[Fl
     return below, upto
 
 
-def _negative_log_likelihoods(
-    prediction: LinkPrediction, link_state: NDArray[np.uint8], gain_db: Floats
-) -> tuple[float, float]:
+def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
     """Of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
@@ -256,7 +255,7 @@ def _unit(path: Path, drawing: Any, segments: Segments) -> float:
     return found[0]
 
 
-def _states(segments: Segments, empty: PartialMap) -> NDArray[np.uint8]:
+def _states(segments: Segments, empty: PartialMap) -> States:
     """Cell states (ny, nx): walls, what they enclose, and unknown cells."""
     cell_m = empty.resolution_m
     corners = np.zeros((len(segments), 5, 2))

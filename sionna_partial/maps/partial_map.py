@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import is_whole, number_of, real_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
@@ -76,7 +76,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     ((2, 3), (0.0, 0.0, 1.5, 1.0), False)
     """
 
-    state: NDArray[np.uint8]
+    state: States
     resolution_m: float
     origin_m: tuple[float, float] = (0.0, 0.0)
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M
@@ -161,7 +161,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         row = np.floor((points[..., 1] - self.origin_m[1]) / self.resolution_m + 1e-9).astype(np.intp)
         return row, column
 
-    def state_at(self, points_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+    def state_at(self, points_m: NDArray[np.floating]) -> States:
         """CellState at world points (..., 2 or 3) [m]; UNKNOWN outside the grid.
 
         A point on the border of several cells is in the freest of them: FREE before UNKNOWN before WALL. Sensors and
@@ -255,14 +255,14 @@ def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
     return row, start, np.nonzero(step == -1)[1]
 
 
-def frontier_cells(state: NDArray[np.uint8]) -> Bools:
+def frontier_cells(state: States) -> Bools:
     """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
     return np.asarray(touches & (state == CellState.FREE))
 
 
-def alike_cells(state: NDArray[np.uint8]) -> NDArray[np.int32]:
+def alike_cells(state: States) -> NDArray[np.int32]:
     """How many cells in every direction, corners included, are in the state of each cell."""
     alike = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
@@ -302,7 +302,7 @@ def grid_array(name: str, values: ArrayLike, kinds: str, wanted: str = "integers
     return array
 
 
-def _checked_state(values: ArrayLike) -> NDArray[np.uint8]:
+def _checked_state(values: ArrayLike) -> States:
     """Return cell states as a new read-only array, or raise a MapError."""
     wanted = "CellState integers FREE 0, WALL 1, UNKNOWN 2"
     state = grid_array("state", values, "iub", wanted)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import affine_transform, binary_dilation
 
+from sionna_partial.arrays import States
 from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
@@ -25,8 +26,6 @@ from sionna_partial.maps.partial_map import MAX_CELLS, MAX_INTERIOR_CELLS, MapWa
 from sionna_partial.settings import Material
 
 logger = logging.getLogger(__name__)
-
-States = NDArray[np.uint8]
 
 MODES = ("trinary", "scale", "raw")
 """How map_server may read an image."""
@@ -214,7 +213,7 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
     logger.warning("origin yaw %g rad: the map is turned onto cells of %g m.", yaw, cell_m)
     first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
 
-    def turned(grid: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def turned(grid: States) -> States:
         """Sample a grid of the map's shape at the centres of the new cells."""
         shape, unknown = (rows, columns), CellState.UNKNOWN
         return affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
@@ -362,7 +361,7 @@ def _decode(sheet: _Sheet) -> Image.Image:
     return image
 
 
-def _classify(pixels: _Pixels, sheet: _Sheet) -> NDArray[np.uint8]:
+def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
     """Read every pixel to the letter of nav2's loadMapFromFile; what lies between the thresholds is unknown."""
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
@@ -380,7 +379,7 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> NDArray[np.uint8]:
     return state
 
 
-def _warn_of_dark_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> None:
+def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
     """Warn of dark grey pixels that lie between the thresholds, if they are more than the walls."""
     full = 255 * pixels.per_shade + pixels.opaque
     occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
@@ -394,7 +393,7 @@ def _warn_of_dark_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _She
     warnings.warn(f"{sheet.source}: {what}: {remedy}", MapWarning, stacklevel=4)
 
 
-def _keep_unknown(state: NDArray[np.uint8], pixels: _Pixels, sheet: _Sheet) -> None:
+def _keep_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
     """Keep, in place, what map savers and painters mean by unknown: fully transparent pixels, and the shade 205.
 
     With a free_thresh above 0.196 (older nav2 wrote 0.25), or with an alpha channel, 205 reads as free. It is

@@ -12,10 +12,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Wedge
 from matplotlib.path import Path as MarkerPath
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
@@ -228,7 +228,7 @@ def _arrow(heading_deg: float) -> MarkerPath:
     return MarkerPath(np.stack([np.cos(angles), np.sin(angles)], axis=1), closed=True)
 
 
-def _picture(state: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Floats:
+def _picture(state: States, truth: States) -> Floats:
     """Colours of the cells, (ny, nx, 3): the map, and beneath it the walls that are not on it."""
     picture = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN)])[state]
     picture[(state == CellState.UNKNOWN) & (truth == CellState.WALL)] = to_rgb(_UNSEEN_WALL)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import require_bool, require_type
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
@@ -93,7 +93,7 @@ class LinkContext(Shown):
         *,
         tx_m: Floats,
         rx_m: Floats,
-        link_state: NDArray[np.uint8],
+        link_state: States,
         unobserved_distance_m: Floats,
         indirect_gain_db: Floats,
         strongest_unobserved_m: Floats,
@@ -178,7 +178,7 @@ class IndirectPaths:
         links = links[power[strongest[links]] >= self._strongest[links]]
         self._strongest[links], self._strongest_m[links] = power[strongest[links]], unobserved_m[strongest[links]]
 
-    def context(self, link_state: NDArray[np.uint8], unobserved_distance_m: Floats) -> LinkContext:
+    def context(self, link_state: States, unobserved_distance_m: Floats) -> LinkContext:
         """Return the context of all T N links, transmitter by transmitter, without windows."""
         tx_m, rx_m = np.repeat(self.tx_m, len(self.rx_m), axis=0), np.tile(self.rx_m, (len(self.tx_m), 1))
         return LinkContext.on_maps(
@@ -224,7 +224,7 @@ def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
 
 
 def _possible_states(
-    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: NDArray[np.uint8], seen: Bools, walled: Bools
+    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, seen: Bools, walled: Bools
 ) -> Bools:
     """Return which link states a map leaves possible (N, 3), whatever the networks predict.
 
@@ -322,7 +322,7 @@ class LinkFeatures(Shown):
     2
     """
 
-    link_state: NDArray[np.uint8]
+    link_state: States
     unobserved_distance_m: Floats
     distance_m: Floats
     gain_db: Floats
@@ -393,7 +393,7 @@ def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats
     return numbers
 
 
-def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> States:
     """Return link states as a uint8 array of a shape; a PredictorError for another shape, or what is none."""
     states = link_numbers(name, values, shape)
     known = ", ".join(f"{state.name} {state.value}" for state in LinkState)
@@ -467,7 +467,7 @@ def features_of_paths(
 
 
 def _features(
-    paths: IndirectPaths, link_state: NDArray[np.uint8], gain_db: Floats, *, context: bool = True, windows: bool = True
+    paths: IndirectPaths, link_state: States, gain_db: Floats, *, context: bool = True, windows: bool = True
 ) -> LinkFeatures:
     """Return the features of all links of `paths`, whose states and gains (N,) are given."""
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])

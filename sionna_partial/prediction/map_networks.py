@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
@@ -291,7 +291,7 @@ def _links_by_window(context: LinkContext) -> tuple[Indices, list[Indices]]:
 
 def fit_context_networks(
     phi: LinkFeatures,
-    link_state: NDArray[np.uint8],
+    link_state: States,
     gain_db: Floats,
     settings: PredictorSettings,
     *,
@@ -320,9 +320,7 @@ def fit_context_networks(
 class _Examples:
     """Training links by window; their columns have the names of the arguments of a gradient step."""
 
-    def __init__(
-        self, phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: Floats, settings: PredictorSettings
-    ) -> None:
+    def __init__(self, phi: LinkFeatures, link_state: States, gain_db: Floats, settings: PredictorSettings) -> None:
         self._used, links = _links_by_window(context_of(phi))
         self._windows = context_of(phi).windows if settings.networks == "map" else None
         self._first = np.cumsum([0, *map(len, links)])

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import minimize
 from scipy.special import log_softmax
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
@@ -222,7 +222,7 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict
 
 
 def distribution_by_paper(
-    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: NDArray[np.uint8]
+    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: States
 ) -> tuple[Any, Any, Any]:
     """Evaluate the paper's networks on `inputs` (N, 1) of `FEATURES` and partial link states (N,).
 
@@ -301,9 +301,7 @@ def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: A
     return getattr(keras.layers, kind)(*arguments, name=name, dtype="float32", **options)
 
 
-def fit_networks(
-    phi: LinkFeatures, link_state: NDArray[np.uint8], gain_db: Floats, settings: PredictorSettings
-) -> "keras.Model":
+def fit_networks(phi: LinkFeatures, link_state: States, gain_db: Floats, settings: PredictorSettings) -> "keras.Model":
     """Fit the classifiers and the gain networks to links and their true states and gains [dB] (N,), all indoors."""
     networks = {}
     for partial_state, name in STATE_NETWORKS.items():
@@ -359,7 +357,7 @@ def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
     return {name: (low, max(high, low + 1.0)) for name, (low, high) in spans.items()}
 
 
-def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: NDArray[np.uint8]) -> None:
+def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> None:
     """Set the weights of a logistic classifier to those of the smallest cross-entropy, a convex problem.
 
     A slight penalty keeps weights finite where a straight line parts the classes.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
@@ -82,7 +82,7 @@ class LinkPrediction(Shown):
     gain_nlos_std_db: Floats
 
     @property
-    def link_state(self) -> NDArray[np.uint8]:
+    def link_state(self) -> States:
         """Likeliest LinkState (N,)."""
         return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import CellState
 from sionna_partial.cores import core_count, in_order
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
@@ -77,9 +77,7 @@ def map_line_fractions(partial: PartialMap, starts: Floats, ends: Floats) -> Flo
     return line_fractions(partial.state, starts, ends, partial.alike_cells)
 
 
-def line_fractions(
-    state: NDArray[np.uint8], starts: Floats, ends: Floats, alike: NDArray[np.int32] | None = None
-) -> Floats:
+def line_fractions(state: States, starts: Floats, ends: Floats, alike: NDArray[np.int32] | None = None) -> Floats:
     """Return the fractions (N, 3), in [0, 1], of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
 
     All cells outside the grid are unknown. `alike` is what `alike_cells` returns of `state`, where it is at hand.
@@ -153,9 +151,7 @@ def leave_cells(
 
 
 @njit(cache=True, nogil=True)
-def _fill_fractions(
-    state: NDArray[np.uint8], alike: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats
-) -> None:
+def _fill_fractions(state: States, alike: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats) -> None:
     """Add the fractions of segments in cells of each state to `fractions` (N, 3), over alike cells at once."""
     ny, nx = state.shape
     for i in range(len(ends)):
@@ -194,7 +190,7 @@ def _first_line(position: float, step: float) -> int:
 
 
 @njit(cache=True)
-def _freest(state: NDArray[np.uint8], x: float, y: float) -> int:
+def _freest(state: States, x: float, y: float) -> int:
     """Return the state of the freest cell within 1e-6 cells of a point [cells]: FREE before UNKNOWN before WALL."""
     ny, nx = state.shape
     found = _WALL

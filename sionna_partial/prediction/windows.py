@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from sionna_partial.arrays import Floats, Indices
+from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.planar import grid_edges
@@ -100,7 +100,7 @@ def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx
     return np.round(255.0 * np.stack(layers, axis=-1)).astype(np.uint8)
 
 
-def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[NDArray[np.uint8], Floats]:
+def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[States, Floats]:
     """Extend or cut a map to what a window covers, and return where the transmitter is in it [cells]."""
     half = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
     start = in_cells(partial, tx_m)

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.planar import cross
@@ -139,13 +139,13 @@ def lattice_outlines(partial: PartialMap) -> Outlines:
     return _assembled(lines, partial.resolution_m)
 
 
-def _canonical(state: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], bool, tuple[bool, bool]]:
+def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
     """Turn or mirror a grid to its one orientation of the smallest bytes, so that the outlines turn with the map.
 
     Returns the grid, whether it was transposed, and whether columns and rows were flipped then.
     """
 
-    def turned(transpose: bool, flip_y: bool, flip_x: bool) -> NDArray[np.uint8]:
+    def turned(transpose: bool, flip_y: bool, flip_x: bool) -> States:
         grid = state.T if transpose else state
         return np.ascontiguousarray(grid[:: -1 if flip_y else 1, :: -1 if flip_x else 1])
 
@@ -386,7 +386,7 @@ def _assembled(lines: list[Points], cell_m: float) -> Outlines:
     return Outlines(vertices * cell_m, segments.astype(np.int64))
 
 
-def _extended(outlines: Outlines, state: NDArray[np.uint8]) -> Points:
+def _extended(outlines: Outlines, state: States) -> Points:
     """Vertices, with ends that UNKNOWN cells follow moved from the centre of the last cell to its border."""
     vertices, segments = outlines.vertices_m.copy(), outlines.segments
     ends, tails = segments.ravel(), segments[:, ::-1].ravel()

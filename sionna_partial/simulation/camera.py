@@ -4,9 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats, Indices
+from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.process import njit
@@ -31,9 +30,7 @@ class Camera:
     The map is `seen` (ny, nx). Positions are in cells, x along columns and y along rows.
     """
 
-    def __init__(
-        self, truth: NDArray[np.uint8], resolution_m: float, sensor: SensorSettings, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, truth: States, resolution_m: float, sensor: SensorSettings, rng: np.random.Generator) -> None:
         self._truth = np.ascontiguousarray(truth)
         rows, columns = ((np.arange(size) * resolution_m // MISSED_PATCH_M).astype(np.intp) for size in truth.shape)
         missed = rng.random((rows[-1] + 1, columns[-1] + 1)) < sensor.missed_wall_fraction
@@ -71,7 +68,7 @@ class Camera:
 
 
 def unknown_in_view(
-    state: NDArray[np.uint8], cell: Indices, headings_deg: Floats, cell_m: float, sensor: SensorSettings
+    state: States, cell: Indices, headings_deg: Floats, cell_m: float, sensor: SensorSettings
 ) -> list[Indices]:
     """Unknown cells (N, 2) that a picture taken in a cell would show if none of them were walls, for each heading."""
     reach = sensor.range_m / cell_m

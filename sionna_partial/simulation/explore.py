@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import Progress, are_stages, is_whole, require, require_choice, settings_or_default
 from sionna_partial.constants import CellState
 from sionna_partial.display import Pictured, later
@@ -66,7 +66,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     home: PartialMap
     sensor: SensorSettings
     steps: tuple[int, ...]
-    states: NDArray[np.uint8]
+    states: States
     poses: Floats
     believed_poses: Floats
 
@@ -223,7 +223,7 @@ def explore_trajectory(
     by_fraction = not all(map(is_whole, steps))
     best, last_progress = 0.0, 0
     reached: list[int] = []
-    states: list[NDArray[np.uint8]] = []
+    states: list[States] = []
     poses: list[Floats] = []
     with reporting(progress) as report:
         for step in itertools.count():

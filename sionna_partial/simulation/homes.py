@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from rasterio.features import rasterize
 from rasterio.transform import Affine
 from scipy import ndimage
@@ -21,7 +20,7 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
@@ -376,7 +375,7 @@ def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineSt
     return substring(wall, start, start + width)
 
 
-def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> NDArray[np.uint8]:
+def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> States:
     """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
     x0, y0, x1, y1 = shapely.total_bounds([plan.free, plan.shut])
     margin = _MARGIN_M + wall_cells * resolution_m

@@ -10,12 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.planar import grid_edges, largest_part
@@ -83,12 +82,7 @@ class Robot:
     """
 
     def __init__(
-        self,
-        truth: NDArray[np.uint8],
-        resolution_m: float,
-        seed: int,
-        sensor: SensorSettings,
-        choose: Choice | None = None,
+        self, truth: States, resolution_m: float, seed: int, sensor: SensorSettings, choose: Choice | None = None
     ) -> None:
         self._choose = choose
         self._rng, errors = np.random.default_rng(seed), np.random.default_rng((seed, 1))
@@ -112,7 +106,7 @@ class Robot:
         self._look()
 
     @property
-    def seen(self) -> NDArray[np.uint8]:
+    def seen(self) -> States:
         """The map (ny, nx)."""
         return self._camera.seen
 
@@ -244,7 +238,7 @@ def _fitting_radius(free: Bools, resolution_m: float) -> tuple[float, Bools]:
 
 
 def find_frontiers(
-    state: NDArray[np.uint8], start: tuple[int, int], cell_m: float, radius: float, tight: Bools, left_out: Bools
+    state: States, start: tuple[int, int], cell_m: float, radius: float, tight: Bools, left_out: Bools
 ) -> list[Frontier]:
     """Find the frontiers of a map (ny, nx) that a robot of some radius [cells] can reach.
 
@@ -281,7 +275,7 @@ def part_of(low: Sequence[int], high: Sequence[int]) -> tuple[slice, slice]:
     return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
-def _travel_cost(state: NDArray[np.uint8], cell_m: float, radius: float, tight: Bools) -> Floats:
+def _travel_cost(state: States, cell_m: float, radius: float, tight: Bools) -> Floats:
     """Cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
     distance = ndimage.distance_transform_edt(state != _WALL) - 0.5
     nearness = np.clip(1.0 - distance * cell_m / _COMFORT_M, 0.0, 1.0)

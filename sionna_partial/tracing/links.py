@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER
 from sionna_partial.display import Shown, later
@@ -63,7 +63,7 @@ class TracedLinks(Shown):
 
     tx: Floats
     rx: Floats
-    link_state: NDArray[np.uint8]
+    link_state: States
     gain_db: Floats
     path_tx: NDArray[np.int32]
     path_rx: NDArray[np.int32]

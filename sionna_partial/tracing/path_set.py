@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Shown
@@ -385,7 +385,7 @@ class GainGradients(Shown):
 
     tx: Floats
     rx: Floats
-    link_state: NDArray[np.uint8]
+    link_state: States
     gain_db: Floats
     tx_db_per_m: Floats
     relative_permittivity_db: Floats

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import Progress, no_progress, require_choice, settings_or_default
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
@@ -221,7 +221,7 @@ class Tracer:
 
     def fill(
         self, columns: PathColumns | PathFiles, tx_m: Floats, rx_m: Floats, report: Progress, valid: Bools | None = None
-    ) -> tuple[NDArray[np.uint8], Floats]:
+    ) -> tuple[States, Floats]:
         """Trace the same links into columns of paths; return their states and gains [dB], (N,) or (T, N)."""
         at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
         sources, count = tx_m.reshape(-1, 3), len(rx_m)
@@ -363,7 +363,7 @@ def path_gain_db(power: Floats) -> Floats:
         return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
 
 
-def link_summary(power: Floats, is_direct: Bools) -> tuple[NDArray[np.uint8], Floats]:
+def link_summary(power: Floats, is_direct: Bools) -> tuple[States, Floats]:
     """Link state and path gain [dB] of links, from the sum of |a|^2 and whether one path has no interaction."""
     gain_db = path_gain_db(power)
     link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
@@ -445,7 +445,7 @@ def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) 
     )
 
 
-def listed_before(interactions: NDArray[np.uint8], vertices_m: NDArray[np.floating[Any]]) -> Bools:
+def listed_before(interactions: States, vertices_m: NDArray[np.floating[Any]]) -> Bools:
     """Find the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
 
     Sionna RT identifies sequences by hashes of rounded planes, and rounding can give one plane two hashes. Paths with

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -110,7 +110,7 @@ def narrow_areas(free: Bools, resolution_m: float) -> Bools:
     return narrow
 
 
-def _rims(state: NDArray[np.uint8], resolution_m: float) -> Bools:
+def _rims(state: States, resolution_m: float) -> Bools:
     """Find the cells (ny, nx) of narrow free areas beside unknown cells."""
     free = state == CellState.FREE
     unknown = np.pad(state == CellState.UNKNOWN, 1)
