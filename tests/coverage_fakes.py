@@ -1,7 +1,6 @@
 """A tracer and a predictor that answer at once, for tests of what is made of their answers."""
 
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,9 +57,7 @@ def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float
 class FakeTracer:
     """Finds no paths, and says so."""
 
-    def __init__(
-        self, partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings
-    ) -> None:
+    def __init__(self, partial: PartialMap, settings: TraceSettings, scene_settings: SceneSettings) -> None:
         pass
 
     def paths(
