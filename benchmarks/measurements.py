@@ -18,7 +18,7 @@ one transmitter in each home, the coverage averaged over the posterior is compar
 
 import argparse
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def main() -> None:
     parser.add_argument("maps", nargs="*", type=Path, help="complete maps")
     parser.add_argument("--made", type=int, default=0, help="number of procedural homes")
     parser.add_argument("--step", type=int, default=200, help="steps that the robot has explored")
-    parser.add_argument("--transmitters", type=int, default=4)
+    parser.add_argument("--transmitters", type=int, default=12, help="in each home")
     parser.add_argument("--unknown", action="store_true", help="find the position of the transmitter")
     arguments = parser.parse_args()
     homes = [(path.parent.name, sp.load_map(path)) for path in arguments.maps]
@@ -88,9 +88,8 @@ def home_links(home: sp.PartialMap, step: int, count: int, seed: int) -> dict[tu
     links: dict[tuple[str, ...], list[Links]] = defaultdict(list)
     anywhere_m, rx_m = (points(home, partial, number, rng) for number in (max(WAY["anywhere indoors"]), 200))
     for tx_m in points(home, partial, count, rng):
-        receivers = places(home, partial, tx_m, rx_m)
-        where = {"on the way": places(home, partial, tx_m, way_m)}
-        where["anywhere indoors"] = places(home, partial, tx_m, anywhere_m)
+        receivers, *measured = places(home, partial, tx_m, (rx_m, way_m, anywhere_m))
+        where = dict(zip(WAY, measured, strict=True))
         seen = bool(partial.state_at(tx_m[None])[0] == sp.CellState.FREE)
         rx_seen = partial.state_at(receivers.rx_m) == sp.CellState.FREE
         every = np.ones_like(rx_seen)
@@ -120,14 +119,25 @@ def points(home: sp.PartialMap, partial: sp.PartialMap, count: int, rng: np.rand
     return points_m[clear_of_walls(home, points_m) & clear_of_walls(partial, points_m)][:count]
 
 
-def places(home: sp.PartialMap, partial: sp.PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> Places:
-    """Trace the links of a transmitter on the home and on the partial map, and predict them."""
-    rx_m = rx_m[np.linalg.norm(rx_m - tx_m, axis=1) > NEAREST_M]
+def places(
+    home: sp.PartialMap, partial: sp.PartialMap, tx_m: NDArray[np.float64], parts: Sequence[NDArray[np.float64]]
+) -> list[Places]:
+    """Trace the links of a transmitter to groups of receivers on the home and on the partial map, and predict them."""
+    parts = [rx_m[np.linalg.norm(rx_m - tx_m, axis=1) > NEAREST_M] for rx_m in parts]
+    rx_m = np.concatenate(parts)
     truth = sp.trace_links(home, tx_m, rx_m)
     phi = sp.link_features(partial, sp.trace_links(partial, tx_m, rx_m))
     distance = Baselines.load(PREDICTORS_FOLDER).distance
-    by_distance = distance.predict(nothing_seen(phi, distance.settings.frequency_hz))
-    return Places(rx_m, truth.link_state, truth.gain_db, sp.Predictor.load().predict(phi), by_distance)
+    predicted = sp.Predictor.load().predict(phi), distance.predict(nothing_seen(phi, distance.settings.frequency_hz))
+    found, last = [], 0
+    for part in parts:
+        mask = np.zeros(len(rx_m), dtype=bool)
+        mask[last : last + len(part)] = True
+        last += len(part)
+        found.append(
+            Places(part, truth.link_state[mask], truth.gain_db[mask], *(each.take(mask) for each in predicted))
+        )
+    return found
 
 
 def predictions(

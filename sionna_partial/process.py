@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -128,19 +129,40 @@ def _locked(folder: Path, *, must: bool = False) -> Iterator[None]:
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return numba's decorator; code is cached where that can be, at last in a temporary folder."""
-    from numba import config
-    from numba import njit as compiled
+    import numba
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:
-            return compiled(**options)(function)
+            compiled = numba.njit(**options)(function)
         except RuntimeError:  # neither the package nor the home folder can be written
-            config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = _private_folder()
-        with suppress(RuntimeError):
-            return compiled(**options)(function)
-        return compiled(**(options | {"cache": False}))(function)
+            numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = _private_folder()
+            with suppress(RuntimeError):
+                return _outdated_by_others(numba.njit(**options)(function))
+            return numba.njit(**(options | {"cache": False}))(function)
+        return _outdated_by_others(compiled)
 
     return decorate
+
+
+def _outdated_by_others(compiled: Any) -> Any:
+    """Let cached code be of no use after a change of any compiled module: numba looks at the function's own alone.
+
+    It would call what other modules have been, and fail where a type that it takes has moved.
+    """
+    with suppress(AttributeError):
+        compiled._cache._cache_file._version += f" {_compiled_sources()}"
+    return compiled
+
+
+@cache
+def _compiled_sources() -> str:
+    """Hash of all modules of this package that have compiled functions."""
+    package, total = Path(__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        source = path.read_bytes()
+        if b"njit" in source:
+            total.update(str(path.relative_to(package)).encode() + source)
+    return total.hexdigest()
 
 
 def _private_folder() -> str:

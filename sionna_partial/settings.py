@@ -175,8 +175,8 @@ class TraceSettings(Checked):
     open_ends : bool
         Whether a wall of a floor plan diffracts also where it ends because observation did.
     power_tolerance_db : float
-        By how much the power of a link's indirect paths may be changed by leaving out weak paths of a floor plan [dB],
-        0 to 1; 0 keeps every path. Bounds of the power of all candidates, before any is verified, guarantee it.
+        By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
+        every path. Bounds of the power of all candidates, before any is verified, guarantee it.
     refraction, diffuse_reflection : bool
         Further interactions. With either of them, every path is found by shooting rays (Sionna RT's own candidate
         generator), which is slower than exact beams.

@@ -10,8 +10,8 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
+from sionna_partial.tracing.bounds import Strengths, strengths_of
 from sionna_partial.tracing.candidates import Candidates, Wedges
-from sionna_partial.tracing.plan.bounds import Strengths, strengths_of
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
@@ -185,7 +185,7 @@ def everything(receivers: int) -> Strengths:
     """Ask for all candidates of so many receivers, in drywall at 28 GHz."""
     material = Material()
     constants = np.array([material.relative_permittivity, material.conductivity_s_m, material.thickness_m])
-    return strengths_of(constants, 28e9, receivers)
+    return strengths_of([constants], 28e9, receivers)
 
 
 def specular_blocks(

@@ -6,7 +6,7 @@ from extruded import ROOM, SPLINTERS, drawn, extrude
 
 import sionna_partial as sp
 from sionna_partial.constants import LinkState
-from sionna_partial.tracing.plan.bounds import LEVELS, dropped_power, level_of, levels_needed, strengths_of, utd_terms
+from sionna_partial.tracing.bounds import LEVELS, dropped_power, level_of, levels_needed, strengths_of, utd_terms
 from sionna_partial.tracing.slab import reflection_coefficients
 
 DRYWALL = np.array([2.94, 0.1226, 0.1])
@@ -20,14 +20,14 @@ def _indirect_power(links: sp.TracedLinks) -> np.ndarray:
 class TestReflection:
     def test_no_angle_reflects_more_than_its_bound(self) -> None:
         cosine = np.random.default_rng(0).uniform(0.0, 1.0, 20_000)
-        table = strengths_of(DRYWALL, 28e9, 1).reflection
+        table = strengths_of([DRYWALL], 28e9, 1).reflection[0]
         bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
         for coefficient in reflection_coefficients(*DRYWALL, 28e9, cosine):
             assert (np.abs(coefficient) ** 2 <= bound).all()
 
     def test_it_is_not_far_above(self) -> None:
         cosine = np.linspace(0.0, 1.0, 1000)
-        table = strengths_of(DRYWALL, 28e9, 1).reflection
+        table = strengths_of([DRYWALL], 28e9, 1).reflection[0]
         bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
         largest = np.max([np.abs(each) for each in reflection_coefficients(*DRYWALL, 28e9, cosine)], axis=0) ** 2
         assert np.median(bound / np.maximum(largest, 1e-9)) < 1.1

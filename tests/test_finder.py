@@ -53,6 +53,32 @@ def test_a_plan_traced_as_a_mesh_has_the_same_paths(tmp_path: Path) -> None:
         np.testing.assert_allclose(_delays(scan, index), _delays(exact, index), atol=1e-12)
 
 
+@pytest.mark.parametrize("tolerance_db", [0.02, 0.1, 0.5])
+def test_weak_paths_of_a_mesh_are_left_out_within_the_tolerance(tmp_path: Path, tolerance_db: float) -> None:
+    scan = _as_mesh(_plan(), tmp_path).mesh
+    assert scan is not None
+    high = scan.vertices_m[scan.triangles][:, :, 2].min(axis=1) > 2.0
+    metal, glass = sp.Material(itu="metal"), sp.Material(itu="glass")
+    parts = SceneMesh(scan.vertices_m, scan.triangles, high.astype(int), (glass, metal))
+    partial = mesh_map(parts, MeshReading(resolution_m=0.1))
+    rx = np.concatenate([RX, RX * [1.0, 1.0, 0.3]])
+    every, some = (
+        sp.trace_links(
+            partial, TX, rx, trace_settings=sp.TraceSettings(power_tolerance_db=each, samples_per_tx=100_000)
+        )
+        for each in (0.0, tolerance_db)
+    )
+    assert len(some.a) < 0.8 * len(every.a)
+    np.testing.assert_array_equal(some.link_state, every.link_state)
+    indirect_db = [
+        10 * np.log10(np.bincount(each.path_rx, np.abs(each.a) ** 2 * (each.interactions > 0).any(axis=1)))
+        for each in (every, some)
+    ]
+    lost_db = indirect_db[0] - indirect_db[1]
+    assert (lost_db >= -1e-6).all()
+    assert lost_db.max() <= tolerance_db
+
+
 def test_a_mesh_far_away_has_the_same_paths() -> None:
     mesh, far = scene_mesh(*room().geometry.values()), np.array([5e5, 4.5e6, 0.0])
     there = SceneMesh(mesh.vertices_m + far, mesh.triangles, mesh.material)

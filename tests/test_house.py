@@ -31,8 +31,8 @@ ROOMS = {
     "simulation": ("furniture", "buildings", "homes", "camera", "robot", "explore"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
-        *("candidates", "paths", "links", "engine", "slab"),
-        *("plan.bounds", "plan.beams", "plan.specular", "plan.diffraction"),
+        *("candidates", "paths", "links", "engine", "slab", "bounds"),
+        *("plan.beams", "plan.specular", "plan.diffraction"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "trace"),
         "path_set",
         "antennas",

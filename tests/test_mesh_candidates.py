@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from extruded import everything
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 from numpy.typing import NDArray
 
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.mesh.candidates import mesh_candidates
+from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 
 SIZE = np.array([8.0, 6.0, 3.0])
@@ -30,10 +31,11 @@ def candidates_of(
     **options: int,
 ) -> Candidates:
     shot = shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), tx, rays, depth)
-    parts = list(mesh_candidates(*joined(*meshes), shot, tx, rx, max_depth=depth, **options))
+    mesh = *joined(*meshes), np.zeros(sum(len(each.faces) for each in meshes), np.int64)
+    parts = list(MeshCandidates(*mesh, shot, tx, rx, depth).blocks(everything(len(rx)), **options))
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
-    assert shares[-1] == 1.0
+    assert depth == 0 or shares[-1] == 1.0
     return Candidates.concatenate([part for part, _ in parts])
 
 
@@ -93,17 +95,11 @@ class TestBox:
             np.testing.assert_allclose(lengths, image_distances_m(RX[k], 4), atol=1e-5)
 
     def test_no_reflection_is_line_of_sight(self, tmp_path: Path) -> None:
-        box = [trimesh.creation.box(SIZE)]
-        scene = load_meshes(tmp_path, *box)
-        parts = list(
-            mesh_candidates(
-                *joined(*box), shoot_rays(scene.mi_scene, shapes_of(scene, 1), TX, 100, 0), TX, RX, max_depth=0
-            )
-        )
-        assert len(parts) == 1
-        assert parts[0][0].rx.tolist() == list(range(len(RX)))
-        assert (parts[0][0].face == -1).all()
-        assert parts[0][0].face.shape == (len(RX), 1)
+        box = trimesh.creation.box(SIZE)
+        found = candidates_of(load_meshes(tmp_path, box), [box], TX, RX, depth=0, rays=100)
+        assert found.rx.tolist() == list(range(len(RX)))
+        assert (found.face == -1).all()
+        assert found.face.shape == (len(RX), 1)
 
 
 class TestRoom:
@@ -158,7 +154,7 @@ class TestRoom:
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
         whole, parts = (
             candidates_of(scene, room(), TX, RX),
-            candidates_of(scene, room(), TX, RX, candidates_per_block=50),
+            candidates_of(scene, room(), TX, RX, receivers_per_block=50),
         )
         for name in ("rx", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
@@ -182,8 +178,5 @@ class TestOpenMesh:
         assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
 
     def test_without_rays_there_is_line_of_sight(self) -> None:
-        parts = list(mesh_candidates(*joined(self.TRIANGLE), [], TX, RX, max_depth=2))
-        assert [part.rx.tolist() for part, _ in parts] == [list(range(len(RX)))]
-
-    def test_no_receivers(self) -> None:
-        assert list(mesh_candidates(*joined(self.TRIANGLE), [], TX, np.zeros((0, 3)), max_depth=2)) == []
+        kind = MeshCandidates(*joined(self.TRIANGLE), np.zeros(1, np.int64), [], TX, RX, 2)
+        assert [part.rx.tolist() for part, _ in kind.blocks(everything(len(RX)))] == [list(range(len(RX)))]

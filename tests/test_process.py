@@ -2,12 +2,14 @@
 
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numba
 import pytest
 
 from sionna_partial import llvm
@@ -123,3 +125,18 @@ def test_compiled_code_is_cached_where_that_can_be(tmp_path: Path, monkeypatch: 
     exec(code, names)
     assert njit(cache=True)(names["half"])(3.0) == 1.5
     assert not config.CACHE_DIR or Path(config.CACHE_DIR).parent == tmp_path
+
+
+def test_cached_code_of_another_version_of_the_package_is_not_used(tmp_path: Path) -> None:
+    """Its index may name types that have moved, and its code what other modules have been."""
+    script = tmp_path / "half.py"
+    script.write_text(
+        "from sionna_partial.process import njit\n\n\n"
+        "@njit(cache=True)\ndef half(x):\n    return x / 2\n\n\nprint(half(3.0), half.stats.cache_hits)\n"
+    )
+    run = [sys.executable, str(script)]
+    outputs = [subprocess.run(run, check=True, capture_output=True, text=True).stdout for _ in range(2)]
+    (index,) = (tmp_path / "__pycache__").glob("*.nbi")
+    index.write_bytes(pickle.dumps(numba.__version__) + b"cpackage_that_is_gone\nThing\n.")
+    outputs += [subprocess.run(run, check=True, capture_output=True, text=True).stdout for _ in range(2)]
+    assert outputs == ["1.5 Counter()\n", "1.5 Counter({(float64,): 1})\n"] * 2

@@ -239,6 +239,10 @@ class SceneSolver:
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
         self.shapes = [shape.mi_mesh for shape in objects]
         faces = [mesh.face_count() for mesh in self.shapes]
+        names = [*self._scene.radio_materials]
+        self.material_of_face = np.repeat(
+            np.array([names.index(shape.radio_material.name) for shape in objects], np.int64), faces
+        )
         shape = np.repeat(np.array([shape.object_id for shape in objects], np.uint32), faces)
         self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last stands for no face, -1
         primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)

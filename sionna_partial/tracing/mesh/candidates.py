@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
+from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.planes import face_at, group_planes
 from sionna_partial.tracing.mesh.sequences import Rays, collect_sequences, view_sequences
@@ -57,33 +58,53 @@ class _Found(NamedTuple):
     points: NDArray[np.float64]
 
 
-def mesh_candidates(
-    vertices_m: NDArray[np.float64],
-    triangles: NDArray[np.int64],
-    rays: Iterable[Rays],
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    *,
-    max_depth: int,
-    candidates_per_block: int = 200_000,
-) -> Iterator[tuple[Candidates, float]]:
-    """Yield the paths that can exist, and the fraction of the work done: direct paths, then sequence after sequence.
+class MeshCandidates:
+    """All paths by the sequences of planes that rays have met, between a transmitter (3,) and receivers (N, 3).
 
-    `rays` come from `shoot_rays`, with the same transmitter (3,) and `max_depth`, and count the faces like `triangles`.
+    The mesh has vertices (V, 3) [m] and triangles (F, 3), each of one of the materials of the bounds (F,). `rays` come
+    from `shoot_rays`, with the same transmitter and `max_depth`, and count the faces like `triangles`.
     """
-    if len(rx_m) == 0:
-        return
-    size = max(1, max_depth)
-    direct = np.arange(len(rx_m), dtype=np.int32)
-    yield Candidates(direct, np.full((len(rx_m), size), -1, np.int32), np.zeros((len(rx_m), size, 3))), 0.0
-    planes = group_planes(vertices_m, triangles)
-    sequences = collect_sequences(rays, planes)
-    views = view_sequences(sequences, planes, np.asarray(tx_m, np.float64))
-    rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
-    boxes, done = _divide(rx_m), 0
-    while done < sequences.size:
-        *columns, done = _next_block(done, sequences, views, planes, boxes, rx_m, size, candidates_per_block)
-        yield Candidates(*columns), done / sequences.size
+
+    def __init__(
+        self,
+        vertices_m: NDArray[np.float64],
+        triangles: NDArray[np.int64],
+        material: NDArray[np.int64],
+        rays: Iterable[Rays],
+        tx_m: NDArray[np.float64],
+        rx_m: NDArray[np.float64],
+        max_depth: int,
+    ) -> None:
+        self._material, self._size = material, max(1, max_depth)
+        self._planes = group_planes(vertices_m, triangles)
+        self._sequences = collect_sequences(rays, self._planes)
+        self._views = view_sequences(self._sequences, self._planes, np.asarray(tx_m, np.float64))
+        self._rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
+        self._boxes = _divide(self._rx_m)
+        self._best = np.zeros(self._sequences.size, np.uint8)  # level of the strongest candidate of each sequence
+
+    def blocks(
+        self, strengths: Strengths, *, receivers_per_block: int = 1_000_000
+    ) -> Iterator[tuple[Candidates, float]]:
+        """Yield the candidates that are asked for, and the fraction of the work done; add up the bounds of all.
+
+        Direct paths come first, then sequence after sequence.
+        """
+        direct = np.flatnonzero((strengths.first == 0) & (strengths.last > 0)).astype(np.int32)
+        face, points = np.full((len(direct), self._size), -1, np.int32), np.zeros((len(direct), self._size, 3))
+        yield Candidates(direct, face, points), 0.0
+        count, done = len(self._best), 0
+        while done < count:
+            *columns, done = _next_block(
+                done,
+                (self._sequences, self._views, self._planes, self._boxes, self._material),
+                self._rx_m,
+                self._size,
+                strengths,
+                self._best,
+                receivers_per_block,
+            )
+            yield Candidates(*columns), done / count
 
 
 @njit(cache=True)
@@ -112,13 +133,21 @@ def _divide(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_block(first, sequences, views, planes, boxes, rx_m, depth, block):  # type: ignore[no-untyped-def]
-    """Candidates of the sequences from number `first` in the order on, until a block is full; and where to go on."""
+def _next_block(first, mesh, rx_m, depth, strengths, best, block):  # type: ignore[no-untyped-def]
+    """Candidates of the sequences from number `first` in the order on, and where to go on.
+
+    A block ends once the sequences in it have been in view of `block` receivers in sum.
+    """
+    sequences, views, planes, boxes, material = mesh
     out = _Found(np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3)))
     seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
-    count, done = 0, first
-    while done < len(views.order) and count < block:
+    count, in_view, done, weakest = 0, 0, first, strengths.last.max()
+    while done < len(views.order) and in_view < block:
         node = views.order[done]
+        done += 1
+        if best[node] >= weakest:
+            continue
+        best[node] = LEVELS
         reach = _REACH * sequences.reach_m[node] + _REACH_M
         view = _View(views.source_m[node], sequences.low[node], sequences.high[node], views.margin[node], reach)
         _bound_view(view, _farthest(view.source, boxes), planes, sequences.plane[node], bounds)
@@ -126,8 +155,9 @@ def _next_block(first, sequences, views, planes, boxes, rx_m, depth, block):  # 
         if number > 0:
             size = count + number
             out = _Found(grow(out.rx, size), grow(out.face, size), grow(out.points, size))
-            count = _fold(node, seen[:number], sequences, views, planes, rx_m, out, count)
-        done += 1
+            ends = seen[:number]
+            count = _fold(node, ends, sequences, views, planes, material, rx_m, strengths, best, out, count)
+            in_view += number
     return out.rx[:count].copy(), out.face[:count].copy(), out.points[:count].copy(), done
 
 
@@ -213,7 +243,7 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fold(node, found, sequences, views, planes, rx_m, out, count):  # type: ignore[no-untyped-def]
+def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best, out, count):  # type: ignore[no-untyped-def]
     """Append the candidates among the receivers found for a sequence, and return the new number of candidates.
 
     The line from the image to a candidate, folded back at every plane of the sequence, meets a face of each.
@@ -223,11 +253,14 @@ def _fold(node, found, sequences, views, planes, rx_m, out, count):  # type: ign
     rx, face, points = out
     for target in found:
         x, y, z = rx_m[target, 0], rx_m[target, 1], rx_m[target, 2]
-        at, k = node, depth - 1
+        at, k, power = node, depth - 1, 1.0
         while k >= 0:
             p = plane[at]
             nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
             sx, sy, sz = sources[at, 0], sources[at, 1], sources[at, 2]
+            length = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (z - sz) ** 2)
+            if k == depth - 1:
+                power = (strengths.wavelength_m / (4.0 * np.pi * length)) ** 2
             behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
             if behind * before >= 0.0:
                 break
@@ -237,8 +270,16 @@ def _fold(node, found, sequences, views, planes, rx_m, out, count):  # type: ign
             face[count, k] = face_at(bins, p, x, y, z)
             if face[count, k] < 0:
                 break
+            power *= reflected_power(strengths.reflection[material[face[count, k]]], (behind - before) / length)
             at, k = parent[at], k - 1
         if k < 0:
+            level = level_of(power)
+            best[node] = min(best[node], level)
+            if len(strengths.power):
+                strengths.power[target, level] += power
+                strengths.reflected[target] += power
+            if not strengths.first[target] <= level < strengths.last[target]:
+                continue
             rx[count] = target
             face[count, depth:] = -1
             points[count, depth:] = 0.0

@@ -16,9 +16,9 @@ from sionna_partial.cores import in_order
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power, utd_terms
 from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
-from sionna_partial.tracing.plan.bounds import LEVELS, Strengths, level_of, reflected_power, utd_terms
 from sionna_partial.tracing.plan.specular import (
     CEILING,
     DIFFRACTED,
@@ -251,9 +251,9 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
                     power = _diffracted_power(strengths, terms, flat, length, onward, height, bounces)
                     sine = (length + onward) / np.hypot(length + onward, height)
                     for k in range(before):
-                        power *= reflected_power(strengths, arrivals.cosine[j, k] * sine)
+                        power *= reflected_power(strengths.reflection[0], arrivals.cosine[j, k] * sine)
                     for k in range(after):
-                        power *= reflected_power(strengths, cosine[k] * sine)
+                        power *= reflected_power(strengths.reflection[0], cosine[k] * sine)
                     level = level_of(power)
                     if len(strengths.power):
                         strengths.power[here, level] += power
@@ -293,13 +293,13 @@ def _diffracted_power(strengths, terms, flat, length, onward, height, bounces): 
     """Upper bound of the power over an edge, without the reflections at walls."""
     total = np.hypot(length + onward, height)
     sine = (length + onward) / total
-    first = np.sqrt(reflected_power(strengths, flat[0] * sine))
-    last = 1.0 if flat[1] > 1.0 else np.sqrt(reflected_power(strengths, flat[1] * sine))
+    first = np.sqrt(reflected_power(strengths.reflection[0], flat[0] * sine))
+    last = 1.0 if flat[1] > 1.0 else np.sqrt(reflected_power(strengths.reflection[0], flat[1] * sine))
     field = (first * (terms[0] + terms[3]) + last * (terms[1] + terms[2])) / sine
     wavelength = strengths.wavelength_m
     spread = sine * sine / (length * onward * total)  # 1 / (s s' (s + s'))
     power = (wavelength / (4.0 * np.pi)) ** 2 * spread * field**2 * wavelength / (4.0 * np.pi**2)
-    return power * reflected_power(strengths, height / total) ** bounces if bounces > 0 else power
+    return power * reflected_power(strengths.reflection[0], height / total) ** bounces if bounces > 0 else power
 
 
 @njit(cache=True)

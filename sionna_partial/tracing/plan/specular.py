@@ -14,9 +14,9 @@ from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power
 from sionna_partial.tracing.candidates import EDGE, Candidates
 from sionna_partial.tracing.plan.beams import trace_beams
-from sionna_partial.tracing.plan.bounds import LEVELS, Strengths, level_of, reflected_power
 
 FLOOR, CEILING, DIFFRACTED = -2, -3, -4
 """Stand for a wall segment where a path meets the floor, the ceiling or a vertical edge."""
@@ -156,9 +156,9 @@ def _specular_power(strengths, cosine, length, height, bounces):  # type: ignore
     total = np.hypot(length, height)
     power = (strengths.wavelength_m / (4.0 * np.pi * total)) ** 2
     for k in range(len(cosine)):
-        power *= reflected_power(strengths, cosine[k] * length / total)
+        power *= reflected_power(strengths.reflection[0], cosine[k] * length / total)
     if bounces > 0:
-        power *= reflected_power(strengths, height / total) ** bounces
+        power *= reflected_power(strengths.reflection[0], height / total) ** bounces
     return power
 
 

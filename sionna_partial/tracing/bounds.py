@@ -6,6 +6,7 @@ diffraction give if they all add up. Both are known before Sionna RT verifies a 
 """
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,8 @@ _DIFFRACTED_FRACTION = 0.5
 class Strengths(NamedTuple):
     """Upper bounds of interactions, and the levels of the candidates that are asked for.
 
-    `reflection` (K,) is the largest |R|^2 where the cosine of the angle of incidence is k / K to (k + 1) / K.
+    `reflection` (M, K) is the largest |R|^2 of each material where the cosine of the angle of incidence is k / K to
+    (k + 1) / K.
     Candidates of each receiver are written whose level is at least `first` (N,) and below `last` (N,). The bounds of
     all candidates are added to `power` (N, LEVELS), those of paths that are reflected at walls alone to `reflected`.
     """
@@ -40,16 +42,18 @@ class Strengths(NamedTuple):
     reflected: NDArray[np.float64]
 
 
-def strengths_of(material: NDArray[np.float64], frequency_hz: float, receivers: int) -> Strengths:
-    """Prepare the bounds for one material, (3,) permittivity, conductivity and thickness, asking for all candidates."""
+def strengths_of(materials: Iterable[NDArray[np.float64]], frequency_hz: float, receivers: int) -> Strengths:
+    """Prepare bounds for materials, each permittivity, conductivity and thickness (3,), and ask for all candidates."""
     cosine = np.linspace(0.0, 1.0, 8 * _ANGLES + 1)
-    permittivity, conductivity_s_m, thickness_m = material.tolist()
-    te, tm = reflection_coefficients(permittivity, conductivity_s_m, thickness_m, frequency_hz, cosine)
-    largest = np.maximum(np.abs(te), np.abs(tm)) ** 2
-    ends = np.maximum(largest[:-1], largest[1:]).reshape(_ANGLES, 8).max(axis=1)
+    reflection = []
+    for permittivity, conductivity_s_m, thickness_m in materials:
+        te, tm = reflection_coefficients(permittivity, conductivity_s_m, thickness_m, frequency_hz, cosine)
+        largest = np.maximum(np.abs(te), np.abs(tm)) ** 2
+        ends = np.maximum(largest[:-1], largest[1:]).reshape(_ANGLES, 8).max(axis=1)
+        reflection.append(np.minimum(_MARGIN * ends, 1.0))
     return Strengths(
         SPEED_OF_LIGHT_M_S / frequency_hz,
-        np.minimum(_MARGIN * ends, 1.0),
+        np.reshape(reflection, (-1, _ANGLES)),
         np.zeros(receivers, np.int64),
         np.full(receivers, LEVELS, np.int64),
         np.zeros((receivers, LEVELS)),
@@ -87,9 +91,9 @@ def level_of(power):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def reflected_power(strengths, cosine):  # type: ignore[no-untyped-def]
-    """Largest part of the power that a reflection leaves."""
-    return strengths.reflection[min(int(abs(cosine) * _ANGLES), _ANGLES - 1)]
+def reflected_power(reflection, cosine):  # type: ignore[no-untyped-def]
+    """Largest fraction of the power that a reflection by one of the materials leaves."""
+    return reflection[min(int(abs(cosine) * _ANGLES), _ANGLES - 1)]
 
 
 @njit(cache=True)
