@@ -318,7 +318,7 @@ class DifferentiableLinks:
         columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
         outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)
         free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops)
-        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi).possible)
+        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi))
 
     def _maps(self, tx_m: Any) -> list[Any]:
         """Return the outputs (1, ...) of the map networks around the transmitter: linear around where it was."""

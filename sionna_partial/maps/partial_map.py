@@ -13,7 +13,7 @@ from scipy import ndimage
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import is_whole, number_of, real_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
-from sionna_partial.display import Pictured
+from sionna_partial.display import Pictured, later
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.settings import Material
@@ -135,6 +135,11 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         out of a larger one. A map without free cells is not complete.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
+
+    @cached_property
+    def wall_noise(self) -> float:
+        """How much range noise thickened and roughened the walls, 0 (exact) to 1."""
+        return float(later("scene.wall_cells:wall_cells")(self).noise)
 
     @cached_property
     def alike_cells(self) -> NDArray[np.int32]:

@@ -56,6 +56,8 @@ class LinkContext(Shown):
         Whether the map is complete, and one of the ends is in an observed cell: then the trace is the truth.
     walled_m : (N,) float64 array
         Length of the direct line in cells of known walls [m]: outlines of walls may leave them open.
+    wall_noise : (N,) float64 array
+        How much range noise thickened and roughened the walls of the map, 0 (exact) to 1.
     possible : (N, 3) bool array
         Whether the map leaves each LinkState possible; at least one is.
     indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
@@ -75,6 +77,7 @@ class LinkContext(Shown):
     rx_seen: Bools
     complete: Bools
     walled_m: Floats
+    wall_noise: Floats
     possible: Bools
     indirect_gain_db: Floats
     strongest_unobserved_m: Floats
@@ -104,16 +107,17 @@ class LinkContext(Shown):
         """
         count = len(map_index)
         tx_seen, rx_seen, complete = (np.zeros(count, dtype=bool) for _ in range(3))
-        walled_m, possible = np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
+        walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
         for number in np.unique(map_index):
             here, partial = map_index == number, maps[number]
             ends = tx_m[here], rx_m[here]
             tx_seen[here], rx_seen[here] = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in ends)
             complete[here] = is_enclosed(partial, *ends)
             walled_m[here] = walled_lengths_m(partial, *ends)
+            wall_noise[here] = 0.0 if complete[here].all() else partial.wall_noise
             seen, walled = unobserved_distance_m[here] == 0.0, walled_m[here] > 0.0
             possible[here] = _possible_states(partial, ends, link_state[here], seen, walled)
-        found = (tx_seen, rx_seen, complete, walled_m, possible)
+        found = (tx_seen, rx_seen, complete, walled_m, wall_noise, possible)
         _, window_index = transmitters(map_index, tx_m)
         return cls(tx_m, rx_m, *found, indirect_gain_db, strongest_unobserved_m, window_index)
 

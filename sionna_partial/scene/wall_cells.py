@@ -43,7 +43,7 @@ class CleanWalls(NamedTuple):
     noise: float
 
 
-def wall_cells(partial: PartialMap, bridge_gap_m: float) -> CleanWalls:
+def wall_cells(partial: PartialMap, bridge_gap_m: float = 0.5) -> CleanWalls:
     """Clean the wall cells of a map.
 
     Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
