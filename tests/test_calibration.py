@@ -142,10 +142,7 @@ class TestWhatCannotBeDetermined:
     @pytest.mark.parametrize(
         ("cell", "message"),
         [
-            (
-                sp.CellState.FREE,
-                "the 20 usable links of measurements have no reflection that shows a material: ",
-            ),
+            (sp.CellState.FREE, "the 20 usable links of measurements have no reflection that shows a material: "),
             (sp.CellState.UNKNOWN, "the map has no walls, floor or ceiling that shows a material: measure links that"),
         ],
     )

@@ -95,11 +95,8 @@ class TestBox:
     def test_no_reflection_is_line_of_sight(self, tmp_path: Path) -> None:
         box = [trimesh.creation.box(SIZE)]
         scene = load_meshes(tmp_path, *box)
-        parts = list(
-            mesh_candidates(
-                *joined(*box), shoot_rays(scene.mi_scene, shapes_of(scene, 1), TX, 100, 0), TX, RX, max_depth=0
-            )
-        )
+        rays = shoot_rays(scene.mi_scene, shapes_of(scene, 1), TX, 100, 0)
+        parts = list(mesh_candidates(*joined(*box), rays, TX, RX, max_depth=0))
         assert len(parts) == 1
         assert parts[0][0].rx.tolist() == list(range(len(RX)))
         assert (parts[0][0].face == -1).all()
@@ -156,10 +153,8 @@ class TestRoom:
             assert whole.vertices_m[kept].tobytes() == alone.vertices_m.tobytes()
 
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
-        whole, parts = (
-            candidates_of(scene, room(), TX, RX),
-            candidates_of(scene, room(), TX, RX, candidates_per_block=50),
-        )
+        whole = candidates_of(scene, room(), TX, RX)
+        parts = candidates_of(scene, room(), TX, RX, candidates_per_block=50)
         for name in ("rx", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 

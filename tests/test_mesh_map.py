@@ -166,24 +166,15 @@ class TestKnown:
     [
         ({"up": "x"}, 'up = \'x\' is not allowed: choose "z" or "y".'),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
-        (
-            {"height_band_m": (2, 1)},
-            "height_band_m = (2, 1) is not allowed: give (low, high), z in metres, low < high.",
-        ),
+        ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high), z in metres, low <"),
         ({"height_band_m": 2}, "height_band_m = 2 is not allowed: give (low, high), z in metres"),
         ({"height_band_m": (0, np.inf)}, "height_band_m = (0, inf) is not allowed"),
-        (
-            {"observed": "all"},
-            "observed = 'all' is not numeric: give the corners (M, 2) of a polygon without crossings",
-        ),
+        ({"observed": "all"}, "observed = 'all' is not numeric: give the corners (M, 2) of a polygon without"),
         ({"observed": [(0, 0), (1, 1)]}, "observed has shape (2, 2) or values that are not finite: give the corners"),
         ({"observed": [(0, 0), (1, 1), (np.nan, 1)]}, "observed has shape (3, 2) or values that are not finite"),
         ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "observed is no polygon (Self-intersection"),
         ({"observed": [(0, 0), (1, 1), (2, 2)]}, "observed is no polygon ("),
-        (
-            {"observed": [(9, 9), (10, 9), (9, 10)]},
-            "observed holds no cell of the map, which spans x -0.05 to 5.1 m and",
-        ),
+        ({"observed": [(9, 9), (10, 9), (9, 10)]}, "observed holds no cell of the map, which spans x -0.05 to 5.1 m"),
     ],
 )
 def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
