@@ -93,13 +93,7 @@ def _clear_m(walls: Floats, number: int, point: Floats) -> float:
     return float(np.hypot(*(point - nearest).T).min(initial=np.inf))
 
 
-def points_of(
-    walls: Floats,
-    chain: Sequence[int],
-    start: Floats,
-    stop: Floats,
-    margin_m: float = 0.0,
-) -> list[Floats]:
+def points_of(walls: Floats, chain: Sequence[int], start: Floats, stop: Floats, margin_m: float = 0.0) -> list[Floats]:
     """Points of the path in the plan that reflects off a chain of walls: textbook image method.
 
     Empty if there is none, or none that passes all ends of walls by a margin.
@@ -128,11 +122,7 @@ def points_of(
 
 
 def chains_between(
-    walls: Floats,
-    start: Floats,
-    stop: Floats,
-    max_depth: int,
-    margin_m: float = 0.0,
+    walls: Floats, start: Floats, stop: Floats, max_depth: int, margin_m: float = 0.0
 ) -> set[tuple[int, ...]]:
     """Every chain of walls that joins two points of the plan, of which either may be the end of a wall."""
     return {
@@ -144,12 +134,7 @@ def chains_between(
 
 
 def specular_lengths_m(
-    geometry: SceneGeometry,
-    tx_m: Floats,
-    rx_m: Floats,
-    max_depth: int,
-    margin_m: float = 0.0,
-    shortest_m: float = 0.0,
+    geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, max_depth: int, margin_m: float = 0.0, shortest_m: float = 0.0
 ) -> Floats:
     """Sorted lengths [m] of all specular paths to one receiver whose legs are not too short.
 
@@ -190,11 +175,7 @@ def everything(receivers: int) -> Strengths:
 
 
 def specular_blocks(
-    geometry: SceneGeometry,
-    tx_m: Floats,
-    rx_m: Floats,
-    max_depth: int,
-    pairs_at_once: int = 200_000,
+    geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, max_depth: int, pairs_at_once: int = 200_000
 ) -> Blocks:
     """List all specular candidates, and the fraction of the work done with each block."""
     candidates = SpecularCandidates(geometry, Room.of(geometry, tx_m, rx_m), max_depth)

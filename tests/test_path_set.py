@@ -399,9 +399,7 @@ class TestNothingIsLeftBehind:
 
 class TestNothingThere:
     @pytest.mark.parametrize(
-        ("rx", "scene_settings"),
-        [([], FLOOR), (np.zeros((0, 3)), NOTHING)],
-        ids=["with a floor", "with nothing"],
+        ("rx", "scene_settings"), [([], FLOOR), (np.zeros((0, 3)), NOTHING)], ids=["with a floor", "with nothing"]
     )
     def test_no_receivers(self, rx: ArrayLike, scene_settings: sp.SceneSettings) -> None:
         paths = PathScene(FIELD, scene_settings=scene_settings).paths((1.0, 1.0, 1.5), rx)
