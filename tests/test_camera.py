@@ -111,6 +111,14 @@ def test_many_noisy_looks_find_the_wall():
     assert (many.seen[3, 6:14] == CellState.FREE).all()
 
 
+def test_a_missed_wall_hides_what_is_behind_it():
+    eye = camera(corridor(), SensorSettings(missed_wall_fraction=1.0))
+    eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
+    assert (eye.seen != CellState.WALL).all()
+    assert (eye.seen[3, 4:21] == CellState.FREE).all()
+    assert (eye.seen[:, 21:] == CellState.UNKNOWN).all()
+
+
 def test_where_the_robot_stands_is_free_whatever_was_seen():
     eye = camera(corridor())
     under = np.array([[3, 21]])

@@ -472,9 +472,7 @@ class TestFiles:
         np.testing.assert_allclose(np.sort(powers), np.sort((np.abs(found.a) ** 2).sum(found.a.dims[1:])), rtol=1e-5)
         np.testing.assert_allclose(np.sort(np.ravel(tau)), np.sort(np.ravel(found.tau)), rtol=1e-6)
 
-    def test_blocks_and_progress(
-        self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_progress_of_blocks(self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         fractions: list[float] = []
         sp.save_channels(several, tmp_path / "whole.nc")
         monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
@@ -518,9 +516,7 @@ class TestFiles:
             (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
         ],
     )
-    def test_refused(
-        self, several: sp.TracedLinks, tmp_path: Path, call: Callable[[Path, Any], object], message: str
-    ) -> None:
+    def test_refused(self, several: sp.TracedLinks, tmp_path: Path, call: Callable[..., object], message: str) -> None:
         (tmp_path / "text.nc").write_text("no NetCDF")
         xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
         with pytest.raises(SettingsError, match=message):

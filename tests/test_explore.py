@@ -111,9 +111,11 @@ def test_diagonal_walls_are_tight():
 def test_robot_sees_all_of_a_small_home_and_then_stays():
     home = plan(CLOSET.replace("#......#", "########"))
     for seed in range(6):
-        maps = explore(home, (300, 301, 1000), seed)
+        found = explore_trajectory(home, (300, 301, 1000), seed)
+        maps = found.maps
         assert maps[0].observed_fraction > 0.99
         assert maps[1] == maps[0] == maps[2]
+        assert (found.poses[-500:] == found.poses[-1]).all()
 
 
 @pytest.mark.parametrize("door_cells", [10, 4])

@@ -14,6 +14,7 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.tracing import trace
+from sionna_partial.tracing.candidates import Wedges
 from sionna_partial.tracing.finder import PlanScene, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import diffracted_as_exact
@@ -111,39 +112,41 @@ def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.Monkey
     assert np.mean(found) > 0.99
 
 
-def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
+@pytest.fixture
+def wedges(tmp_path: Path) -> Wedges:
     scene = write_scene_of(_plan(), tmp_path, all_paths(), sp.SceneSettings())
     assert isinstance(scene, PlanScene)
-    edge_x, edge_y = scene.wedges.edge_m[0]
+    return scene.wedges
+
+
+def _counted(wedges: Wedges, kinds: np.ndarray, vertices: np.ndarray, walls_a_side: int) -> list[bool]:
+    zeros = np.zeros(len(kinds))
+    rx, transfer = zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex)
+    paths = SolvedPaths.of_vertices(rx, transfer, zeros, kinds, vertices, tx_m=TX, rx_m=RX)
+    return diffracted_as_exact(wedges, paths, walls_a_side).tolist()
+
+
+def test_bends_count_only_at_upright_edges(wedges: Wedges) -> None:
+    edge_x, edge_y = wedges.edge_m[0]
     kinds = np.array([[8, 0, 0, 0], [8, 0, 0, 0], [8, 0, 0, 0], [1, 8, 1, 1], [1, 8, 4, 1], [1, 1, 1, 1]], np.uint8)
     vertices = np.full((6, 4, 3), 1.0)
     vertices[[0, 1, 2], 0] = [(edge_x, edge_y, 1.0), (edge_x, edge_y, 0.0), (edge_x + 0.1, edge_y, 1.0)]
     vertices[[3, 4], 1] = (edge_x, edge_y, 1.0)
-    zeros = np.zeros(6)
-    paths = SolvedPaths.of_vertices(
-        zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
-    )
-    assert diffracted_as_exact(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
+    assert _counted(wedges, kinds, vertices, 2) == [True, False, False, False, True, True]
 
 
 @pytest.mark.parametrize(
     ("walls_a_side", "expected"),
     [(0, (True, False, False, False, True, False)), (1, (True, True, True, False, True, True)), (2, (True,) * 6)],
 )
-def test_bends_count_with_so_many_walls_a_side(tmp_path: Path, walls_a_side: int, expected: tuple[bool, ...]) -> None:
+def test_bends_count_with_so_many_walls_a_side(wedges: Wedges, walls_a_side: int, expected: tuple[bool, ...]) -> None:
     """Floor and ceiling are no walls."""
-    scene = write_scene_of(_plan(), tmp_path, all_paths(), sp.SceneSettings())
-    assert isinstance(scene, PlanScene)
     kinds = np.array([[8, 0, 0], [1, 8, 0], [8, 1, 0], [1, 1, 8], [1, 8, 1], [1, 8, 1]], np.uint8)
     vertices = np.full((6, 3, 3), 1.0)
-    vertices[4, [0, 2], 2] = 0.0, scene.wedges.height_m
+    vertices[4, [0, 2], 2] = 0.0, wedges.height_m
     for path, at in enumerate((kinds == 8).argmax(axis=1)):
-        vertices[path, at, :2] = scene.wedges.edge_m[0]
-    zeros = np.zeros(6)
-    paths = SolvedPaths.of_vertices(
-        zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
-    )
-    assert tuple(diffracted_as_exact(scene.wedges, paths, walls_a_side).tolist()) == expected
+        vertices[path, at, :2] = wedges.edge_m[0]
+    assert tuple(_counted(wedges, kinds, vertices, walls_a_side)) == expected
 
 
 def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:

@@ -1,7 +1,6 @@
 """Meshes on cells: walls without gaps, and what has been observed."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -203,16 +202,6 @@ def test_too_many_cells() -> None:
     message = r"resolution_m = 0.05 makes \d+ x \d+ cells, more than 100,000,000: give (\d+) or more, check"
     with pytest.raises(MapError, match=message):
         mesh_map(large, MeshReading())
-
-
-@pytest.mark.parametrize(
-    "given", [{"height_band_m": (1, 2)}, {"observed": OBSERVED}, {"resolution_m": 0.1}, {"up": "z"}]
-)
-def test_for_meshes_alone(given: dict) -> None:  # type: ignore[type-arg]
-    (name,) = given
-    with pytest.raises(MapError, match=rf"{name} is for scans alone, but path = 'a.npz' is none: leave it out\."):
-        MeshReading(**given).require_unused(Path("a.npz"), "none")
-    MeshReading().require_unused(Path("a.npz"), "none")
 
 
 @pytest.mark.parametrize(

@@ -66,9 +66,7 @@ def test_cell_index() -> None:
 
 
 @given(states, st.floats(1e-3, 10.0), st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)))
-def test_every_cell_centre_has_its_index_and_state(
-    state: np.ndarray, resolution_m: float, origin_m: tuple[float, float]
-) -> None:
+def test_every_cell_centre_has_its_index_and_state(state: np.ndarray, resolution_m: float, origin_m: tuple) -> None:
     partial = PartialMap(state, resolution_m, origin_m)
     row, column = np.mgrid[: state.shape[0], : state.shape[1]]
     centres = np.stack([column, row], axis=-1) * resolution_m + resolution_m / 2 + np.array(origin_m)

@@ -72,12 +72,6 @@ class TestShard:
         np.testing.assert_array_equal(columns["gain_db"], links.gain_db)
         np.testing.assert_array_equal(columns["partial_link_state"], links.phi.link_state)
 
-    def test_maps_come_back(self, links: LinkTable, shard: Path) -> None:
-        found = read_shard(shard)
-        assert found.maps == links.maps
-        assert found.complete_maps == links.complete_maps
-        assert {each.interior_cells is None for each in found.maps} == {True, False}
-
     def test_notes(self, shard: Path) -> None:
         notes = shard_metadata(shard)
         assert {name: notes[name] for name in notes if name != "maps"} == {"format": FORMAT, **NOTES}

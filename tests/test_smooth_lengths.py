@@ -82,6 +82,12 @@ class TestLengths:
         ramp_m = (into_m + HALF_M) ** 2 / (2 * RESOLUTION_M)
         np.testing.assert_allclose(smooth(np.array([2.0, 3.0, 1.0]), ends_m), ramp_m, atol=1e-12)
 
+    def test_upright_segment_by_hand(self):
+        smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
+        x_m = 5.0 + np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * RESOLUTION_M
+        low_m = np.column_stack([x_m, np.full(5, 3.0), np.full(5, 0.5)])
+        np.testing.assert_allclose(smooth(low_m, low_m + [0.0, 0.0, 2.0]), [0.0, 0.5, 1.0, 1.5, 2.0], atol=1e-5)
+
     @pytest.mark.parametrize("block", [1, 3, 9])
     @pytest.mark.parametrize("kind", CellState)
     def test_agree_with_quadrature(self, kind, block):
