@@ -86,7 +86,7 @@ class TestLengths:
         smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
         x_m = 5.0 + np.array([-0.5, -0.25, 0.0, 0.25, 0.5]) * RESOLUTION_M
         low_m = np.column_stack([x_m, np.full(5, 3.0), np.full(5, 0.5)])
-        np.testing.assert_allclose(smooth(low_m, low_m + [0.0, 0.0, 2.0]), [0.0, 0.5, 1.0, 1.5, 2.0], atol=1e-5)
+        np.testing.assert_allclose(smooth(low_m, np.add(low_m, (0.0, 0.0, 2.0))), [0.0, 0.5, 1.0, 1.5, 2.0], atol=1e-5)
 
     @pytest.mark.parametrize("block", [1, 3, 9])
     @pytest.mark.parametrize("kind", CellState)
