@@ -145,7 +145,6 @@ class TestValues:
         "tx_m", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=str
     )  # in the pillar, far away, at a receiver
     def test_impossible_positions_have_finite_slopes(self, tx_m, predictor, links_of):
-        """In the pillar, far away, and at a receiver."""
         links, tx_m = links_of("partial", predictor), tf.Variable(np.array(tx_m))
         with tf.GradientTape(persistent=True) as tape:
             found = links(tx_m=tx_m)
