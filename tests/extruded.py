@@ -15,6 +15,7 @@ from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
+Floats = NDArray[np.float64]
 Blocks = list[tuple[Candidates, float]]
 
 CELLS = {".": CellState.FREE, "#": CellState.WALL, "?": CellState.UNKNOWN}
@@ -37,6 +38,10 @@ def drawn(text: str, resolution_m: float = 0.5, origin_m: tuple[float, float] = 
     rows = text.split()
     state = np.array([[CELLS[sign] for sign in row] for row in reversed(rows)], dtype=np.uint8)
     return PartialMap(state, resolution_m, origin_m)
+
+
+HALF = drawn("########## #....????# #....????# #....????# ##########", 1.0)
+"""A room of which half has been seen."""
 
 
 def extrude(
@@ -64,13 +69,11 @@ def extrude(
     )
 
 
-def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def cross(a: Floats, b: Floats) -> Floats:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def is_blocked(
-    walls: NDArray[np.float64], start: NDArray[np.float64], stop: NDArray[np.float64], margin_m: float = 0.0
-) -> bool:
+def is_blocked(walls: Floats, start: Floats, stop: Floats, margin_m: float = 0.0) -> bool:
     """Whether a wall, longer by a margin at both ends, crosses the open segment from start to stop."""
     along, wall = stop - start, walls[:, 1] - walls[:, 0]
     area, slack = cross(along, wall), margin_m / np.hypot(*wall.T) + 1e-9
@@ -81,7 +84,7 @@ def is_blocked(
     return bool(((t > near) & (t < 1 - near) & (u > -slack) & (u < 1 + slack)).any())
 
 
-def _clear_m(walls: NDArray[np.float64], number: int, point: NDArray[np.float64]) -> float:
+def _clear_m(walls: Floats, number: int, point: Floats) -> float:
     """Distance [m] of a point of one wall from the other walls."""
     others = np.delete(walls, number, axis=0)
     along = others[:, 1] - others[:, 0]
@@ -90,13 +93,7 @@ def _clear_m(walls: NDArray[np.float64], number: int, point: NDArray[np.float64]
     return float(np.hypot(*(point - nearest).T).min(initial=np.inf))
 
 
-def points_of(
-    walls: NDArray[np.float64],
-    chain: Sequence[int],
-    start: NDArray[np.float64],
-    stop: NDArray[np.float64],
-    margin_m: float = 0.0,
-) -> list[NDArray[np.float64]]:
+def points_of(walls: Floats, chain: Sequence[int], start: Floats, stop: Floats, margin_m: float = 0.0) -> list[Floats]:
     """Points of the path in the plan that reflects off a chain of walls: textbook image method.
 
     Empty if there is none, or none that passes all ends of walls by a margin.
@@ -125,11 +122,7 @@ def points_of(
 
 
 def chains_between(
-    walls: NDArray[np.float64],
-    start: NDArray[np.float64],
-    stop: NDArray[np.float64],
-    max_depth: int,
-    margin_m: float = 0.0,
+    walls: Floats, start: Floats, stop: Floats, max_depth: int, margin_m: float = 0.0
 ) -> set[tuple[int, ...]]:
     """Every chain of walls that joins two points of the plan, of which either may be the end of a wall."""
     return {
@@ -141,13 +134,8 @@ def chains_between(
 
 
 def specular_lengths_m(
-    geometry: SceneGeometry,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    max_depth: int,
-    margin_m: float = 0.0,
-    shortest_m: float = 0.0,
-) -> NDArray[np.float64]:
+    geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, max_depth: int, margin_m: float = 0.0, shortest_m: float = 0.0
+) -> Floats:
     """Sorted lengths [m] of all specular paths to one receiver whose legs are not too short.
 
     Floor and ceiling count as endless.
@@ -163,9 +151,7 @@ def specular_lengths_m(
     return np.sort(lengths)
 
 
-def climbs_m(
-    geometry: SceneGeometry, low_m: float, high_m: float, bounces: int
-) -> list[tuple[float, NDArray[np.float64]]]:
+def climbs_m(geometry: SceneGeometry, low_m: float, high_m: float, bounces: int) -> list[tuple[float, Floats]]:
     """Unfolded differences in height [m] with at most `bounces` off floor and ceiling, and where those are on the way.
 
     Where: shares (B,) of the way.
@@ -189,11 +175,7 @@ def everything(receivers: int) -> Strengths:
 
 
 def specular_blocks(
-    geometry: SceneGeometry,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
-    max_depth: int,
-    pairs_at_once: int = 200_000,
+    geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, max_depth: int, pairs_at_once: int = 200_000
 ) -> Blocks:
     """List all specular candidates, and the fraction of the work done with each block."""
     candidates = SpecularCandidates(geometry, Room.of(geometry, tx_m, rx_m), max_depth)
@@ -203,8 +185,8 @@ def specular_blocks(
 def diffracted_blocks(
     geometry: SceneGeometry,
     wedges: Wedges,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
+    tx_m: Floats,
+    rx_m: Floats,
     max_depth: int,
     walls_a_side: int = MAX_REFLECTIONS,
 ) -> Blocks:

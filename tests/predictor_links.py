@@ -59,9 +59,7 @@ def make_context(phi):
     count = len(phi)
     tx_m = np.tile([0.0, 0.0, 1.5], (count, 1))
     linked, crossed_m = phi.link_state != OUTAGE, phi.unobserved_distance_m
-    kept = np.stack(
-        [np.exp(-crossed_m / reach) if reach else crossed_m < 1e-3 for reach in ATTENUATION_LENGTHS_M], axis=1
-    )
+    kept = np.stack([np.exp(-crossed_m / reach) if reach else crossed_m < 1e-3 for reach in ATTENUATION_LENGTHS_M]).T
     power = 10.0 ** ((phi.gain_db - 6.0 * (phi.link_state == LOS)) / 10.0) * linked
     return LinkContext.on_maps(
         corridors(),

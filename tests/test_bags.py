@@ -66,16 +66,10 @@ class TestMaps:
     @pytest.mark.parametrize(
         ("given", "message"),
         [
-            (
-                {"time_s": 0.5},
-                r"has no map up to time_s = 0\.5: topic /map has its first map 1 s after the start: g",
-            ),
+            ({"time_s": 0.5}, r"has no map up to time_s = 0\.5: topic /map has its first map 1 s after the start: g"),
             ({"time_s": -1}, r"time_s = -1 is not allowed: give seconds since the start of the recording"),
             ({"time_s": "1"}, r"time_s = '1' is not allowed"),
-            (
-                {"topic": "/odom"},
-                r"has no OccupancyGrid topic '/odom': name one of its topics: /amcl_pose \(PoseStamped\)",
-            ),
+            ({"topic": "/odom"}, r"has no OccupancyGrid topic '/odom': name one of its topics: /amcl_pose"),
             ({"topic": 3}, r"has no OccupancyGrid topic 3: name one of its topics"),
         ],
     )
@@ -189,9 +183,7 @@ class TestPowers:
     def test_powers_without_poses(self, tmp_path: Path, name: str) -> None:
         make = messages_of(name)
         rows = [("/pose", 9.0, make.pose_stamped(START_S, 0.0, 0.0, 0.0)), ("/rssi", 0.0, make.power(-60.0))]
-        with pytest.raises(
-            MeasurementError, match=r"topic /rssi has 1 powers \(0.0 to 0.0 s\), none of them finite and"
-        ):
+        with pytest.raises(MeasurementError, match=r"topic /rssi has 1 powers \(0.0 to 0.0 s\), none of them finite"):
             measurements_from_bag(write_bag(tmp_path / name, rows), "/rssi", self.TX, tx_power_dbm=0.0)
 
 

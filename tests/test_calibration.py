@@ -46,9 +46,7 @@ def places(count: int = 60) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return TX[np.arange(count) % 2], rx
 
 
-def measured(
-    scene: sp.PartialMap = FLAT, hidden: sp.Material | None = HIDDEN, noise_db: float = 1.0
-) -> dict[str, object]:
+def measured(scene: sp.PartialMap = FLAT, hidden: sp.Material | None = HIDDEN, noise_db: float = 1.0) -> dict:
     tx, rx = places()
     settings = None if hidden is None else sp.SceneSettings(material=hidden)
     links = sp.trace_links(scene, TX, rx, trace_settings=SETTINGS, scene_settings=settings)
@@ -142,10 +140,7 @@ class TestWhatCannotBeDetermined:
     @pytest.mark.parametrize(
         ("cell", "message"),
         [
-            (
-                sp.CellState.FREE,
-                "the 20 usable links of measurements have no reflection that shows a material: ",
-            ),
+            (sp.CellState.FREE, "the 20 usable links of measurements have no reflection that shows a material: "),
             (sp.CellState.UNKNOWN, "the map has no walls, floor or ceiling that shows a material: measure links that"),
         ],
     )
@@ -209,21 +204,19 @@ def test_materials_of_a_mesh() -> None:
 
 class TestWrongArguments:
     @pytest.mark.parametrize(
-        ("changes", "error", "message"),
+        ("changes", "message"),
         [
-            ({"rx": [9.0, 1.0, 1.5]}, PositionError, "rx[3] = (9.0, 1.0, 1.5) is outside the map"),
-            ({"tx": [4.05, 1.0, 1.5]}, PositionError, "tx[3] = (4.05, 1.0, 1.5) is inside a wall"),
-            ({"rx": [1.0, 1.0, np.nan]}, MeasurementError, "rx[3, 2] = nan is not allowed: give finite numbers"),
-            ({"gain_db": np.nan}, MeasurementError, "gain_db[3] = nan is not allowed: give finite numbers"),
+            ({"rx": [9.0, 1.0, 1.5]}, "rx[3] = (9.0, 1.0, 1.5) is outside the map"),
+            ({"tx": [4.05, 1.0, 1.5]}, "tx[3] = (4.05, 1.0, 1.5) is inside a wall"),
         ],
     )
-    def test_unusable_measurements(self, changes: dict[str, object], error: type[Exception], message: str) -> None:
+    def test_positions_that_are_impossible(self, changes: dict[str, object], message: str) -> None:
         tx, rx = places()
         arrays = {"tx": tx, "rx": rx, "gain_db": np.full(60, -80.0)}
         for name, value in changes.items():
             arrays[name] = arrays[name].copy()
             arrays[name][3] = value
-        with pytest.raises(error, match=re.escape(message)):
+        with pytest.raises(PositionError, match=re.escape(message)):
             calibrate(arrays)
 
     def test_links_without_length(self) -> None:

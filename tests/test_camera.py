@@ -83,13 +83,6 @@ def test_cells_are_seen_just_as_far_and_wide_as_the_camera_reaches(heading_deg, 
     assert not seen[(distance > reach + 1) | (off_axis_deg > half_deg + slack_deg)].any()
 
 
-def test_a_wall_ends_the_view():
-    eye = camera(corridor())
-    eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
-    assert (eye.seen[2:5, 21] == CellState.WALL).all()
-    assert (eye.seen[:, 22:] == CellState.UNKNOWN).all()
-
-
 def test_belief_shifts_the_map_by_as_many_cells():
     truth = np.pad(corridor(), 6, constant_values=CellState.UNKNOWN)
     here, there = camera(truth), camera(truth)
@@ -118,9 +111,8 @@ def test_many_noisy_looks_find_the_wall():
     assert (many.seen[3, 6:14] == CellState.FREE).all()
 
 
-def test_a_noticed_and_a_missed_wall():
-    truth = corridor()
-    eye = camera(truth, SensorSettings(missed_wall_fraction=1.0))
+def test_a_missed_wall_hides_what_is_behind_it():
+    eye = camera(corridor(), SensorSettings(missed_wall_fraction=1.0))
     eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
     assert (eye.seen != CellState.WALL).all()
     assert (eye.seen[3, 4:21] == CellState.FREE).all()

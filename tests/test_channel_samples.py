@@ -20,7 +20,7 @@ def home() -> sp.PartialMap:
 
 
 @pytest.fixture(scope="module")
-def receivers(home: sp.PartialMap) -> np.ndarray[Any, Any]:
+def receivers(home: sp.PartialMap) -> np.ndarray:
     cells = np.random.default_rng(0).permutation(np.argwhere(home.state == sp.CellState.FREE))[:40]
     rx_m = np.insert((cells[:, ::-1] + 0.5) * home.resolution_m + home.origin_m, 2, 1.5, axis=1)
     return rx_m[home.radios_can_stand(rx_m) & (np.linalg.norm(rx_m - TX, axis=1) > 0.2)]
@@ -32,11 +32,11 @@ def partial() -> sp.PartialMap:
 
 
 @pytest.fixture(scope="module")
-def samples(partial: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> sp.ChannelSamples:
+def samples(partial: sp.PartialMap, receivers: np.ndarray) -> sp.ChannelSamples:
     return sp.sample_channels(partial, TX, receivers, n=100)
 
 
-def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receivers: np.ndarray) -> None:
     links = sp.trace_links(home, TX, receivers)
     samples = sp.sample_channels(home, TX, receivers, n=3)
     assert len(links.a) > 20
@@ -47,7 +47,7 @@ def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receiver
 
 
 def test_draws_agree_with_the_prediction_and_with_themselves(
-    partial: sp.PartialMap, receivers: np.ndarray[Any, Any], samples: sp.ChannelSamples
+    partial: sp.PartialMap, receivers: np.ndarray, samples: sp.ChannelSamples
 ) -> None:
     prediction = sp.Predictor.load().predict(sp.link_features(partial, sp.trace_links(partial, TX, receivers)))
     for state, probability in zip(sp.LinkState, prediction.by_state[0], strict=True):
@@ -70,7 +70,7 @@ def test_no_receivers_have_no_paths(partial: sp.PartialMap) -> None:
     assert len(samples.drawn.a) == 0
 
 
-def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: np.ndarray) -> None:
     samples = sp.sample_channels(partial, TX, receivers, n=400, memory_gb=0.05)
     power = [np.bincount(each.path_rx, np.abs(each.a) ** 2).sum() for each in map(samples.links, (399, 0, 399))]
     assert power[0] == power[2] != power[1]
@@ -80,16 +80,14 @@ def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: n
         samples.links(400)
 
 
-def test_equal_seeds_give_equal_draws(
-    partial: sp.PartialMap, receivers: np.ndarray[Any, Any], samples: sp.ChannelSamples
-) -> None:
+def test_equal_seeds_equal_draws(partial: sp.PartialMap, receivers: np.ndarray, samples: sp.ChannelSamples) -> None:
     again = sp.sample_channels(partial, TX, receivers, n=100)
     np.testing.assert_array_equal(again.drawn.transfer, samples.drawn.transfer)
     other = sp.sample_channels(partial, TX, receivers, n=100, seed=1)
     assert not np.array_equal(other.gain_db, samples.gain_db)
 
 
-def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, receivers: np.ndarray) -> None:
     arrays = {"tx_array": planar_array(2, 2)}
     cfr = samples.cfr(np.arange(4) * 1e6, **arrays)
     assert cfr.h.sizes == {"draw": 100, "link": len(receivers), "rx_ant": 1, "tx_ant": 4, "frequency": 4}
@@ -104,7 +102,7 @@ def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, r
     np.testing.assert_array_equal(two.links(3).gain_db, two.gain_db[3])
 
 
-def test_a_path_model_learns_what_survives(home: sp.PartialMap, receivers: np.ndarray[Any, Any]) -> None:
+def test_a_path_model_learns_what_survives(home: sp.PartialMap, receivers: np.ndarray) -> None:
     maps = [*sp.explore(home, (20, 60), 0), home]
     examples = [example(each, home, np.array([TX]), receivers) for each in maps]
     assert examples[-1].exists.all()  # on the whole of the home every path is there
@@ -126,7 +124,7 @@ def test_a_path_model_learns_what_survives(home: sp.PartialMap, receivers: np.nd
     ],
 )
 def test_bad_input(
-    partial: sp.PartialMap, receivers: np.ndarray[Any, Any], options: dict[str, Any], error: type[Exception], match: str
+    partial: sp.PartialMap, receivers: np.ndarray, options: dict[str, Any], error: type[Exception], match: str
 ) -> None:
     with pytest.raises(error, match=match):
         sp.sample_channels(partial, TX, receivers, **options)

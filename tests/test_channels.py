@@ -9,7 +9,8 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
-from test_trace import NO_FLOOR, WAVELENGTH_M, _room, _slab_reflection
+from test_trace import _room
+from traced import made_links
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
@@ -94,21 +95,6 @@ def matches(links: sp.TracedLinks, paths: Any) -> list[tuple[int, int, int]]:
 
 
 class TestTransfer:
-    def test_reflection_at_a_wall(self) -> None:
-        """Vertical antennas see the TE coefficient of the slab, horizontal ones the TM coefficient."""
-        state = np.zeros((60, 100), dtype=np.uint8)
-        state[50, :] = sp.CellState.WALL
-        settings = sp.TraceSettings(power_tolerance_db=0.0, diffraction=False)
-        tx, rx, wall_y = np.array([1.0, 2.0, 1.5]), np.array([[5.0, 3.0, 1.5]]), 5.05
-        links = sp.trace_links(sp.PartialMap(state, 0.1), tx, rx, trace_settings=settings, scene_settings=NO_FLOOR)
-        lengths_m = np.array([np.hypot(4.0, 1.0), np.hypot(4.0, 2 * wall_y - 5.0)])
-        cosine = (2 * wall_y - 5.0) / lengths_m[1]
-        te, tm = (_slab_reflection(cosine, sp.Material(), each) for each in ("te", "tm"))
-        expected = WAVELENGTH_M / (4 * np.pi * lengths_m) * [[1.0, abs(te)], [1.0, abs(tm)]]
-        np.testing.assert_allclose(np.abs(links.transfer[:, [0, 1], [0, 1]].T), expected, rtol=1e-3)
-        np.testing.assert_allclose(links.transfer[:, [0, 1], [1, 0]], 0.0, atol=1e-9)
-        assert links.to_xarray().transfer.sel(at_rx="theta", at_tx="theta").values.tolist() == links.a.tolist()
-
     def test_reflections_are_reciprocal(self) -> None:
         settings = sp.TraceSettings(power_tolerance_db=0.0, diffraction=False, max_depth=2)
         ends = (TX, RX[2]), (RX[2], TX)
@@ -223,10 +209,7 @@ class TestPerAntenna:
         checked, kinds = 0, set()
         for receiver in range(len(RX)):
             ends = []
-            for array, position_m, angles in (
-                (tx_array, TX, TX_RAD),
-                (rx_array, RX[receiver], RX_RAD[receiver]),
-            ):
+            for array, position_m, angles in ((tx_array, TX, TX_RAD), (rx_array, RX[receiver], RX_RAD[receiver])):
                 import mitsuba as mi
 
                 ends.append(position_m + np.array(array.rotate(wavelength_m, mi.Point3f(*map(float, angles)))).T)
@@ -302,9 +285,7 @@ class TestResponses:
     def test_memory_is_asked_for_first(self, several: sp.TracedLinks) -> None:
         many = replace(several, rx=np.broadcast_to(several.rx[:1], (1_000_000, 3)))
         arrays = {"tx_array": array_of(8, 8), "rx_array": array_of(8, 8)}
-        message = (
-            r"memory_gb = 2 is too little for 2,000,000 links x 64 x 64 antennas x \d+ paths, which take [\d,.]+ GB"
-        )
+        message = r"memory_gb = 2 is too little for 2,000,000 links x 64 x 64 antennas x \d+ paths, which take"
         with pytest.raises(MemoryLimitError, match=message):
             many.cir(**arrays)
         with pytest.raises(MemoryLimitError, match=r"x 8 frequencies, which take 524\.3 GB: give fewer"):
@@ -357,9 +338,8 @@ class TestBeams:
         flat = np.sort(power.reshape(6, -1), axis=1)
         np.testing.assert_allclose(beams.margin_db[:2], 10 * np.log10(flat[:2, -1] / flat[:2, -2]), atol=1e-3)
         best = power.reshape(6, -1).argmax(axis=1)
-        assert (beams.best_rx_beam * len(at_tx) + beams.best_tx_beam)[[0, 1, 3, 4]].values.tolist() == best[
-            [0, 1, 3, 4]
-        ].tolist()
+        linked, found = [0, 1, 3, 4], beams.best_rx_beam * len(at_tx) + beams.best_tx_beam
+        assert found[linked].values.tolist() == best[linked].tolist()
         assert beams.best_tx_beam[[2, 5]].values.tolist() == [-1, -1]
         assert np.isnan(beams.margin_db[[2, 5]]).all()
 
@@ -376,28 +356,22 @@ class TestBeams:
         np.testing.assert_allclose(gain_db, 10 * np.log10(32), atol=1e-2)
 
 
-def made_links(*paths: tuple[float, float, float, int]) -> sp.TracedLinks:
+def one_link(*paths: tuple[float, float, float, int]) -> sp.TracedLinks:
     """One link with paths (power, delay [ns], azimuth of departure [rad], interaction)."""
     power, delay_ns, azimuth, kind = np.array(paths, dtype=float).reshape(-1, 4).T
     count = len(power)
     transfer = np.zeros((count, 2, 2), complex)
     transfer[:, 0, 0] = np.sqrt(power)
-    gain_db = 10 * np.log10(power.sum()) if count else -150.0
-    return sp.TracedLinks(
-        tx=np.zeros(3),
-        rx=np.ones((1, 3)),
+    return made_links(
+        np.zeros(3),
+        np.ones((1, 3)),
         link_state=np.ones(1, np.uint8),
-        gain_db=np.array([gain_db]),
-        path_tx=np.zeros(count, np.int32),
-        path_rx=np.zeros(count, np.int32),
+        gain_db=10 * np.log10(np.maximum([power.sum()], 1e-15)),
         transfer=transfer,
         delay_s=1e-9 * delay_ns,
         departure_rad=np.stack([np.full(count, np.pi / 2), azimuth], axis=1),
         arrival_rad=np.stack([azimuth / 2, np.full(count, 3.0)], axis=1),
         interactions=kind.astype(np.uint8)[:, None],
-        vertices_m=np.full((count, 1, 3), np.nan),
-        settings=sp.TraceSettings(),
-        scene_settings=sp.SceneSettings(),
     )
 
 
@@ -405,7 +379,7 @@ class TestSpreads:
     """Cases by hand, with the definitions of TR 38.901."""
 
     def test_two_paths(self) -> None:
-        found = made_links((3e-8, 10.0, np.pi - 0.1, 0), (1e-8, 50.0, 0.1 - np.pi, 1)).spreads()
+        found = one_link((3e-8, 10.0, np.pi - 0.1, 0), (1e-8, 50.0, 0.1 - np.pi, 1)).spreads()
         assert found.delay_spread_s.values == pytest.approx([40e-9 * np.sqrt(0.75 * 0.25)])
         assert found.k_factor_db.values == pytest.approx([10 * np.log10(3.0)])
         assert found.path_loss_db.values == pytest.approx([-10 * np.log10(4e-8)])
@@ -416,16 +390,12 @@ class TestSpreads:
         assert found.zenith_arrival_spread_rad.units == "rad"
         assert found.path_loss_db.dims == ("rx",)
 
-    def test_line_of_sight_alone(self) -> None:
-        found = made_links((1e-8, 10.0, 0.3, 0)).spreads()
-        assert found.k_factor_db.values.tolist() == [np.inf]
-        assert found.delay_spread_s.values.tolist() == [0.0]
-
-    def test_no_line_of_sight(self) -> None:
-        assert np.isnan(made_links((1e-8, 10.0, 0.3, 1)).spreads().k_factor_db).all()
-
-    def test_no_paths(self) -> None:
-        assert np.isnan(made_links().spreads().to_array()).all()
+    def test_line_of_sight_alone_none_and_no_paths(self) -> None:
+        alone = one_link((1e-8, 10.0, 0.3, 0)).spreads()
+        assert alone.k_factor_db.values.tolist() == [np.inf]
+        assert alone.delay_spread_s.values.tolist() == [0.0]
+        assert np.isnan(one_link((1e-8, 10.0, 0.3, 1)).spreads().k_factor_db).all()
+        assert np.isnan(one_link().spreads().to_array()).all()
 
     def test_several_transmitters(self, several: sp.TracedLinks) -> None:
         assert several.spreads().delay_spread_s.dims == ("tx", "rx")
@@ -455,6 +425,7 @@ class TestFiles:
         sp.save_channels(several, path, **options)
         found = sp.load_channels(path)
         assert found.a.dims == ("rx", "rx_ant", "tx", "tx_ant", "path", "time")
+        assert found.a.dtype == np.complex64
         assert found.a.shape == (3, 2, 2, 8, whole.sizes["path"], 1)
         assert found.tau.dims == (("rx", "tx", "path") if synthetic_array else found.a.dims[:-1])
         for tx, rx in np.ndindex(2, 3):
@@ -489,15 +460,6 @@ class TestFiles:
         sp.save_channels(links.cfr([0.0, 1e6]), tmp_path / "h.h5", layout="deepmimo")
         assert sp.load_channels(tmp_path / "h.h5").channel.dims == ("rx", "rx_ant", "tx_ant", "frequency")
 
-    def test_a_generator_yields_what_sionna_takes(self, several: sp.TracedLinks, tmp_path: Path) -> None:
-        """`CIRDataset` takes a generator of a [rx, rx_ant, tx, tx_ant, path, time] and tau [rx, tx, path]."""
-        sp.save_channels(several, tmp_path / "channels.zarr", tx_array=array_of(2, 2))
-        found = sp.load_channels(tmp_path / "channels.zarr")
-        for a, tau in of_receivers(found):
-            assert a.shape == (1, 1, 2, 4, found.sizes["path"], 1)
-            assert tau.shape == (1, 2, found.sizes["path"])
-            assert a.dtype == np.complex64
-
     def test_in_the_data_set_of_sionna(self, several: sp.TracedLinks, tmp_path: Path) -> None:
         """Runs where the whole of Sionna is installed, not its ray tracer alone."""
         cir_dataset = pytest.importorskip("sionna.phy.channel").CIRDataset
@@ -510,9 +472,7 @@ class TestFiles:
         np.testing.assert_allclose(np.sort(powers), np.sort((np.abs(found.a) ** 2).sum(found.a.dims[1:])), rtol=1e-5)
         np.testing.assert_allclose(np.sort(np.ravel(tau)), np.sort(np.ravel(found.tau)), rtol=1e-6)
 
-    def test_blocks_and_progress(
-        self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_progress_of_blocks(self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         fractions: list[float] = []
         sp.save_channels(several, tmp_path / "whole.nc")
         monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
@@ -545,7 +505,7 @@ class TestFiles:
             (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
             (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels = .* give links, or what their cir"),
             (lambda path, links: sp.save_channels(links.cir(), path, rx_array=None), "options = 'rx_array' is not"),
-            (lambda path, links: sp.save_channels(made_links(), path), "channels = '1 links' .* none has a path"),
+            (lambda path, links: sp.save_channels(one_link(), path), "channels = '1 links' .* none has a path"),
             (lambda path, links: sp.load_channels(path), "channels.nc' cannot be read"),
             (lambda path, links: sp.load_channels(path.with_suffix(".zarr")), "channels.zarr' cannot be read"),
             (lambda path, links: sp.load_channels(path.with_suffix(".mat")), "path = .*mat' is not allowed: give a"),
@@ -556,9 +516,7 @@ class TestFiles:
             (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
         ],
     )
-    def test_refused(
-        self, several: sp.TracedLinks, tmp_path: Path, call: Callable[[Path, Any], object], message: str
-    ) -> None:
+    def test_refused(self, several: sp.TracedLinks, tmp_path: Path, call: Callable[..., object], message: str) -> None:
         (tmp_path / "text.nc").write_text("no NetCDF")
         xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
         with pytest.raises(SettingsError, match=message):

@@ -72,9 +72,7 @@ def test_grid(map_path: Path, tmp_path: Path) -> None:
         (["--rx", "wall.csv"], "rx[0] ="),
     ],
 )
-def test_refused(
-    map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list[object], message: str
-) -> None:
+def test_refused(map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: list, message: str) -> None:
     monkeypatch.chdir(tmp_path)
     Path("bad.csv").write_text("a,b\n1,2\n")
     Path("cut.csv").write_text("x,y,z\n1,2,1\n3,4\n")

@@ -222,16 +222,8 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("homes", "settings", "message"),
         [
-            (
-                SEEDS,
-                replace(SETTINGS, links_per_home=6),
-                r"settings\.links_per_home was 5 when '.*' was begun, and is 6:",
-            ),
-            (
-                SEEDS,
-                replace(SETTINGS, seed=1, stages=(0,)),
-                r"settings\.seed was 0 .*, and is 1 \(and 1 more\): take what",
-            ),
+            (SEEDS, replace(SETTINGS, links_per_home=6), r"links_per_home was 5 when '.*' was begun, and is 6:"),
+            (SEEDS, replace(SETTINGS, seed=1, stages=(0,)), r"settings\.seed was 0 .*, and is 1 \(and 1 more\): take"),
             (SEEDS, replace(SETTINGS, trace=TraceSettings(max_depth=2)), r"settings\.trace\.max_depth was 6 .* is 2:"),
             (SEEDS[1:], SETTINGS, r"home 'make_home\(0\)' was in the list of homes when .* is not in it:"),
         ],
@@ -260,9 +252,7 @@ class TestRefused:
 
     def test_folder_with_other_content(self, tmp_path: Path) -> None:
         (tmp_path / "letter.txt").touch()
-        with pytest.raises(
-            OutputError, match=r"other content than a data set \(letter\.txt\): choose a new or an empty"
-        ):
+        with pytest.raises(OutputError, match=r"other content than a data set \(letter\.txt\): choose a new or an"):
             build_dataset(tmp_path, SEEDS, SETTINGS)
 
     def test_two_runs_at_once(self, unbroken: Path) -> None:
@@ -281,9 +271,7 @@ class TestRefused:
             build_dataset(tmp_path, SEEDS, SETTINGS)
 
     def test_workers_and_scheduler(self, tmp_path: Path) -> None:
-        with pytest.raises(
-            SettingsError, match="workers = 2 is for this machine, and scheduler is given: leave one out"
-        ):
+        with pytest.raises(SettingsError, match="workers = 2 is for this machine, and scheduler is given: leave one"):
             build_dataset(tmp_path, SEEDS, SETTINGS, workers=2, scheduler="tcp://127.0.0.1:1")
 
     @pytest.mark.parametrize(("name", "value"), [("workers", 0), ("workers", 1.5), ("home_time_limit_s", 0.0)])
@@ -367,9 +355,7 @@ class TestScheduler:
 
     def test_address_where_nothing_answers(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
-        with pytest.raises(
-            BackendError, match=r"scheduler = 'tcp://127\.0\.0\.1:9' does not answer .*: give the address"
-        ):
+        with pytest.raises(BackendError, match=r"scheduler = 'tcp://127\.0\.0\.1:9' does not answer .*: give the"):
             build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="tcp://127.0.0.1:9")
 
     def test_no_address(self, tmp_path: Path) -> None:

@@ -40,9 +40,7 @@ class TestOpenLinks:
 
     def test_folders_traced_differently(self, tmp_path):
         folders = [make_dataset(tmp_path / name, make_table(homes=1), frequency_hz=hz) for name, hz in _AT]
-        message = (
-            f"'{folders[1]}' was traced at 60 GHz with diffraction, '{folders[0]}' at 28 GHz with diffraction: give"
-        )
+        message = f"'{folders[1]}' was traced at 60 GHz with diffraction, '{folders[0]}' at 28 GHz with diffraction"
         with pytest.raises(PredictorError, match=re.escape(message)):
             open_links(folders)
 

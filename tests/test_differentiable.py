@@ -20,7 +20,7 @@ from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
-from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathScene, PathSet
+from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet
 
 pytestmark = QUIET
 
@@ -80,7 +80,8 @@ def links_of():
 
 def predicted(kind, predictor):
     links = sp.trace_links(MAPS[kind], TX_M, RX_M, trace_settings=TRACE, scene_settings=SCENE)
-    return loaded(predictor).predict(sp.link_features(MAPS[kind], links)), links
+    phi = sp.link_features(MAPS[kind], links)
+    return LinkPrediction.of_trace(phi) if kind == "complete" else loaded(predictor).predict(phi), links
 
 
 def assert_same(found, expected, **tolerance):
@@ -90,19 +91,12 @@ def assert_same(found, expected, **tolerance):
 
 class TestValues:
     @pytest.mark.parametrize("predictor", ["paper", "map"])
-    @pytest.mark.parametrize("kind", ["partial", "finished", "empty"])
+    @pytest.mark.parametrize("kind", MAPS)
     def test_unmoved_as_predictor(self, kind, predictor, links_of):
+        """On a complete map as the trace, whichever the predictor."""
         expected, links = predicted(kind, predictor)
         assert (links.link_state == sp.LinkState.NLOS).any() == (kind != "empty")
         assert_same(links_of(kind, predictor)(), expected, rtol=1e-6, atol=1e-9)
-
-    def test_complete_map_is_the_trace(self, links_of):
-        _, links = predicted("complete", "paper")
-        found = links_of("complete")()
-        expected = loaded().predict(sp.link_features(MAPS["complete"], links))
-        assert_same(found, expected, rtol=1e-9, atol=1e-12)
-        np.testing.assert_allclose(found.gain_mean_db, links.gain_db, rtol=1e-9)
-        assert not found.gain_std_db.numpy().any()
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     @pytest.mark.parametrize("kind", MAPS)
@@ -116,13 +110,7 @@ class TestValues:
     def test_arguments_may_be_of_any_kind(self, links_of):
         links = links_of("partial", "paper")
         tx_m = TX_M + 0.01
-        kinds = (
-            tx_m,
-            tx_m.tolist(),
-            tf.constant(tx_m),
-            tf.Variable(tx_m),
-            tf.constant(tx_m, tf.float64),
-        )
+        kinds = (tx_m, tx_m.tolist(), tf.constant(tx_m), tf.Variable(tx_m), tf.constant(tx_m, tf.float64))
         found = [links(tx_m=kind).gain_mean_db.numpy() for kind in kinds]
         assert all(np.array_equal(one, found[0]) for one in found)
         np.testing.assert_allclose(links(tx_m=tf.constant(tx_m, tf.float32)).gain_mean_db, found[0], atol=1e-4)
@@ -154,8 +142,8 @@ class TestValues:
 
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     @pytest.mark.parametrize(
-        "tx_m", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["pillar", "far", "receiver"]
-    )
+        "tx_m", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=str
+    )  # in the pillar, far away, at a receiver
     def test_impossible_positions_have_finite_slopes(self, tx_m, predictor, links_of):
         links, tx_m = links_of("partial", predictor), tf.Variable(np.array(tx_m))
         with tf.GradientTape(persistent=True) as tape:
@@ -240,10 +228,9 @@ class TestSlopes:
 
 class TestSecondUse:
     def test_map_from_a_file(self, tmp_path, links_of):
-        sp.export_scene(MAPS["partial"], tmp_path / "scene")
-        scene = sp.DifferentiableScene(
-            tmp_path / "scene", predictor="paper", trace_settings=TRACE, scene_settings=SCENE
-        )
+        folder = sp.export_scene(MAPS["partial"], tmp_path / "scene")
+        scene = sp.DifferentiableScene(folder, predictor="paper", trace_settings=TRACE, scene_settings=SCENE)
+        assert len(scene.materials) == len(links_of("partial", "paper").base.thickness_m) == 1
         assert_same(scene.links(TX_M, RX_M)(), links_of("partial", "paper")(), rtol=1e-6, atol=1e-9)
 
     def test_process_ends_well_with_all_of_it_alive(self):
@@ -258,6 +245,7 @@ class TestSecondUse:
             "with tape:\n"
             "    found = links(tx_m=tx_m)\n"
             "slope = tape.gradient(found.gain_mean_db, tx_m)\n"
+            "held = next(links._paths._passes(links.base, ('tx_m',)))\n"
             "print(slope.shape)\n"
         )
         result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
@@ -286,9 +274,7 @@ class TestErrors:
 
     def test_within_a_function(self, links_of):
         links = links_of("partial", "paper")
-        with pytest.raises(
-            SettingsError, match=r"tx_m = .* is not allowed: call links eagerly, not within tf\.function"
-        ):
+        with pytest.raises(SettingsError, match=r"tx_m = .* is not allowed: call links eagerly, not within"):
             tf.function(lambda tx_m: links(tx_m=tx_m).p_los, autograph=False)(tf.constant(TX_M))
 
     def test_positions(self, links_of):
@@ -305,11 +291,6 @@ class TestErrors:
         with pytest.raises(LookupError, match="first derivatives only"):
             outer.gradient(slope, tx_m)
 
-    def test_materials_are_named(self, links_of):
-        scene = links_of("partial", "paper")._scene
-        assert len(scene.materials) == len(links_of("partial", "paper").base.thickness_m) == 1
-        assert all(getattr(links_of("partial", "paper").base, name).shape == (1,) for name in MATERIAL_PARAMETERS)
-
 
 TX = np.array([1.1, 1.7, 1.4])
 
@@ -319,19 +300,8 @@ def paths() -> PathSet:
     return PathScene(small_room(), settings=sp.TraceSettings(max_depth=1)).paths(TX_M, PILLAR_RX_M)
 
 
-@pytest.fixture(scope="module")
-def empty() -> PathSet:
-    return PathScene(small_room(), settings=sp.TraceSettings(max_depth=1)).paths(TX_M, [])
-
-
 def variables(paths, *names):
     return {name: tf.Variable(getattr(paths.base, name)) for name in names}
-
-
-def upstream(paths, seed=0):
-    """Return weights of the powers and of the vertices of paths, for a scalar of both."""
-    rng = np.random.default_rng(seed)
-    return rng.uniform(0.5, 1.5, len(paths)) / paths.power.sum(), rng.normal(size=paths.vertices_m.shape)
 
 
 class TestMovedPaths:
@@ -344,26 +314,6 @@ class TestMovedPaths:
         np.testing.assert_array_equal(vertices_m, np.nan_to_num(expected_m))
         assert not vertices_m.numpy()[paths.interactions == 0].any()
 
-    def test_nothing_given_is_the_trace(self, paths):
-        power, vertices_m = moved_paths(paths, {})
-        np.testing.assert_array_equal(power, paths.power)
-        np.testing.assert_array_equal(vertices_m, np.nan_to_num(paths.vertices_m))
-
-    def test_gradient(self, paths):
-        of_power, of_vertices = upstream(paths)
-        given = variables(paths, *PARAMETERS)
-        with tf.GradientTape() as tape:
-            power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
-            value = tf.reduce_sum(power * of_power) + tf.reduce_sum(vertices_m * of_vertices)
-        found, slopes = tape.gradient(value, given), paths.slopes(paths.base)
-        power_by_tx, vertices_by_tx = paths.transmitter_slopes(paths.base)
-        expected = {name: of_power @ slopes[name] for name in PARAMETERS}
-        expected["tx_m"] = of_power @ power_by_tx + np.einsum("pdi,pdij->j", of_vertices, vertices_by_tx)
-        for name in PARAMETERS:
-            assert found[name].shape == getattr(paths.base, name).shape
-            np.testing.assert_allclose(np.ravel(found[name]), expected[name], rtol=1e-9, err_msg=name)
-            assert np.all(found[name].numpy() != 0.0)
-
     def test_slopes_are_those_of_where_it_was_evaluated(self, paths):
         tx_m = tf.Variable(paths.base.tx_m)
         before = paths.base.tx_m.copy()
@@ -375,15 +325,13 @@ class TestMovedPaths:
 
     @pytest.mark.parametrize("at_once", [True, False])
     def test_jacobian(self, paths, at_once):
-        given = variables(paths, "tx_m", "thickness_m", "frequency_hz")
+        given = variables(paths, *PARAMETERS)
         with tf.GradientTape(persistent=True) as tape:
             power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
         options = {"experimental_use_pfor": at_once}
         found, slopes = tape.jacobian(power, given, **options), paths.slopes(paths.base)
-        assert {name: tuple(each.shape) for name, each in found.items()} == {
-            "tx_m": (len(paths), 3), "thickness_m": (len(paths), 1), "frequency_hz": (len(paths),)
-        }  # fmt: skip
         for name, each in found.items():
+            assert each.shape == (len(paths), *getattr(paths.base, name).shape)
             np.testing.assert_allclose(np.reshape(each, slopes[name].shape), slopes[name], rtol=1e-12)
         if at_once:
             of_vertices = tape.jacobian(vertices_m, given["tx_m"], **options)
@@ -398,14 +346,6 @@ class TestMovedPaths:
         found, slopes = tape.gradient(value, given), paths.slopes(paths.base)
         for name, each in found.items():
             np.testing.assert_allclose(each, slopes[name][[3, 5]].sum(axis=0), rtol=1e-9)
-
-    def test_no_paths(self, empty):
-        given = variables(empty, *PARAMETERS)
-        with tf.GradientTape() as tape:
-            power, vertices_m = moved_paths(empty, {name: tf.identity(each) for name, each in given.items()})
-            value = tf.reduce_sum(power) + tf.reduce_sum(vertices_m)
-        assert (power.shape, vertices_m.shape[0]) == ((0,), 0)
-        assert not any(np.any(each) for each in tape.gradient(value, given).values())
 
 
 @pytest.fixture(scope="module")
@@ -501,15 +441,6 @@ class TestMovedLengths:
         ends = np.array([[1.0, 1.0, 1.0]]), np.array([[99.0, 1.0, 1.0]])
         assert moved_lengths_m(lengths, np.zeros(1), ends, tuple(map(tf.constant, ends))).numpy().tolist() == [0.0]
 
-    def test_second_derivatives_are_refused(self, partial, rx_m):
-        tx_m = tf.Variable(TX)
-        with tf.GradientTape() as outer:
-            with tf.GradientTape() as tape:
-                value = tf.reduce_sum(self.of(partial, rx_m, tf.convert_to_tensor(tx_m))[1] ** 2)
-            slope = tape.gradient(value, tx_m)
-        with pytest.raises(LookupError, match="first derivatives only"):
-            outer.gradient(slope, tx_m)
-
 
 THRESHOLD_DB = -100.0
 
@@ -538,26 +469,6 @@ class TestOfParts:
             values = getattr(found, field.name)
             assert values.dtype == tf.float64
             np.testing.assert_allclose(values.numpy(), getattr(expected, field.name), rtol=1e-12, err_msg=field.name)
-
-    def test_slopes_by_differences(self):
-        parts = [part[:, 30:][:, np.arange(170) % 4 != 2] for part in random_parts()]
-        tensors = [tf.constant(part) for part in parts]
-        with tf.GradientTape(persistent=True) as tape:
-            tape.watch(tensors)
-            found = of(*tensors)
-        for name in ("gain_mean_db", "gain_std_db"):
-            for index, tensor in enumerate(tensors):
-                slopes = tape.gradient(getattr(found, name), tensor, unconnected_gradients="zero")
-                for row in range(3):
-                    step = 1e-5 * np.eye(3)[row][:, None]
-                    ends = [
-                        getattr(of(*(part + sign * step * (k == index) for k, part in enumerate(parts))), name)
-                        for sign in (1, -1)
-                    ]
-                    expected = (ends[0] - ends[1]).numpy() / 2e-5
-                    np.testing.assert_allclose(
-                        slopes[row], expected, rtol=1e-4, atol=1e-6 * np.abs(expected).max() + 1e-5
-                    )
 
     def test_no_spread_has_no_slope(self):
         """A square root has an infinite one at 0, which times 0 is NaN."""

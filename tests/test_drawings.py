@@ -182,9 +182,7 @@ def endless_block(doc: Drawing) -> None:
         (spoiled(endless_block), {}, "has more than 1,000 entities in blocks"),
     ],
 )
-def test_refused(
-    tmp_path: Path, write: Callable[[Path], None], given: Any, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refused(tmp_path: Path, write: Callable, given: Any, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawings, "MAX_PARTS", 1000)
     write(tmp_path / "plan.dxf")
     with pytest.raises(MapError, match=re.escape(message)):

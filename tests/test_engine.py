@@ -172,9 +172,7 @@ class TestEngineFault:
         assert engine_fault() == ""
         assert not caplog.records
 
-    def test_other_release_is_named_once(
-        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_other_release_is_named(self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
         monkeypatch.setattr(engine, "TESTED_VERSION", "2.1")
         with caplog.at_level(logging.WARNING):
             faults = {engine_fault() for _ in range(3)}

@@ -73,7 +73,5 @@ class TestPlotReliability:
         assert len(above.collections[0].get_offsets()) == 0
 
     def test_nothing_to_draw(self):
-        with pytest.raises(
-            SettingsError, match=re.escape("stages = {} is not allowed: give at least one calibration.")
-        ):
+        with pytest.raises(SettingsError, match=re.escape("stages = {} is not allowed: give at least one")):
             plot_reliability({})

@@ -78,10 +78,8 @@ class TestPlotExploration:
         assert np.array_equal(trajectories[1].get_xdata(), drifting.believed_poses[:, 0])
         (view,) = panels(figure)[0].patches
         assert view.get_xy()[0] == pytest.approx(drifting.believed_poses[-1, :2])
-        assert [text.get_text() for text in figure.legends[0].texts][:2] == [
-            "estimated trajectory",
-            "true trajectory",
-        ]
+        texts = [text.get_text() for text in figure.legends[0].texts]
+        assert texts[:2] == ["estimated trajectory", "true trajectory"]
 
     def test_many_moments_are_thinned(self, home):
         many = explore_trajectory(home, range(0, 40), 2)
@@ -130,9 +128,7 @@ class TestAnimateExploration:
             assert (animation.format, animation.n_frames) == ("GIF", 1)
 
     def test_another_suffix(self, exploration, tmp_path):
-        with pytest.raises(
-            SettingsError, match=r"path = '.*way\.mp4' is not allowed: give a name that ends with \.gif\."
-        ):
+        with pytest.raises(SettingsError, match=r"path = '.*way\.mp4' is not allowed: give a name that ends with"):
             animate_exploration(exploration, tmp_path / "way.mp4")
         assert list(tmp_path.iterdir()) == []
 
@@ -142,7 +138,5 @@ class TestAnimateExploration:
             animate_exploration(exploration.at((60,)), tmp_path / "file" / "way.gif")
 
     def test_it_needs_an_exploration(self):
-        with pytest.raises(
-            SettingsError, match="exploration = 'str' is not allowed: give what explore_trajectory returned"
-        ):
+        with pytest.raises(SettingsError, match="exploration = 'str' is not allowed: give what explore_trajectory"):
             animate_exploration("exploration", Path("way.gif"))

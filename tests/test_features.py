@@ -1,28 +1,16 @@
 import dataclasses
-import functools
 import re
 
-import extruded
 import numpy as np
 import pytest
+from extruded import HALF
 from predictor_links import features
+from traced import made_links
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.windows import map_windows
-from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.links import TracedLinks
-
-drawn = functools.partial(extruded.drawn, resolution_m=1.0)
-
-HALF = drawn("""
-    ##########
-    #....????#
-    #....????#
-    #....????#
-    ##########
-""")
 
 
 def phi_of(count=3):
@@ -30,24 +18,9 @@ def phi_of(count=3):
     return LinkFeatures(np.full(count, LinkState.LOS), 0.5 * ones, ones * np.arange(1, count + 1), -60.0 * ones)
 
 
-def traced(tx, rx, gain_db=-60.0, state=LinkState.NLOS):
-    count = len(rx)
-    return TracedLinks(
-        tx=np.asarray(tx, dtype=float),
-        rx=np.asarray(rx, dtype=float),
-        link_state=np.full(count, state, dtype=np.uint8),
-        gain_db=np.full(count, gain_db),
-        path_tx=np.zeros(0, dtype=np.int32),
-        path_rx=np.zeros(0, dtype=np.int32),
-        transfer=np.zeros((0, 1, 1), dtype=complex),
-        delay_s=np.zeros(0),
-        departure_rad=np.zeros((0, 2)),
-        arrival_rad=np.zeros((0, 2)),
-        interactions=np.zeros((0, 6), dtype=np.uint8),
-        vertices_m=np.zeros((0, 6, 3)),
-        settings=TraceSettings(),
-        scene_settings=SceneSettings(),
-    )
+def traced(tx, rx, gain_db=-60.0):
+    state = np.full(len(rx), LinkState.NLOS, dtype=np.uint8)
+    return made_links(tx, rx, link_state=state, gain_db=np.full(len(rx), gain_db))
 
 
 def test_link_features():

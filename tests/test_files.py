@@ -218,12 +218,8 @@ def test_exported_scene_is_replaced_and_other_files_stay(tmp_path: Path) -> None
 def test_other_folders_are_refused(tmp_path: Path, names: tuple[str, ...]) -> None:
     write_scene(tmp_path, b"mine ", names)
     before = tree(tmp_path)
-    with (
-        pytest.raises(
-            OutputError, match=r"other content than an exported scene \(scene.xml and map.yaml\): choose a new"
-        ),
-        atomic_folder(tmp_path),
-    ):
+    message = r"other content than an exported scene \(scene.xml and map.yaml\): choose a new"
+    with pytest.raises(OutputError, match=message), atomic_folder(tmp_path):
         pytest.fail("must not be entered")
     assert tree(tmp_path) == before
 

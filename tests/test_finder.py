@@ -7,12 +7,14 @@ import pytest
 import trimesh
 from meshes import box, room, scene_mesh
 from numpy.typing import NDArray
+from test_trace import all_paths
 
 import sionna_partial as sp
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.tracing import trace
+from sionna_partial.tracing.candidates import Wedges
 from sionna_partial.tracing.finder import PlanScene, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.trace import diffracted_as_exact
@@ -41,10 +43,8 @@ def _delays(links: sp.TracedLinks, rx: int) -> NDArray[np.float64]:
 
 
 def test_a_plan_traced_as_a_mesh_has_the_same_paths(tmp_path: Path) -> None:
-    plan, settings = (
-        _plan(),
-        sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, diffraction=False, samples_per_tx=100_000),
-    )
+    plan = _plan()
+    settings = all_paths(max_depth=4, diffraction=False, samples_per_tx=100_000)
     exact = sp.trace_links(plan, TX, RX, trace_settings=settings)
     scan = sp.trace_links(_as_mesh(plan, tmp_path), TX, RX, trace_settings=settings)
     np.testing.assert_array_equal(scan.link_state, exact.link_state)
@@ -82,7 +82,7 @@ def test_weak_paths_of_a_mesh_are_left_out_within_the_tolerance(tmp_path: Path, 
 def test_a_mesh_far_away_has_the_same_paths() -> None:
     mesh, far = scene_mesh(*room().geometry.values()), np.array([5e5, 4.5e6, 0.0])
     there = SceneMesh(mesh.vertices_m + far, mesh.triangles, mesh.material)
-    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=3, samples_per_tx=50_000)
+    settings = all_paths(max_depth=3, samples_per_tx=50_000)
     near, moved = (
         sp.trace_links(mesh_map(each, MeshReading(resolution_m=0.1)), TX + shift, RX + shift, trace_settings=settings)
         for each, shift in ((mesh, 0.0), (there, far))
@@ -93,7 +93,7 @@ def test_a_mesh_far_away_has_the_same_paths() -> None:
 
 
 def test_diffraction_is_on_for_plans_and_off_for_meshes(tmp_path: Path) -> None:
-    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=2, samples_per_tx=10_000)
+    settings = all_paths(max_depth=2, samples_per_tx=10_000)
     for partial, diffracts in ((_plan(), True), (_as_mesh(_plan(), tmp_path), False)):
         links = sp.trace_links(partial, TX, RX, trace_settings=settings)
         assert links.settings.diffraction is diffracts
@@ -106,7 +106,7 @@ def test_parts_of_a_mesh_have_their_own_materials() -> None:
     metal, glass = sp.Material(itu="metal"), sp.Material(relative_permittivity=1.0001, conductivity_s_m=0.0)
     parts = SceneMesh(mesh.vertices, mesh.faces, np.repeat([0, 1], 12), (metal, glass))
     partial = mesh_map(parts, MeshReading(resolution_m=0.1))
-    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1, samples_per_tx=20_000)
+    settings = all_paths(max_depth=1, samples_per_tx=20_000)
     links = sp.trace_links(partial, (1.0, 2.0, 1.0), [[4.0, 2.0, 1.0]], trace_settings=settings)
     strength = {round(z, 1): abs(a) for a, (_, _, z) in zip(links.a[1:], links.vertices_m[1:, 0], strict=True)}
     assert strength[0.0] > 100 * strength[2.9]
@@ -124,7 +124,7 @@ def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
 
 
 def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=4, samples_per_tx=20_000)
+    settings = all_paths(max_depth=4, samples_per_tx=20_000)
     exact = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
     monkeypatch.setattr(trace, "engine_fault", lambda: "broken")
     public = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
@@ -132,59 +132,55 @@ def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.Monkey
     bent = (public.interactions == 8).any(axis=1)
     assert bent.any()
     assert ((public.interactions == 1)[bent].sum(axis=1) <= 2).all()
-    found = [
-        np.abs(_delays(exact, rx) - delay).min() < 1e-11
-        for rx, delay in zip(public.path_rx, public.delay_s, strict=True)
-    ]
+    pairs = zip(public.path_rx, public.delay_s, strict=True)
+    found = [np.abs(_delays(exact, rx) - delay).min() < 1e-11 for rx, delay in pairs]
     assert len(found) > 50
     assert np.mean(found) > 0.99
 
 
-def test_bends_count_only_at_upright_edges(tmp_path: Path) -> None:
-    scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(power_tolerance_db=0.0), sp.SceneSettings())
+@pytest.fixture
+def wedges(tmp_path: Path) -> Wedges:
+    scene = write_scene_of(_plan(), tmp_path, all_paths(), sp.SceneSettings())
     assert isinstance(scene, PlanScene)
-    edge_x, edge_y = scene.wedges.edge_m[0]
+    return scene.wedges
+
+
+def _counted(wedges: Wedges, kinds: np.ndarray, vertices: np.ndarray, walls_a_side: int) -> list[bool]:
+    zeros = np.zeros(len(kinds))
+    rx, transfer = zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex)
+    paths = SolvedPaths.of_vertices(rx, transfer, zeros, kinds, vertices, tx_m=TX, rx_m=RX)
+    return diffracted_as_exact(wedges, paths, walls_a_side).tolist()
+
+
+def test_bends_count_only_at_upright_edges(wedges: Wedges) -> None:
+    edge_x, edge_y = wedges.edge_m[0]
     kinds = np.array([[8, 0, 0, 0], [8, 0, 0, 0], [8, 0, 0, 0], [1, 8, 1, 1], [1, 8, 4, 1], [1, 1, 1, 1]], np.uint8)
     vertices = np.full((6, 4, 3), 1.0)
     vertices[[0, 1, 2], 0] = [(edge_x, edge_y, 1.0), (edge_x, edge_y, 0.0), (edge_x + 0.1, edge_y, 1.0)]
     vertices[[3, 4], 1] = (edge_x, edge_y, 1.0)
-    zeros = np.zeros(6)
-    paths = SolvedPaths.of_vertices(
-        zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
-    )
-    assert diffracted_as_exact(scene.wedges, paths, 2).tolist() == [True, False, False, False, True, True]
+    assert _counted(wedges, kinds, vertices, 2) == [True, False, False, False, True, True]
 
 
 @pytest.mark.parametrize(
     ("walls_a_side", "expected"),
     [(0, (True, False, False, False, True, False)), (1, (True, True, True, False, True, True)), (2, (True,) * 6)],
 )
-def test_bends_count_with_so_many_walls_on_each_side(
-    tmp_path: Path, walls_a_side: int, expected: tuple[bool, ...]
-) -> None:
+def test_bends_count_with_so_many_walls_a_side(wedges: Wedges, walls_a_side: int, expected: tuple[bool, ...]) -> None:
     """Floor and ceiling are no walls."""
-    scene = write_scene_of(_plan(), tmp_path, sp.TraceSettings(power_tolerance_db=0.0), sp.SceneSettings())
-    assert isinstance(scene, PlanScene)
     kinds = np.array([[8, 0, 0], [1, 8, 0], [8, 1, 0], [1, 1, 8], [1, 8, 1], [1, 8, 1]], np.uint8)
     vertices = np.full((6, 3, 3), 1.0)
-    vertices[4, [0, 2], 2] = 0.0, scene.wedges.height_m
+    vertices[4, [0, 2], 2] = 0.0, wedges.height_m
     for path, at in enumerate((kinds == 8).argmax(axis=1)):
-        vertices[path, at, :2] = scene.wedges.edge_m[0]
-    zeros = np.zeros(6)
-    paths = SolvedPaths.of_vertices(
-        zeros.astype(np.int32), zeros.reshape(-1, 1, 1).astype(complex), zeros, kinds, vertices, tx_m=TX, rx_m=RX
-    )
-    assert tuple(diffracted_as_exact(scene.wedges, paths, walls_a_side).tolist()) == expected
+        vertices[path, at, :2] = wedges.edge_m[0]
+    assert tuple(_counted(wedges, kinds, vertices, walls_a_side)) == expected
 
 
 def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:
     """Bends over one edge with no wall, with one before or after, and with up to two."""
-    words = []
+    words, no_floor = [], sp.SceneSettings(floor_extent="none")
     for walls in (0, 1, 2):
-        settings = sp.TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction_walls=walls)
-        links = sp.trace_links(
-            _plan(), TX, RX, trace_settings=settings, scene_settings=sp.SceneSettings(floor_extent="none")
-        )
+        settings = all_paths(max_depth=3, diffraction_walls=walls)
+        links = sp.trace_links(_plan(), TX, RX, trace_settings=settings, scene_settings=no_floor)
         words.append({"".join("D" if kind == 8 else "R" for kind in row if kind) for row in links.interactions})
     assert {word for word in words[0] if "D" in word} == {"D"}
     assert {word for word in words[1] if "D" in word} == {"D", "DR", "RD", "RDR"}

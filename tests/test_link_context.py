@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from predictor_links import features
+from traced import made_links
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, link_features
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
-from sionna_partial.settings import DatasetSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import DatasetSettings, TraceSettings
 from sionna_partial.simulation.homes import make_home
-from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.trace import trace_links
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
@@ -40,29 +40,15 @@ NEAR, FAR = (4.5, 2.5, 1.5), (7.5, 2.5, 1.5)
 
 def traced(tx, rx, *paths):
     """Return links with paths (transmitter, receiver, complex gain, vertices)."""
-    tx, rx = np.array(tx, dtype=float), np.array(rx, dtype=float).reshape(-1, 3)
-    shape = (len(rx),) if tx.ndim == 1 else (len(tx), len(rx))
     interactions = np.zeros((len(paths), DEPTH), dtype=np.uint8)
     vertices_m = np.full((len(paths), DEPTH, 3), np.nan)
     for number, (_, _, _, vertices) in enumerate(paths):
         interactions[number, : len(vertices)] = 1
         vertices_m[number, : len(vertices)] = np.reshape(vertices, (-1, 3))
-    return TracedLinks(
-        tx=tx,
-        rx=rx,
-        link_state=np.zeros(shape, dtype=np.uint8),
-        gain_db=np.full(shape, GAIN_FLOOR_DB),
-        path_tx=np.array([path[0] for path in paths], dtype=np.int32),
-        path_rx=np.array([path[1] for path in paths], dtype=np.int32),
-        transfer=np.array([path[2] for path in paths], dtype=complex).reshape(-1, 1, 1),
-        delay_s=np.zeros(len(paths)),
-        departure_rad=np.zeros((len(paths), 2)),
-        arrival_rad=np.zeros((len(paths), 2)),
-        interactions=interactions,
-        vertices_m=vertices_m,
-        settings=TraceSettings(),
-        scene_settings=SceneSettings(),
-    )
+    path_tx, path_rx = (np.array([path[end] for path in paths], dtype=np.int32) for end in (0, 1))
+    transfer = np.array([path[2] for path in paths], dtype=complex).reshape(-1, 1, 1)
+    of_paths = {"transfer": transfer, "interactions": interactions, "vertices_m": vertices_m}
+    return made_links(tx, rx, path_tx=path_tx, path_rx=path_rx, **of_paths)
 
 
 def link_context(partial, links):

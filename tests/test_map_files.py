@@ -19,13 +19,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
 from sionna_partial.maps.bags import map_from_occupancy
-from sionna_partial.maps.map_files import (
-    load_map,
-    map_from_array,
-    map_from_habitat,
-    map_from_slam,
-    save_map,
-)
+from sionna_partial.maps.map_files import load_map, map_from_array, map_from_habitat, map_from_slam, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.settings import Material
 
@@ -137,6 +131,8 @@ def test_no_such_file(tmp_path: Path, name: str) -> None:
     [
         ("map.png", r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"),
         ("map.dae", r"map\.dae' is of no known kind: give a ROS map YAML"),
+        ("coverage.nc", "is a coverage, no map: give the map that it was computed from"),
+        ("coverage.tif", "is a coverage, no map: give the map that it was computed from"),
     ],
 )
 def test_other_files(tmp_path: Path, name: str, message: str) -> None:
@@ -216,9 +212,7 @@ def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     folder = export(tmp_path / "scene")
     with pytest.raises(MapError, match=r"resolution_m is for scans alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
-    with pytest.raises(
-        MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its map.yam"
-    ):
+    with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its"):
         load_map(folder, up="z")
 
 
@@ -249,9 +243,7 @@ WHOLE = {"state": SMALL.state, "resolution_m": 0.05, "origin_m": (0.0, 0.0), "wa
 def test_damaged_npz(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "home.npz"
     path.write_bytes(content)
-    with pytest.raises(
-        MapError, match=rf"path = '{re.escape(str(path))}' is damaged or was not written by save_map \(.*save"
-    ):
+    with pytest.raises(MapError, match=rf"path = '{re.escape(str(path))}' is damaged or was not written by save_map"):
         load_map(path)
 
 
@@ -300,27 +292,14 @@ def test_array_row_0_is_the_smallest_y() -> None:
 @pytest.mark.parametrize(
     ("state", "message"),
     [
-        (
-            np.zeros((40, 30)),
-            r"home.npz' has 1,200 free cells and no wall, so that nothing obstructs or reflects: look",
-        ),
-        (
-            np.eye(40) == 0,
-            r"home.npz' has 1,560 wall cells and 40 free ones, as if inverted: look at its states, and at",
-        ),
+        (np.zeros((40, 30)), r"home.npz' has 1,200 free cells and no wall, so that nothing obstructs or reflects"),
+        (np.eye(40) == 0, r"home.npz' has 1,560 wall cells and 40 free ones, as if inverted: look at its states"),
     ],
 )
 def test_odd_states(tmp_path: Path, state: np.ndarray, message: str) -> None:
     save_map(PartialMap(state.astype(int), 0.1), tmp_path / "home.npz")
     with pytest.warns(MapWarning, match=message):
         load_map(tmp_path / "home.npz")
-
-
-@pytest.mark.parametrize("name", ["coverage.nc", "coverage.tif"])
-def test_coverage_is_no_map(tmp_path: Path, name: str) -> None:
-    (tmp_path / name).touch()
-    with pytest.raises(MapError, match=f"{name}' is a coverage, no map: give the map that it was computed from"):
-        load_map(tmp_path / name)
 
 
 def test_occupancy_grid() -> None:
@@ -390,12 +369,7 @@ FUNCTIONS = {
         ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
         ("array", ([["wall"]],), {}, "array = [['wall']] is not numeric: give integers"),
         ("array", ([[None]],), {}, "array has dtype float64: give integers"),
-        (
-            "array",
-            ([[0, 1], [0]],),
-            {},
-            "array = [[0, 1], [0]] is not numeric: give integers, in a two-dimensional array",
-        ),
+        ("array", ([[0, 1], [0]],), {}, "array = [[0, 1], [0]] is not numeric: give integers, in a two-dimensional"),
         ("array", ([0, 1],), {}, "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
         ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
         ("array", (np.zeros((0, 2), int),), {}, "array has shape (0, 2): give a two-dimensional array"),

@@ -24,7 +24,6 @@ from sionna_partial.prediction.map_networks import (
     link_inputs,
     read_links,
     read_maps,
-    receiver_offsets_m,
 )
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras
 from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS
@@ -330,19 +329,6 @@ class TestEvaluateContextNetworks:
         many = evaluate_context_networks(networks, phi.take(np.arange(17_000) % 50), FREQUENCY_HZ)
         for one, other in zip(at_once, many, strict=True):
             np.testing.assert_allclose(one, other[:, -50:], rtol=1e-5, atol=1e-5)
-
-    def test_as_the_networks_one_by_one(self, networks, home):
-        phi = features(home, [(1.0, 2.0, 1.5), (-3.0, 0.4, 1.5)], unobserved_m=1.0)
-        maps = read_maps(networks, phi.context.windows.astype(np.float32))
-        outputs = read_links(networks, maps, link_inputs(phi, FREQUENCY_HZ)[None], receiver_offsets_m(phi)[None])
-        free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
-        log_p, means_db, log_variances = decode(np.asarray(outputs, dtype=np.float64)[0], free_db)
-        found_p, found_db, found_std_db = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
-        np.testing.assert_allclose(found_p, np.exp(log_p).T, rtol=1e-5)
-        expected_db = [[-150.0] * 2, *np.maximum(np.transpose(means_db), -150.0)]
-        np.testing.assert_allclose(found_db, expected_db, rtol=1e-5)
-        np.testing.assert_allclose(found_std_db, [[0.0] * 2, *np.exp(0.5 * np.transpose(log_variances))], rtol=1e-5)
-        np.testing.assert_allclose(found_p.sum(axis=0), 1.0, atol=1e-12)
 
     def test_gains_stay_above_the_floor(self, home):
         def low(links):

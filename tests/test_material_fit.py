@@ -95,18 +95,6 @@ class TestMaterialTarget:
         gains_db = fake_target(4.0, 0.3).gains_db(FakePaths().power(*LOSSLESS))
         np.testing.assert_array_equal(gains_db, material_fit.LOWEST_GAIN_DB)
 
-    def test_noise_is_found(self) -> None:
-        assert point(fake_target(4.0, 0.3, noise_db=2.0), 4.0, 0.3).errors.noise_db == pytest.approx(2.0, abs=0.6)
-
-
-def test_each_step_down_is_better() -> None:
-    target = fake_target(4.0, 0.3)
-    steps, curvature = descend(target, point(target, 3.9, 0.5), quiet)
-    losses = [each.loss for each in steps]
-    assert losses == sorted(losses, reverse=True)
-    assert losses[0] > losses[-1]
-    assert np.abs(np.linalg.solve(curvature, target.slopes(steps[-1])[0])).max() < 0.05
-
 
 class TestPosterior:
     def test_prior_has_the_spread_that_is_said(self) -> None:
@@ -164,16 +152,3 @@ class TestSearch:
         fine = grid @ weight
         np.testing.assert_allclose((centre - fine) / spread, 0.0, atol=0.1)
         np.testing.assert_allclose(spread, np.sqrt((grid - fine[:, None]) ** 2 @ weight), rtol=0.15)
-
-    def test_opaque_slab_hides_its_conductivity(self) -> None:
-        target = fake_target(5.24, 0.8, noise_db=3.0)
-        _, posterior = search(target, point(target, 3.0, 0.1), 0, 0.1, FREQUENCY_HZ, quiet)
-        low, high = posterior.interval(posterior.conductivity_s_m)
-        assert high / low > 5.0
-
-    def test_same_answer_from_any_start(self) -> None:
-        answers = []
-        for start in ((3.0, 0.1), (30.0, 10.0)):
-            target = fake_target(4.0, 0.3)
-            answers.append(search(target, point(target, *start), 0, THICKNESS_M, FREQUENCY_HZ, quiet)[1])
-        np.testing.assert_array_equal(answers[0].weight, answers[1].weight)

@@ -54,10 +54,8 @@ def test_reflection_has_its_band() -> None:
     (band,) = axis.collections
     heights = band.get_paths()[0].vertices[:, 1]
     assert heights.max() == pytest.approx((loss_db + 2.0 * std_db).max())
-    assert [text.get_text() for text in axis.get_legend().get_texts()] == [
-        "start: 2.94, 0.12 S/m",
-        "calibrated: 5.24, 0.6 S/m",
-    ]
+    texts = [text.get_text() for text in axis.get_legend().get_texts()]
+    assert texts == ["start: 2.94, 0.12 S/m", "calibrated: 5.24, 0.6 S/m"]
 
 
 def test_a_picture_for_each_material() -> None:

@@ -173,10 +173,7 @@ class TestWhatIsMissing:
         ("text", "message"),
         [
             (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", "' has 2 columns gain_db: keep one of them."),
-            (
-                f"{HEADER}\n1,2,1.5,3,4,1.5,-7",
-                "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be cut",
-            ),
+            (f"{HEADER}\n1,2,1.5,3,4,1.5,-7", "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be"),
             (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
             ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
             (f'{HEADER}\n"1,5",2,1.5,3,4,1.5,-70\n', "line 2: tx_x = '1,5' is not a number: write decimal points."),

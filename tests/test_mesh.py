@@ -12,7 +12,6 @@ from meshes import areas_m2, box, open_edges, scene_mesh, surface_m2
 
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh import mesh as mesh_module
-from sionna_partial.maps.mesh.cut import clip_slab, merge_points
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.settings import Material
 
@@ -179,21 +178,6 @@ class TestWithin:
     def test_far_from_the_origin(self) -> None:
         shift = np.array([500_000.0, 4_500_000.0, 0.0])
         area = random_cells(5)
-        far = replace(ROOM, vertices_m=ROOM.vertices_m + shift).within(
-            shapely.transform(area, lambda corners: corners + shift[:2])
-        )
+        moved = shapely.transform(area, lambda corners: corners + shift[:2])
+        far = replace(ROOM, vertices_m=ROOM.vertices_m + shift).within(moved)
         assert surface_m2(far) == pytest.approx(surface_m2(ROOM.within(area)), rel=1e-6)
-
-
-def test_clip_slab() -> None:
-    corners = np.array([[[0.0, 0, 0], [4, 0, 0], [0, 0, 4]]])
-    polygons, sizes = clip_slab(corners, np.ascontiguousarray(corners[..., 2]), np.array([1.0]), np.array([3.0]))
-    np.testing.assert_array_equal(sizes, [4])
-    np.testing.assert_allclose(polygons[0, :4], [[3, 0, 1], [1, 0, 3], [0, 0, 3], [0, 0, 1]])
-
-
-def test_merge_points() -> None:
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 0, 5e-7], [1, 0, 0], [0, 0, 1e-3]])
-    np.testing.assert_array_equal(merge_points(points), [0, 1, 0, 1, 4])
-    np.testing.assert_array_equal(merge_points(points, 1e-2), [0, 1, 0, 1, 0])
-    assert merge_points(np.zeros((0, 3))).shape == (0,)

@@ -152,10 +152,8 @@ class TestRoom:
             assert whole.vertices_m[kept].tobytes() == alone.vertices_m.tobytes()
 
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
-        whole, parts = (
-            candidates_of(scene, room(), TX, RX),
-            candidates_of(scene, room(), TX, RX, receivers_per_block=50),
-        )
+        whole = candidates_of(scene, room(), TX, RX)
+        parts = candidates_of(scene, room(), TX, RX, receivers_per_block=50)
         for name in ("rx", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 

@@ -1,7 +1,6 @@
 """Meshes on cells: walls without gaps, and what has been observed."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -166,24 +165,15 @@ class TestKnown:
     [
         ({"up": "x"}, 'up = \'x\' is not allowed: choose "z" or "y".'),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
-        (
-            {"height_band_m": (2, 1)},
-            "height_band_m = (2, 1) is not allowed: give (low, high), z in metres, low < high.",
-        ),
+        ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high), z in metres, low <"),
         ({"height_band_m": 2}, "height_band_m = 2 is not allowed: give (low, high), z in metres"),
         ({"height_band_m": (0, np.inf)}, "height_band_m = (0, inf) is not allowed"),
-        (
-            {"observed": "all"},
-            "observed = 'all' is not numeric: give the corners (M, 2) of a polygon without crossings",
-        ),
+        ({"observed": "all"}, "observed = 'all' is not numeric: give the corners (M, 2) of a polygon without"),
         ({"observed": [(0, 0), (1, 1)]}, "observed has shape (2, 2) or values that are not finite: give the corners"),
         ({"observed": [(0, 0), (1, 1), (np.nan, 1)]}, "observed has shape (3, 2) or values that are not finite"),
         ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "observed is no polygon (Self-intersection"),
         ({"observed": [(0, 0), (1, 1), (2, 2)]}, "observed is no polygon ("),
-        (
-            {"observed": [(9, 9), (10, 9), (9, 10)]},
-            "observed holds no cell of the map, which spans x -0.05 to 5.1 m and",
-        ),
+        ({"observed": [(9, 9), (10, 9), (9, 10)]}, "observed holds no cell of the map, which spans x -0.05 to 5.1 m"),
     ],
 )
 def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
@@ -212,16 +202,6 @@ def test_too_many_cells() -> None:
     message = r"resolution_m = 0.05 makes \d+ x \d+ cells, more than 100,000,000: give (\d+) or more, check"
     with pytest.raises(MapError, match=message):
         mesh_map(large, MeshReading())
-
-
-@pytest.mark.parametrize(
-    "given", [{"height_band_m": (1, 2)}, {"observed": OBSERVED}, {"resolution_m": 0.1}, {"up": "z"}]
-)
-def test_for_meshes_alone(given: dict) -> None:  # type: ignore[type-arg]
-    (name,) = given
-    with pytest.raises(MapError, match=rf"{name} is for scans alone, but path = 'a.npz' is none: leave it out\."):
-        MeshReading(**given).require_unused(Path("a.npz"), "none")
-    MeshReading().require_unused(Path("a.npz"), "none")
 
 
 @pytest.mark.parametrize(

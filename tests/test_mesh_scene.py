@@ -131,21 +131,12 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
     ("content", "message"),
     [
         ("", "holds no shape: give a Mitsuba scene with meshes"),
-        (
-            '<include filename="/etc/passwd"/>' + shape("cube"),
-            "has an <include>, which is not followed: put everything",
-        ),
+        ('<include filename="/etc/passwd"/>' + shape("cube"), "has an <include>, which is not followed: put"),
         ('<path value="/etc"/>' + shape("cube"), "has an <path>, which is not followed"),
-        (
-            shape("sphere") + shape("disk"),
-            "has shapes of type disk, sphere: give ply, obj, rectangle, cube; Mitsuba wr",
-        ),
+        (shape("sphere") + shape("disk"), "has shapes of type disk, sphere: give ply, obj, rectangle, cube; Mitsuba"),
         (RADIO + shape("obj"), "shape 'it' has the filename '', which is not allowed: put it into"),
         (shape("cube"), "shape 'it' refers to 'wall', which is no bsdf of the scene: add it, or correct the id"),
-        (
-            RADIO.replace("concrete", "cheese") + shape("cube"),
-            "bsdf 'wall' is no radio material (itu = 'cheese' is not",
-        ),
+        (RADIO.replace("concrete", "cheese") + shape("cube"), "bsdf 'wall' is no radio material (itu = 'cheese' is"),
         ('<bsdf type="itu-radio-material" id="a"/>' + shape("cube"), "bsdf 'a' is no radio material (itu = '' is not"),
         (
             '<bsdf type="radio-material" id="a"><float name="conductivity" value="much"/></bsdf>' + shape("cube"),
@@ -159,10 +150,7 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
             '<bsdf type="radio-material" id="a"><float name="relativePermittivity" value="2"/></bsdf>' + shape("cube"),
             "<bsdf> 'a' has the property 'relativePermittivity', which is not read: give the names of Mitsuba 3 (type,",
         ),
-        (
-            RADIO + shape("cube", moved('<translate X="1"/>')),
-            "has a to_world with <translate {'X': '1'}>, which",
-        ),
+        (RADIO + shape("cube", moved('<translate X="1"/>')), "has a to_world with <translate {'X': '1'}>, which"),
         (RADIO + shape("cube", moved("<lookat/>")), "shape 'it' has a to_world with <lookat {}>, which cannot be read"),
         (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
         (RADIO + shape("cube", moved('<rotate x="1"/>')), "has a to_world with <rotate {'x': '1'}>, which cannot"),

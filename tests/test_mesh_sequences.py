@@ -9,14 +9,7 @@ from mesh_rays import TURN, joined, load_meshes, shapes_of
 
 from sionna_partial.tracing.mesh import sequences as module
 from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
-from sionna_partial.tracing.mesh.sequences import (
-    MARGIN,
-    Rays,
-    Sequences,
-    collect_sequences,
-    shoot_rays,
-    view_sequences,
-)
+from sionna_partial.tracing.mesh.sequences import MARGIN, Rays, Sequences, collect_sequences, shoot_rays, view_sequences
 
 TX = np.array([0.3, -0.2, 0.1])
 
@@ -33,19 +26,15 @@ def points(rays: Rays, depth: int) -> np.ndarray:
     return TX + np.cumsum(steps, axis=1)
 
 
-UP = np.array([0.0, 0.0, 1.0])
-
-
 def box_planes() -> MeshPlanes:
     mesh = trimesh.creation.box((8, 6, 3))
     return group_planes(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
 
 
-def rays_along(face: list[list[int]], leg_m: list[list[float]], direction: np.ndarray | None = None) -> Rays:
-    """Rays with given faces and lengths; all legs go up unless directions are given."""
-    shape = (len(leg_m), len(leg_m[0]), 3)
-    directions = np.broadcast_to(UP, shape) if direction is None else direction
-    return Rays(np.array(face, np.int32), np.array(leg_m, np.float32), directions.astype(np.float32))
+def rays_along(face: list[list[int]], leg_m: list[list[float]]) -> Rays:
+    """Rays with given faces and lengths; all legs go up."""
+    up = np.broadcast_to(np.float32([0.0, 0.0, 1.0]), (len(leg_m), len(leg_m[0]), 3))
+    return Rays(np.array(face, np.int32), np.array(leg_m, np.float32), up)
 
 
 def sequence_planes(sequences: Sequences, node: int) -> list[int]:
@@ -68,15 +57,6 @@ class TestShootRays:
         mirrored = before - 2.0 * (before * normal[rays.face]).sum(axis=2)[:, :, None] * normal[rays.face]
         np.testing.assert_allclose(after, mirrored, atol=1e-5)
 
-    def test_lengths_in_a_box_are_those_of_the_unfolded_ray(self, tmp_path: Path) -> None:
-        """A ray in a box is a straight line in the lattice of its images: it has crossed as many walls as it met."""
-        size = np.array([8.0, 6.0, 3.0])
-        rays = shoot(tmp_path, trimesh.creation.box(size))
-        ahead = np.concatenate([rays.leg_m[:, :3].sum(axis=1), rays.leg_m.sum(axis=1)]).reshape(2, -1).mean(axis=0)
-        end = TX + ahead[:, None] * rays.direction[:, 0]
-        crossed = np.abs(np.rint(end / size)).sum(axis=1)
-        assert (crossed == 3).mean() > 0.998  # single precision sends a ray through a corner the other way
-
     def test_directions_are_those_of_sionna_rt(self, tmp_path: Path) -> None:
         rays = shoot(tmp_path, trimesh.creation.box((8, 6, 3)), max_depth=0)
         import mitsuba as mi
@@ -85,31 +65,11 @@ class TestShootRays:
         stock = mi.warp.square_to_uniform_sphere(fibonacci_lattice(2000)).numpy().T
         np.testing.assert_allclose(rays.direction[:, 0], stock, atol=1e-6)
 
-    def test_no_reflection_is_one_leg(self, tmp_path: Path) -> None:
-        rays = shoot(tmp_path, trimesh.creation.box((8, 6, 3)), max_depth=0)
-        assert rays.face.shape == (2000, 0)
-        assert rays.leg_m.shape == (2000, 1)
-        assert np.isfinite(rays.leg_m).all()
-
-    def test_rays_escape_for_good(self, tmp_path: Path) -> None:
-        triangle = trimesh.Trimesh([[2, -2, -2], [2, 2, -2], [2, 0, 3]], [[0, 1, 2]])
-        rays = shoot(tmp_path, triangle)
-        hit = rays.face[:, 0] >= 0
-        assert 0 < hit.sum() < 500
-        np.testing.assert_allclose(TX[0] + rays.leg_m[hit, 0] * rays.direction[hit, 0, 0], 2.0, atol=1e-5)
-        assert (rays.face[:, 1:] == -1).all()
-        assert np.isinf(rays.leg_m[:, 1:]).all()
-        assert np.isinf(rays.leg_m[~hit, 0]).all()
-
     def test_an_empty_scene_stops_no_ray(self, tmp_path: Path) -> None:
-        rays = shoot(tmp_path)
-        assert (rays.face == -1).all()
+        assert (shoot(tmp_path).face == -1).all()
 
-    @pytest.mark.parametrize("count", [0, 1])
-    def test_few_rays(self, tmp_path: Path, count: int) -> None:
-        scene = load_meshes(tmp_path, trimesh.creation.box((8, 6, 3)))
-        parts = list(shoot_rays(scene.mi_scene, shapes_of(scene, 1), TX, count, 2))
-        assert [part.face.shape for part in parts] == [(1, 2)] * count
+    def test_one_ray(self, tmp_path: Path) -> None:
+        assert shoot(tmp_path, trimesh.creation.box((8, 6, 3)), count=1, max_depth=2).face.shape == (1, 2)
 
     def test_parts_join_to_the_same_bytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         box = trimesh.creation.box((8, 6, 3))
@@ -120,31 +80,6 @@ class TestShootRays:
 
 
 class TestCollectChains:
-    def test_faces_of_one_plane_make_one_chain(self) -> None:
-        planes = box_planes()
-        first, second = (np.flatnonzero(planes.plane == plane) for plane in (0, 1))
-        rays = rays_along(
-            [[first[0], second[1]], [first[1], second[0]], [first[1], -1]], [[1, 2, 3], [2, 2, 1], [1, 9, 9]]
-        )
-        sequences = collect_sequences([rays], planes)
-        assert [sequence_planes(sequences, node) for node in range(sequences.size)] == [[0], [0, 1]]
-        assert sequences.rays == 3
-
-    def test_reach_is_the_longest_unfolded_length(self) -> None:
-        planes = box_planes()
-        rays = rays_along([[0, 5], [0, 5], [0, -1]], [[1, 2, 3], [2, 2, 1], [1, np.inf, np.inf]])
-        sequences = collect_sequences([rays], planes)
-        assert sequences.reach_m[:2].tolist() == [np.inf, 6.0]
-
-    def test_boxes_hold_the_directions_in_which_rays_left(self) -> None:
-        direction = np.random.default_rng(0).normal(size=(50, 3, 3))
-        direction /= np.linalg.norm(direction, axis=2, keepdims=True)
-        sequences = collect_sequences([rays_along([[0, 5]] * 50, [[1, 1, 1]] * 50, direction)], box_planes())
-        for node in range(2):
-            left = direction[:, node + 1].astype(np.float32)
-            np.testing.assert_array_equal(sequences.low[node], left.min(axis=0))
-            np.testing.assert_array_equal(sequences.high[node], left.max(axis=0))
-
     def test_as_many_chains_as_there_are(self) -> None:
         """More than the arrays hold at first, and the same for rays in parts."""
         planes = box_planes()
@@ -159,27 +94,6 @@ class TestCollectChains:
 
 
 class TestViewChains:
-    def test_images_in_a_box(self) -> None:
-        planes = box_planes()
-        face = [int(np.flatnonzero(planes.normal[planes.plane] @ axis)[0]) for axis in np.eye(3)]
-        tx = np.array([1.0, 2.0, 0.5])
-        views = view_sequences(collect_sequences([rays_along([face], [[1, 1, 1, 1]])], planes), planes, tx)
-        walls = np.array(
-            [planes.offset_m[planes.plane[f]] * planes.normal[planes.plane[f]][k] for k, f in enumerate(face)]
-        )
-        image = 2.0 * walls - tx
-        np.testing.assert_allclose(views.source_m[0], [image[0], 2.0, 0.5])
-        np.testing.assert_allclose(views.source_m[2], image)
-        assert views.depth.tolist() == [1, 2, 3]
-
-    def test_chains_that_begin_alike_are_together(self) -> None:
-        planes = box_planes()
-        first = [int(np.flatnonzero(planes.plane == plane)[0]) for plane in range(4)]
-        face = [[first[0], first[1]], [first[2], first[1]], [first[0], first[3]], [first[2], first[0]]]
-        sequences = collect_sequences([rays_along(face, [[1, 1, 1]] * 4)], planes)
-        order = view_sequences(sequences, planes, np.zeros(3)).order
-        assert [sequence_planes(sequences, node) for node in order] == [[0], [0, 1], [0, 3], [2], [2, 1], [2, 0]]
-
     def test_margin_is_no_more_than_a_small_plane_can_span(self) -> None:
         corners = np.array([[0, 0, 9], [0.1, 0, 9], [0, 0.1, 9], [-9, -9, -1], [9, -9, -1], [0, 9, -1]], float)
         planes = group_planes(corners, np.array([[0, 1, 2], [3, 4, 5]]))
@@ -193,6 +107,3 @@ class TestViewChains:
         np.testing.assert_allclose(
             view_sequences(sequences._replace(rays=10**6), planes, np.zeros(3)).margin[2], MARGIN * 3.545e-3, rtol=1e-3
         )
-
-    def test_no_rays(self) -> None:
-        assert len(view_sequences(collect_sequences([], box_planes()), box_planes(), np.zeros(3)).order) == 0

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from extruded import drawn
 from matplotlib.figure import Figure
 from PIL import Image
-from test_explore import plan
 from typer.testing import CliRunner
 
 import sionna_partial as sp
@@ -36,7 +36,7 @@ TX = (1.0, 1.9, 1.5)
 
 @pytest.fixture(scope="module")
 def hall() -> sp.PartialMap:
-    cells = plan(HALL, 0.2).state
+    cells = drawn(HALL, 0.2).state
     return sp.PartialMap(np.pad(cells, ((5, 5), (0, 15)), constant_values=2), 0.2, (-2.0, 3.0))
 
 
@@ -103,7 +103,7 @@ def test_gain_is_at_most_the_uncertainty(hall):
 
 
 def test_a_complete_map_has_none():
-    views = sp.next_views(plan("#####\n#...#\n#...#\n#####", 0.5), goal="area")
+    views = sp.next_views(drawn("#####\n#...#\n#...#\n#####", 0.5), goal="area")
     assert len(views) == 0
     assert yaml.safe_load(views.to_yaml())["poses"] == []
     assert isinstance(sp.plot_next_views(views), Figure)
@@ -200,20 +200,8 @@ class TestCommand:
     def test_what_it_writes_and_says(self, hall, tmp_path: Path):
         sp.save_map(hall, tmp_path / "map.yaml")
         x, y = map(str, at(1.0, 1.9))
-        arguments = [
-            "next",
-            tmp_path / "map.yaml",
-            "--tx",
-            x,
-            y,
-            "--start",
-            x,
-            y,
-            "--count",
-            "2",
-            "--out",
-            tmp_path / "o",
-        ]
+        options = ["--tx", x, y, "--start", x, y, "--count", 2, "--out", tmp_path / "o"]
+        arguments = ["next", tmp_path / "map.yaml", *options]
         result = CliRunner().invoke(cli.app, [*map(str, arguments)])
         assert result.exit_code == 0, result.output
         lines = result.stdout.splitlines()
@@ -224,6 +212,6 @@ class TestCommand:
             assert picture.width > 500
 
     def test_nothing_to_see(self, tmp_path: Path):
-        sp.save_map(plan("#####\n#...#\n#...#\n#####", 0.5), tmp_path / "map.yaml")
+        sp.save_map(drawn("#####\n#...#\n#...#\n#####", 0.5), tmp_path / "map.yaml")
         arguments = ["next", tmp_path / "map.yaml", "--goal", "area", "--out", tmp_path / "o"]
         assert "nothing unknown can be reached" in CliRunner().invoke(cli.app, [*map(str, arguments)]).stdout

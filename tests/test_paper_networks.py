@@ -195,9 +195,8 @@ def test_line_of_sight_fades_with_distance_like_free_space(trained, partial_stat
 def test_cells_without_links_fall_back_to_prior_knowledge():
     phi, _, _ = make_links(60)
     sight = phi.take(phi.link_state == LOS)
-    model = Predictor.fit(
-        sight, np.full(len(sight), LOS), sight.gain_db, settings=PredictorSettings(minimum_links=1000)
-    )
+    settings = PredictorSettings(minimum_links=1000)
+    model = Predictor.fit(sight, np.full(len(sight), LOS), sight.gain_db, settings=settings)
     answer = model.predict(dataclasses.replace(phi, link_state=np.full(len(phi), OUTAGE)))
     free_db = free_space_gain_db(phi.distance_m, FREQUENCY_HZ)
     np.testing.assert_allclose([answer.p_los, answer.p_nlos, answer.p_outage], 1 / 3, atol=1e-6)
@@ -225,7 +224,5 @@ def test_indoor(quick):
 def test_diverging_training():
     phi, state, gain_db = make_links(300)
     settings = PredictorSettings(steps=3, minimum_links=10)
-    with pytest.raises(
-        PredictorError, match=r"training of gain_\w+ diverged: learning_rate = 0.01, give a smaller one"
-    ):
+    with pytest.raises(PredictorError, match=r"training of gain_\w+ diverged: learning_rate = 0.01, give a smaller"):
         Predictor.fit(phi, state, np.where(gain_db > -150.0, gain_db + 1e30, gain_db), settings=settings)

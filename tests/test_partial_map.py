@@ -23,13 +23,6 @@ PLAN = PartialMap(np.array([[1, 1, 1, 1], [1, 0, 0, 2], [1, 1, 1, 1]]), 0.5, (10
 states = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=8), elements=st.integers(0, 2))
 
 
-def test_properties() -> None:
-    assert PLAN.shape == (3, 4)
-    assert PLAN.bounds_m == (10.0, -4.0, 12.0, -2.5)
-    assert PLAN.state.dtype == np.uint8
-    assert PLAN.origin_m == (10.0, -4.0)
-
-
 def test_state_is_a_read_only_copy() -> None:
     array = np.zeros((2, 2), dtype=np.uint8)
     partial = PartialMap(array, 0.1)
@@ -73,9 +66,7 @@ def test_cell_index() -> None:
 
 
 @given(states, st.floats(1e-3, 10.0), st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)))
-def test_every_cell_centre_has_its_index_and_state(
-    state: np.ndarray, resolution_m: float, origin_m: tuple[float, float]
-) -> None:
+def test_every_cell_centre_has_its_index_and_state(state: np.ndarray, resolution_m: float, origin_m: tuple) -> None:
     partial = PartialMap(state, resolution_m, origin_m)
     row, column = np.mgrid[: state.shape[0], : state.shape[1]]
     centres = np.stack([column, row], axis=-1) * resolution_m + resolution_m / 2 + np.array(origin_m)
@@ -122,27 +113,9 @@ def test_an_edge_has_the_freer_state_of_its_two_cells() -> None:
     assert PLAN.state_at(np.array([[10.5, -3.75], [10.25, -3.5]])).tolist() == [WALL, WALL]
 
 
-@pytest.mark.parametrize(
-    ("state", "complete"),
-    [
-        ([[1, 1, 1], [1, 0, 1], [1, 1, 1]], True),
-        ([[2, 1, 2], [1, 0, 1], [2, 1, 2]], True),
-        ([[1, 1, 1], [1, 0, 2], [1, 1, 1]], False),
-        ([[1, 0, 1], [1, 0, 1], [1, 1, 1]], False),
-        ([[1, 1, 1], [1, 0, 0], [1, 1, 1]], False),
-        ([[0]], False),
-        ([[1]], False),
-        ([[2]], False),
-    ],
-)
-def test_is_complete(state: list[list[int]], complete: bool) -> None:
-    """No free cell shares an edge with an unknown one, as all those beyond the grid are."""
-    for turned in (state, np.transpose(state)):
-        assert PartialMap(np.array(turned), 0.1).is_complete is complete
-
-
 @given(states)
-def test_is_complete_cell_by_cell(state: np.ndarray) -> None:
+def test_is_complete(state: np.ndarray) -> None:
+    """No free cell shares an edge with an unknown one, as all those beyond the grid are."""
     padded = np.pad(state, 1, constant_values=UNKNOWN)
     free = np.argwhere(padded == FREE)
     steps = ((0, 1), (1, 0), (0, -1), (-1, 0))
@@ -230,10 +203,7 @@ def test_positions_may_be_free_or_unknown() -> None:
         ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),
         ((9, -3.25, 1.5), "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: m"),
         ((12.5, -3.25, 1.5), "is outside the map"),
-        (
-            np.ma.masked_array((10.75, -3.25, 1.5), [0, 0, 1]),
-            "tx has masked values, whose data would be read",
-        ),
+        (np.ma.masked_array((10.75, -3.25, 1.5), [0, 0, 1]), "tx has masked values, whose data would be read"),
         (np.array([10.75, -3.25, 1.5 + 0j]), "is not numeric: give x, y, z in metres"),
         ((True, False, True), "tx has dtype bool: give x, y, z in metres"),
         ((10.75, -4.1, 1.5), "is outside the map"),

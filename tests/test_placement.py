@@ -19,6 +19,7 @@ PROBABILITIES = np.array([[0.1, 1.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.3], [0.3, 0.0,
 MEANS_DB = np.array([[-150.0] * 4, [-80.0, -90.0, -70.0, -101.0], [-105.0, -110.0, -99.0, -95.0]])
 STDS_DB = np.array([[0.0] * 4, [3.0, 4.0, 2.0, 5.0], [8.0, 9.0, 7.0, 6.0]])
 PERCENTILE = PlacementSettings("percentile")
+DIRECT = sp.TraceSettings(max_depth=0, diffraction=False)
 
 
 def placed_bytes(found: TransmitterPlacement, folder: Path) -> bytes:
@@ -76,8 +77,7 @@ class TestSearch:
 
     def test_more_starts_on_a_large_map(self) -> None:
         hall = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.5)
-        settings = sp.TraceSettings(max_depth=0, diffraction=False)
-        assert len(sp.place_transmitter(hall, trace_settings=settings).starts_m) == STARTS[1]
+        assert len(sp.place_transmitter(hall, trace_settings=DIRECT).starts_m) == STARTS[1]
 
     def test_heights_and_free_cells(self) -> None:
         found = placed(tx_height_m=2.5, rx_height_m=0.7)
@@ -96,20 +96,13 @@ class TestSearch:
     def test_score_is_that_of_traced_and_predicted_links(self, options: dict[str, Any]) -> None:
         found = placed(**options)
         far = np.linalg.norm(found.rx_m - found.position_m, axis=1) > 0.02
-        links = sp.trace_links(
-            found.partial,
-            found.position_m,
-            found.rx_m[far],
-            trace_settings=sp.TraceSettings(max_depth=0, diffraction=False),
-        )
+        links = sp.trace_links(found.partial, found.position_m, found.rx_m[far], trace_settings=DIRECT)
         answer = sp.Predictor.load("paper").predict(sp.link_features(found.partial, links))
         np.testing.assert_allclose(found.values[far], link_values(answer, found.settings), atol=1e-6)
 
     def test_path_of_a_map(self, tmp_path: Path) -> None:
         sp.save_map(home(TWO_ROOMS), tmp_path / "map.yaml")
-        found = sp.place_transmitter(
-            tmp_path / "map.yaml", trace_settings=sp.TraceSettings(max_depth=0, diffraction=False)
-        )
+        found = sp.place_transmitter(tmp_path / "map.yaml", trace_settings=DIRECT)
         np.testing.assert_array_equal(found.position_m, placed(TWO_ROOMS).position_m)
 
     def test_progress_rises_to_one(self) -> None:

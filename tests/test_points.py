@@ -78,13 +78,8 @@ def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
 
 
 def require_room(partial: PartialMap) -> None:
-    assert partial.state_at(np.array([INSIDE, IN_WALL, OUTSIDE, (3.27, 1.27)])).tolist() == [
-        FREE,
-        WALL,
-        UNKNOWN,
-        UNKNOWN,
-    ]
-    assert partial.state_at(np.array([(1.4, 1.3), (3.03, 1.3)])).tolist() == [FREE, WALL]  # under the table; the pillar
+    assert states(partial, INSIDE, IN_WALL, OUTSIDE, (3.27, 1.27)) == [FREE, WALL, UNKNOWN, UNKNOWN]
+    assert states(partial, (1.4, 1.3), (3.03, 1.3)) == [FREE, WALL]  # under the table; the pillar
     assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
     assert partial.is_complete
     assert (partial.state == FREE).sum() * 0.05**2 == pytest.approx(5 * 3 - 0.25, rel=0.05)
@@ -140,12 +135,7 @@ def test_walls_alone() -> None:
     walls = walls[(np.abs(walls[:, :2] - (1.4, 1.3)) > 0.6).any(axis=1)]
     assert states(map_from_points(walls), INSIDE) == [UNKNOWN]
     partial = map_from_points(walls, sensor_positions_m=[(1.0, 1.25, 0.9), (1.01, 1.25, 0.9)])
-    assert states(partial, INSIDE, IN_WALL, OUTSIDE, (4.5, 1.25)) == [
-        FREE,
-        WALL,
-        UNKNOWN,
-        UNKNOWN,
-    ]
+    assert states(partial, INSIDE, IN_WALL, OUTSIDE, (4.5, 1.25)) == [FREE, WALL, UNKNOWN, UNKNOWN]
     around = map_from_points(walls, sensor_positions_m=[(1.0, 1.25), (4.5, 2.0)])
     assert states(around, (4.5, 1.25)) == [FREE]
 

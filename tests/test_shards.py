@@ -72,12 +72,6 @@ class TestShard:
         np.testing.assert_array_equal(columns["gain_db"], links.gain_db)
         np.testing.assert_array_equal(columns["partial_link_state"], links.phi.link_state)
 
-    def test_maps_come_back(self, links: LinkTable, shard: Path) -> None:
-        found = read_shard(shard)
-        assert found.maps == links.maps
-        assert found.complete_maps == links.complete_maps
-        assert {each.interior_cells is None for each in found.maps} == {True, False}
-
     def test_notes(self, shard: Path) -> None:
         notes = shard_metadata(shard)
         assert {name: notes[name] for name in notes if name != "maps"} == {"format": FORMAT, **NOTES}
@@ -98,9 +92,7 @@ class TestDamaged:
     def test_truncated(self, shard: Path, share: float) -> None:
         content = shard.read_bytes()
         shard.write_bytes(content[: int(share * len(content))])
-        with pytest.raises(
-            PredictorError, match=r"villa\.parquet' is damaged, or no Parquet file .*: delete it and run"
-        ):
+        with pytest.raises(PredictorError, match=r"villa\.parquet' is damaged, or no Parquet file .*: delete it and"):
             read_shard(shard)
 
     def test_one_byte_of_a_column(self, shard: Path) -> None:
@@ -126,9 +118,7 @@ class TestDamaged:
 
     def test_foreign(self, tmp_path: Path) -> None:
         pq.write_table(pa.table({"a": [1]}), tmp_path / "foreign.parquet")
-        with pytest.raises(
-            PredictorError, match=r"foreign\.parquet' is no shard of this version .* build the data set"
-        ):
+        with pytest.raises(PredictorError, match=r"foreign\.parquet' is no shard of this version .* build the data"):
             read_shard(tmp_path / "foreign.parquet")
 
     def test_values_that_no_link_has(self, shard: Path) -> None:
@@ -219,7 +209,5 @@ class TestDataset:
     @pytest.mark.parametrize("text", ["", "[]", '{"homes": [3]}'])
     def test_damaged_list(self, tmp_path: Path, text: str) -> None:
         (tmp_path / "dataset.json").write_text(text)
-        with pytest.raises(
-            PredictorError, match=r"dataset\.json' is damaged .*: build the data set again in a new folder"
-        ):
+        with pytest.raises(PredictorError, match=r"dataset\.json' is damaged .*: build the data set again in a new"):
             read_dataset(tmp_path)

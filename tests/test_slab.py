@@ -21,9 +21,8 @@ def test_as_sionna_has_it(permittivity: float, conductivity_s_m: float, thicknes
     loss = conductivity_s_m / (2.0 * np.pi * FREQUENCY_HZ * VACUUM_F_M)
     cosine = mi.Float(np.cos(np.radians(ANGLES_DEG)).astype(np.float32))
     wavelength = mi.Float(299_792_458.0 / FREQUENCY_HZ)
-    te, tm, *_ = itu_coefficients_single_layer_slab(
-        cosine, mi.Complex2f(permittivity, -loss), mi.Float(thickness_m), wavelength
-    )
+    eta = mi.Complex2f(permittivity, -loss)
+    te, tm, *_ = itu_coefficients_single_layer_slab(cosine, eta, mi.Float(thickness_m), wavelength)
     for name, theirs in (("te", te), ("tm", tm)):
         ours_db = reflection_loss_db(permittivity, conductivity_s_m, thickness_m, FREQUENCY_HZ, ANGLES_DEG, name)
         amplitude = np.hypot(theirs.real.numpy(), theirs.imag.numpy())

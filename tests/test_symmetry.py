@@ -47,9 +47,7 @@ def links_of(seed: int, stage: int, which: int = 0, offset_m: float = 0.0) -> sp
 
 @given(st.sampled_from([60_001, 60_004]), st.sampled_from([0, 80]), st.integers(0, 7), st.sampled_from(OFFSETS_M))
 @settings(max_examples=15, deadline=None)
-def test_gains_and_states_are_those_of_the_building_as_it_was(
-    seed: int, stage: int, which: int, offset_m: float
-) -> None:
+def test_gains_and_states_are_those_of_the_building(seed: int, stage: int, which: int, offset_m: float) -> None:
     here, there = links_of(seed, stage), links_of(seed, stage, which, offset_m)
     assert (here.link_state == there.link_state).mean() > 0.99
     assert (np.abs(here.gain_db - there.gain_db) <= 0.5).mean() >= 0.99

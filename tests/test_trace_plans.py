@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from extruded import ROOM, SPLINTERS, drawn, extrude, specular_blocks, specular_lengths_m
 from numpy.typing import NDArray
-from test_trace import _grid, _half_seen_room, _room
+from test_trace import _grid, _half_seen_room, _room, all_paths
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings
 from sionna_partial.tracing.engine import SceneSolver
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
@@ -45,9 +45,7 @@ LATTICE = np.array([[x, y, 1.2] for x in (0.5, 1.0, 2.0, 4.0, 5.0, 5.5) for y in
 
 
 def _trace(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], folder: Path) -> SolvedPaths:
-    solver = SceneSolver(
-        write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, TraceSettings(power_tolerance_db=0.0)
-    )
+    solver = SceneSolver(write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, all_paths())
     blocks = specular_blocks(geometry, tx, rx, 2)
     return join_paths([solver.verify(block, tx, rx)[0] for block, _ in blocks], 2)
 
@@ -76,6 +74,17 @@ def test_every_path_of_the_image_method_and_no_other(name: str, tmp_path: Path) 
     assert total >= len(rx) / 2
 
 
+def test_blocks_of_candidates_together_hold_what_one_block_holds() -> None:
+    tx, rx = np.array([1.1, 0.7, 1.2]), np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4]])
+    ((whole, _),) = specular_blocks(extrude(ROOM), tx, rx, 3)
+    parts, shares = zip(*specular_blocks(extrude(ROOM), tx, rx, 3, pairs_at_once=3), strict=True)
+    assert len(parts) > 3
+    assert list(shares) == sorted(shares)
+    assert shares[-1] == 1.0
+    for name in ("rx", "face", "vertices_m"):
+        np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
+
+
 class TestJunctions:
     def test_nothing_leaks_through_the_joints_of_a_closed_wall(self) -> None:
         state = _room().state.copy()
@@ -87,12 +96,8 @@ class TestJunctions:
 
     @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
     def test_no_path_bends_where_three_walls_meet(self, partial: PartialMap) -> None:
-        links = trace_links(
-            partial,
-            (1.05, 2.95, 1.5),
-            _grid(partial, 0.5),
-            trace_settings=TraceSettings(power_tolerance_db=0.0, open_ends=True),
-        )
+        settings = all_paths(open_ends=True)
+        links = trace_links(partial, (1.05, 2.95, 1.5), _grid(partial, 0.5), trace_settings=settings)
         edges = np.unique(links.vertices_m[links.interactions == 8][:, :2].round(2), axis=0)
         jambs = [[3.05, 1.45], [3.05, 2.55]]
         assert {tuple(edge) for edge in jambs} <= {tuple(edge) for edge in edges.tolist()}
@@ -106,13 +111,7 @@ class TestOpenEnds:
         tx, rx = (1.5, 0.5, 1.5), [[0.5, 4.5, 1.5]]
         scene = SceneSettings(floor_extent="none")
         quiet, asked = (
-            trace_links(
-                partial,
-                tx,
-                rx,
-                trace_settings=TraceSettings(power_tolerance_db=0.0, open_ends=each),
-                scene_settings=scene,
-            )
+            trace_links(partial, tx, rx, trace_settings=all_paths(open_ends=each), scene_settings=scene)
             for each in (False, True)
         )
         assert quiet.link_state.tolist() == [LinkState.OUTAGE]
@@ -129,9 +128,7 @@ class TestDiffractionSetting:
     def test_plans_diffract_unless_told_otherwise(self) -> None:
         tx, rx = (1.03, 0.52, 1.5), [[4.02, 0.93, 1.5]]
         default, on, off = (
-            trace_links(
-                _room(), tx, rx, trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=2, diffraction=each)
-            )
+            trace_links(_room(), tx, rx, trace_settings=all_paths(max_depth=2, diffraction=each))
             for each in (None, True, False)
         )
         assert default.a.tobytes() == on.a.tobytes()
@@ -145,7 +142,7 @@ class TestCeiling:
     @pytest.mark.parametrize("diffraction", [False, True])
     def test_without_it_the_paths_that_do_not_touch_it_remain(self, diffraction: bool) -> None:
         tx, rx = (1.05, 2.95, 1.5), _grid(_room(), 1.0)
-        settings = TraceSettings(power_tolerance_db=0.0, max_depth=3, diffraction=diffraction)
+        settings = all_paths(max_depth=3, diffraction=diffraction)
         under, open_air = (
             trace_links(_room(), tx, rx, trace_settings=settings, scene_settings=SceneSettings(ceiling=each))
             for each in (True, False)
@@ -213,14 +210,9 @@ class TestTransmitters:
 
 def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:
     """Sionna RT makes a path longer that has fewer interactions after its diffraction than others in its buffer."""
-    walls = drawn(
-        "............. .###########. .#....#....#. .#....#....#. .#.........#. .###########. .............", 0.5
-    )
+    walls = drawn("............. .###########. .#....#....#. .#....#....#. .#.........#. .###########. .............")
     tx, rx = np.array([1.3, 1.7, 1.2]), np.array([[4.4, 2.2, 1.5], [3.9, 1.4, 1.9]])
-    shallow, deep = (
-        trace_links(walls, tx, rx, trace_settings=TraceSettings(power_tolerance_db=0.0, max_depth=depth))
-        for depth in (2, 3)
-    )
+    shallow, deep = (trace_links(walls, tx, rx, trace_settings=all_paths(max_depth=depth)) for depth in (2, 3))
     bent = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
     assert len(bent) > 3
     for path in bent:

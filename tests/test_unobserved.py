@@ -1,12 +1,11 @@
 """How much of segments runs through unknown cells: by hand, in exact fractions, and by its properties."""
 
-import functools
 from fractions import Fraction
 from itertools import pairwise, product
 
-import extruded
 import numpy as np
 import pytest
+from extruded import HALF, drawn
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -16,17 +15,6 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.unobserved import line_fractions, unobserved_lengths_m, walled_lengths_m
 
 FREE, WALL, UNKNOWN = (int(state) for state in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
-
-
-drawn = functools.partial(extruded.drawn, resolution_m=1.0)
-
-HALF = drawn("""
-    ##########
-    #....????#
-    #....????#
-    #....????#
-    ##########
-""")
 
 
 def length_m(partial, start, end):
@@ -56,15 +44,6 @@ def test_length_by_hand(start, end, expected_m):
     assert length_m(HALF, start, end) == pytest.approx(expected_m, abs=1e-12)
 
 
-def test_diagonal_through_corners_by_hand():
-    chess = drawn("""
-        ?.
-        .?
-    """)
-    assert length_m(chess, (0.0, 0.0, 1.0), (2.0, 2.0, 1.0)) == pytest.approx(0.0, abs=1e-9)
-    assert length_m(chess, (0.0, 2.0, 1.0), (2.0, 0.0, 1.0)) == pytest.approx(np.sqrt(8), abs=1e-9)
-
-
 @pytest.mark.parametrize(
     ("below", "above", "expected_m"),
     [(".", "?", 0.0), ("?", ".", 0.0), ("#", "?", 1.0), ("?", "#", 1.0), ("#", "#", 0.0), ("?", "?", 1.0)],
@@ -89,9 +68,7 @@ def test_no_segments(measure):
 def test_many_segments_are_measured_as_few():
     """By several threads."""
     starts, ends = np.random.default_rng(2).uniform(-1.0, 11.0, (2, 50_000, 2))
-    blocks = [
-        line_fractions(HALF.state, *ends_of) for ends_of in zip(np.split(starts, 10), np.split(ends, 10), strict=True)
-    ]
+    blocks = [line_fractions(HALF.state, *each) for each in zip(np.split(starts, 10), np.split(ends, 10), strict=True)]
     np.testing.assert_array_equal(line_fractions(HALF.state, starts, ends), np.concatenate(blocks))
 
 
@@ -213,7 +190,7 @@ def test_revealing_cells_never_raises_it(state, start, end, data):
 class TestCompleteMap:
     """A closed room, and unknown space around it in which another part of the building may be."""
 
-    ROOM = extruded.drawn("??????? ?#####? ?#...#? ?#...#? ?#####? ??????? ???????", 1.0)
+    ROOM = drawn("??????? ?#####? ?#...#? ?#...#? ?#####? ??????? ???????", 1.0)
 
     def test_nothing_is_unobserved_from_a_known_cell(self) -> None:
         inside, outside = np.array([3.5, 4.5, 1.5]), np.array([[2.5, 3.5, 1.5], [0.5, 0.5, 1.5]])

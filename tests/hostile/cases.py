@@ -148,10 +148,7 @@ KINDS = (
     *("predictor.keras", "predictor.json", "coverage.nc", "channels.nc", "dataset.parquet", "dataset.json"),
 )
 
-STOPPED = COMMANDS | {
-    "dataset": "OUT --homes 2",
-    "train": "LINKS --out OUT --networks paper --test-fraction 0",
-}
+STOPPED = COMMANDS | {"dataset": "OUT --homes 2", "train": "LINKS --out OUT --networks paper --test-fraction 0"}
 """Subcommands that are told to end in the middle of what they do, and then called again."""
 
 STOPPED_AFTER_S = (0.1, 10.0)
