@@ -14,7 +14,6 @@ import typer
 import xarray as xr
 import yaml
 from coverage_cases import PICTURE, TX, map_of
-from meshes import room as room_mesh
 from PIL import Image
 from typer.testing import CliRunner, Result
 
@@ -172,27 +171,30 @@ class TestPredict:
         assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
 
 
-@pytest.mark.filterwarnings("always::sionna_partial.maps.partial_map.MapWarning")
 class TestMap:
-    def test_strict_and_warnings_of_one_line_each(self, map_path: Path, tmp_path: Path) -> None:
+    @pytest.mark.filterwarnings("always::sionna_partial.maps.partial_map.MapWarning")
+    @pytest.mark.parametrize("strict", [False, True])
+    def test_strict_and_warnings_of_one_line_each(self, strict: bool, map_path: Path, tmp_path: Path) -> None:
         sheet = yaml.safe_load(map_path.read_text()) | {"free_thresh": 0.25, "origin": [-2.0, -1.0, 0.5]}
         map_path.write_text(yaml.safe_dump(sheet))
-        for options, strict in (([], False), (["--strict"], True)):
-            result = run("export-scene", map_path, "--out", tmp_path / "scene", *options)
-            assert result.exit_code == 0, result.output
-            assert load_map(tmp_path / "scene") == load_map(map_path, strict=strict)
-            words = ["cells of shade 205 would read as free"] * (not strict) + ["origin yaw 0.5 rad: the map is turned"]
-            for line, word in zip(result.stderr.splitlines(), words, strict=True):
-                assert line.startswith("warning: ")
-                assert word in line
-
-    def test_axis_and_height_band_of_a_mesh(self, tmp_path: Path) -> None:
-        room_mesh().export(tmp_path / "room.glb")
-        options = ["--up", "y", "--height-band", 0.5, 2]
-        result = run("export-scene", tmp_path / "room.glb", "--out", tmp_path / "scene", *options)
+        result = run("export-scene", map_path, "--out", tmp_path / "scene", *["--strict"] * strict)
         assert result.exit_code == 0, result.output
-        expected = load_map(tmp_path / "room.glb", up="y", height_band_m=(0.5, 2.0))
-        assert np.array_equal(load_map(tmp_path / "scene").state, expected.state)
+        assert load_map(tmp_path / "scene") == load_map(map_path, strict=strict)
+        words = ["cells of shade 205 would read as free"] * (not strict) + ["origin yaw 0.5 rad: the map is turned"]
+        for line, word in zip(result.stderr.splitlines(), words, strict=True):
+            assert line.startswith("warning: ")
+            assert word in line
+
+    def test_axis_and_height_band_of_a_cloud(self, tmp_path: Path) -> None:
+        points_m = np.random.default_rng(0).uniform((0, 0, 0), (2, 3, 1), (4000, 3))
+        points_m[:2000, 0] = 0.0
+        np.savetxt(tmp_path / "cloud.xyz", points_m)
+        maps = [load_map(tmp_path / "cloud.xyz", up="y", height_band_m=band) for band in ((2.5, 2.9), None)]
+        assert maps[0] != maps[1]
+        options = ["--up", "y", "--height-band", 2.5, 2.9]
+        result = run("export-scene", tmp_path / "cloud.xyz", "--out", tmp_path / "scene", *options)
+        assert result.exit_code == 0, result.output
+        assert load_map(tmp_path / "scene") == maps[0]
 
 
 class TestExportScene:
@@ -261,7 +263,7 @@ class TestInfo:
         environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/no/such/libLLVM.so", "COLUMNS": "1000"}
         environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
         result = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60
+            [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
         )
         assert result.returncode == 1, result.stderr
         assert "unset DRJIT_LIBLLVM_PATH and run pip install" in result.stdout

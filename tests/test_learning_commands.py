@@ -124,32 +124,35 @@ class TestDataset:
 
 class TestTrain:
     @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
-    @pytest.mark.parametrize("networks", ["paper", "map"])
-    def test_what_it_writes_and_says(self, networks: str, dataset: Path, tmp_path: Path) -> None:
-        out = tmp_path / "run"
-        options = ["--test-fraction", 0.5, "--networks", networks, "--passes", 2, "--seed", 3]
-        result = run("train", dataset, "--out", out, *options)
+    @pytest.mark.parametrize(
+        ("words", "settings", "fraction"),
+        [
+            ("", PredictorSettings("map", 60e9, diffraction=False), 0.3),
+            (
+                "--test-fraction 0.5 --networks paper --passes 2 --seed 3",
+                PredictorSettings("paper", 60e9, diffraction=False, passes=2, seed=3),
+                0.5,
+            ),
+        ],
+        ids=["defaults", "options"],
+    )
+    def test_what_it_writes_and_says(
+        self, words: str, settings: PredictorSettings, fraction: float, tmp_path: Path
+    ) -> None:
+        table, out = make_table(homes=3, links=20), tmp_path / "run"
+        dataset = make_dataset(tmp_path / "links", table, frequency_hz=60e9, diffraction=False)
+        result = run("train", dataset, "--out", out, *words.split())
         assert result.exit_code == 0, result.output
         names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
         assert sorted(path.name for path in out.iterdir()) == names
         *lines, hint = result.stdout.splitlines()
         assert lines[-6:] == [f"wrote {out / name}" for name in names]
         assert hint.endswith(f"sionna-partial evaluate {dataset} --predictor {out / 'predictor.keras'} --out REPORT")
-        assert "### Test homes (2), receivers indoors" in result.stdout
-        found = Predictor.load(out / "predictor.keras").settings
-        assert (found.networks, found.passes, found.seed, found.frequency_hz) == (networks, 2, 3, 28e9)
+        assert Predictor.load(out / "predictor.keras").settings == settings
         split = json.loads((out / "split.json").read_text())
-        assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
-
-    @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
-    def test_defaults_and_the_frequency_of_the_data_set(self, tmp_path: Path) -> None:
-        table = make_table(homes=3, links=5, stages=(0,))
-        folder = make_dataset(tmp_path / "links", table, frequency_hz=60e9, diffraction=False)
-        result = run("train", folder, "--out", tmp_path / "run")
-        assert result.exit_code == 0, result.output
-        settings = PredictorSettings("map", frequency_hz=60e9, diffraction=False)
-        assert Predictor.load(tmp_path / "run" / "predictor.keras").settings == settings
-        assert json.loads((tmp_path / "run" / "split.json").read_text())["test_fraction"] == 0.3
+        tests = round(3 * fraction)
+        assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (fraction, 3 - tests, tests)
+        assert f"### Test homes ({tests}), receivers indoors" in result.stdout
 
     @pytest.mark.parametrize(
         ("words", "message"),
