@@ -7,6 +7,7 @@ from extruded import drawn
 
 from sionna_partial.coverage import predict_map
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.predictor import Predictor
 
 PICTURE = """
 ????????????
@@ -45,8 +46,14 @@ def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float
 
 
 @cache
+def shipped(name: str = "map") -> Predictor:
+    """Return a shipped predictor; reading it takes longer than most predictions."""
+    return Predictor.load(name)
+
+
+@cache
 def _predicted(several: bool) -> xr.Dataset:
-    return predict_map(map_of(PICTURE), SEVERAL if several else TX, spacing_m=0.25)
+    return predict_map(map_of(PICTURE), SEVERAL if several else TX, spacing_m=0.25, predictor=shipped())
 
 
 def small_coverage(*, several: bool = False) -> xr.Dataset:

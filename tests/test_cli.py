@@ -13,7 +13,7 @@ import pytest
 import typer
 import xarray as xr
 import yaml
-from coverage_cases import PICTURE, TX, map_of
+from coverage_cases import PICTURE, TX, map_of, shipped
 from PIL import Image
 from typer.testing import CliRunner, Result
 
@@ -61,7 +61,7 @@ class TestPredict:
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in names]
         assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "coverage.pgm"}
         coverage = sp.load_coverage(tmp_path / "out" / "coverage.nc")
-        xr.testing.assert_identical(coverage, sp.predict_map(map_of(PICTURE), TX))
+        xr.testing.assert_identical(coverage, sp.predict_map(map_of(PICTURE), TX, predictor=shipped()))
 
     def test_every_option(self, tmp_path: Path) -> None:
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
@@ -74,7 +74,7 @@ class TestPredict:
             (*TX, 2.0),
             rx_height_m=1.0,
             spacing_m=0.5,
-            predictor="paper",
+            predictor=shipped("paper"),
             scene_settings=SceneSettings(material=Material(4.0, 0.1, 0.2)),
             trace_settings=TraceSettings(frequency_hz=60e9, max_depth=2, diffraction=False),
             receivers="anywhere",

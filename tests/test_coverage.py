@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import xarray as xr
-from coverage_cases import COMPLETE, PICTURE, TX, map_of
+from coverage_cases import COMPLETE, PICTURE, TX, map_of, shipped
 from extruded import drawn
 from predictor_links import arrays
 from scipy.stats import norm
@@ -18,18 +18,24 @@ from sionna_partial.export import load_coverage
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
-from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.trace import trace_links
 
-QUICK = {"predictor": "paper", "trace_settings": TraceSettings(max_depth=0, diffraction=False)}
-"""Options where receivers and cells matter, and the prediction does not."""
+
+def predicted(partial, tx=TX, **options):
+    return predict_map(partial, tx, **{"predictor": shipped(), **options})
+
+
+def quickly_predicted(*arguments, **options):
+    """Predict where receivers and cells matter, and the gains do not."""
+    settings = TraceSettings(max_depth=0, diffraction=False)
+    return predicted(*arguments, predictor=shipped("paper"), trace_settings=settings, **options)
 
 
 @pytest.fixture(scope="module")
 def anywhere():
     """The map of `coverage` for receivers that may be outside."""
-    return predict_map(map_of(PICTURE), TX, spacing_m=0.25, receivers="anywhere")
+    return predicted(map_of(PICTURE), spacing_m=0.25, receivers="anywhere")
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +72,7 @@ def test_all_documented_variables_are_there_and_missing_exactly_where_no_receive
 
 def test_each_receiver_has_the_prediction_of_its_own_link(coverage):
     """As traced and predicted step by step, in another order of the receivers."""
-    partial, model, valid = map_of(PICTURE), Predictor.load(), coverage["valid"].to_numpy()
+    partial, model, valid = map_of(PICTURE), shipped(), coverage["valid"].to_numpy()
     x, y = np.meshgrid(coverage["x"], coverage["y"])
     order = np.random.default_rng(0).permutation(valid.sum())
     rx_m = np.column_stack([x[valid], y[valid], np.full(valid.sum(), 1.5)])[order]
@@ -156,22 +162,22 @@ def test_a_transmitter_behind_the_walls_of_a_complete_map_is_predicted():
 
 def test_a_map_without_walls_and_one_that_is_all_unknown_are_answered():
     for partial in (PartialMap(np.zeros((8, 12), dtype=np.uint8), 0.5), unknown_map()):
-        coverage = predict_map(partial, (1.1, 1.1), spacing_m=0.5)
+        coverage = predicted(partial, (1.1, 1.1), spacing_m=0.5)
         assert coverage["valid"].all()
         assert np.isfinite(coverage["gain_mean_db"]).all()
 
 
 def test_no_receiver_stands_at_the_transmitter():
-    coverage = predict_map(unknown_map(), (1.75, 2.25), spacing_m=0.5, **QUICK)
+    coverage = quickly_predicted(unknown_map(), (1.75, 2.25), spacing_m=0.5)
     at_tx = ~coverage["valid"].to_numpy()
     assert at_tx.sum() == 1
     assert np.isnan(coverage["gain_mean_db"].sel(x=1.75, y=2.25))
     assert coverage["cell_state"].sel(x=1.75, y=2.25) == CellState.UNKNOWN
-    assert predict_map(unknown_map(), (1.75, 2.25, 1.6), spacing_m=0.5, **QUICK)["valid"].all()
+    assert quickly_predicted(unknown_map(), (1.75, 2.25, 1.6), spacing_m=0.5)["valid"].all()
 
 
 def test_at_low_frequencies_friis_stays_below_0_db():
-    coverage = predict_map(unknown_map(), (1.75, 2.25), spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=30e6))
+    coverage = predicted(unknown_map(), (1.75, 2.25), spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=30e6))
     distance_m = np.hypot(coverage["x"] - 1.75, coverage["y"] - 2.25)
     np.testing.assert_array_equal(coverage["valid"], (distance_m >= 9.99308 / (4 * np.pi)).transpose("y", "x"))
 
@@ -179,7 +185,7 @@ def test_at_low_frequencies_friis_stays_below_0_db():
 def test_receivers_within_a_centimetre_of_a_wall_are_masked():
     state = np.zeros((6, 6), dtype=np.uint8)
     state[:, 3] = CellState.WALL
-    coverage = predict_map(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=0.2, **QUICK)
+    coverage = quickly_predicted(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=0.2)
     x = coverage["x"].to_numpy()
     near_m = np.maximum(1.5 - x, x - 2.0)
     np.testing.assert_array_equal(coverage["valid"].to_numpy().all(axis=0), near_m > 0.01)
@@ -189,7 +195,7 @@ def test_receivers_within_a_centimetre_of_a_wall_are_masked():
 def test_a_wall_thinner_than_a_receiver_cell_is_kept_for_pictures():
     state = np.zeros((6, 6), dtype=np.uint8)
     state[4, 0] = CellState.WALL
-    coverage = predict_map(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=1.5, **QUICK)
+    coverage = quickly_predicted(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=1.5)
     assert coverage["valid"].all()
     expected = np.zeros((2, 2), dtype=np.int64)
     for row in (2, 3):
@@ -202,7 +208,7 @@ def test_a_wall_thinner_than_a_receiver_cell_is_kept_for_pictures():
 def test_receivers_fill_the_map_and_wall_parts_cover_every_wall_and_nothing_far_from_one(spacing_m):
     state = (np.random.default_rng(round(10 * spacing_m)).random((7, 9)) < 0.2).astype(np.uint8)
     state[0, 0] = CellState.FREE
-    coverage = predict_map(PartialMap(state, 0.5), (0.2, 0.2), spacing_m=spacing_m, **QUICK)
+    coverage = quickly_predicted(PartialMap(state, 0.5), (0.2, 0.2), spacing_m=spacing_m)
     bits, x_m, y_m = (coverage[name].to_numpy() for name in ("wall_parts", "x", "y"))
     for axis, length_m in ((x_m, 4.5), (y_m, 3.5)):
         assert axis[0] == pytest.approx(spacing_m / 2)
@@ -220,7 +226,7 @@ def test_receivers_fill_the_map_and_wall_parts_cover_every_wall_and_nothing_far_
 
 
 def test_moving_the_map_moves_the_answer(coverage):
-    far = predict_map(map_of(PICTURE, origin_m=(499_999.0, 4_500_002.0)), (500_000.6, 4_500_003.6), spacing_m=0.25)
+    far = predicted(map_of(PICTURE, origin_m=(499_999.0, 4_500_002.0)), (500_000.6, 4_500_003.6), spacing_m=0.25)
     for name in ATTRIBUTES:
         np.testing.assert_allclose(coverage[name], far[name], atol=1e-3, err_msg=name)
 
@@ -233,10 +239,10 @@ def test_a_path_is_read(coverage, tmp_path):
 
 
 def test_a_predictor_is_used_as_it_is():
-    mine = replace(Predictor.load("paper"), name="mine")
-    coverage, shipped = (predict_map(map_of(PICTURE), TX, spacing_m=0.5, predictor=each) for each in (mine, "paper"))
+    mine = replace(shipped("paper"), name="mine")
+    coverage, by_name = (predicted(map_of(PICTURE), spacing_m=0.5, predictor=each) for each in (mine, "paper"))
     assert coverage.attrs["predictor"] == "mine"
-    xr.testing.assert_equal(coverage, shipped)
+    xr.testing.assert_equal(coverage, by_name)
 
 
 @pytest.mark.parametrize(
@@ -256,16 +262,15 @@ def test_a_predictor_is_used_as_it_is():
     ],
 )
 def test_a_predictor_trained_on_other_traces_is_warned_about(caplog, settings, words):
-    predict_map(map_of(PICTURE), TX, spacing_m=1.0, **settings)
+    predicted(map_of(PICTURE), spacing_m=1.0, **settings)
     found = [message for message in caplog.messages if message.startswith("predictor 'map' was trained ")]
     assert len(found) == (words is not None)
     assert all(words in message for message in found)
 
 
 def test_settings_reach_the_tracer_and_the_attributes():
-    coverage = predict_map(
+    coverage = predicted(
         map_of(PICTURE),
-        TX,
         rx_height_m=1.0,
         spacing_m=0.5,
         scene_settings=SceneSettings(material=Material(itu="concrete")),
@@ -277,10 +282,10 @@ def test_settings_reach_the_tracer_and_the_attributes():
     assert json.loads(attributes["trace_settings"])["max_depth"] == 3
     assert json.loads(attributes["scene_settings"])["material"]["itu"] == "concrete"
     assert "sionna-rt" in attributes["source"]
-    assert (attributes["predictor"], attributes["predictor_sha256"]) == ("map", Predictor.load().fingerprint)
+    assert (attributes["predictor"], attributes["predictor_sha256"]) == ("map", shipped().fingerprint)
     assert float(coverage["distance_m"].min()) >= 0.5
     partial = replace(map_of(PICTURE), material=Material(itu="concrete"))
-    of_map = predict_map(partial, TX, rx_height_m=1.0, spacing_m=0.5, trace_settings=TraceSettings(60e9, 3))
+    of_map = predicted(partial, rx_height_m=1.0, spacing_m=0.5, trace_settings=TraceSettings(60e9, 3))
     xr.testing.assert_identical(of_map, coverage)
 
 
@@ -296,7 +301,7 @@ def test_units_and_flags_follow_cf(coverage):
 
 def test_progress_grows_to_1():
     calls = []
-    predict_map(map_of(PICTURE), TX, spacing_m=0.5, progress=lambda share, message: calls.append((share, message)))
+    predicted(map_of(PICTURE), spacing_m=0.5, progress=lambda share, message: calls.append((share, message)))
     shares = [share for share, _ in calls]
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
@@ -384,7 +389,7 @@ def test_what_is_no_coverage_map_is_named(coverage, spoil, message):
 
 
 def test_the_answer_does_not_depend_on_the_blocks():
-    whole, in_blocks = (predict_map(map_of(PICTURE), TX, spacing_m=0.12, memory_gb=gb) for gb in (2.0, 1.062))
+    whole, in_blocks = (predicted(map_of(PICTURE), spacing_m=0.12, memory_gb=gb) for gb in (2.0, 1.062))
     assert whole["valid"].sum() > 1000
     for name in ATTRIBUTES:
         np.testing.assert_allclose(in_blocks[name], whole[name], rtol=1e-5, atol=1e-5, err_msg=name)

@@ -2,6 +2,7 @@ import io
 
 import numpy as np
 import pytest
+from coverage_cases import shipped
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -193,7 +194,7 @@ def test_the_outside_is_blank_on_a_complete_map_alone(coverage):
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 3)])
 def test_maps_of_any_shape_are_drawn(shape):
     partial = PartialMap(np.full(shape, 2, dtype=np.uint8), 0.5)
-    small = predict_map(partial, (0.1, 0.1), spacing_m=0.5)
+    small = predict_map(partial, (0.1, 0.1), spacing_m=0.5, predictor=shipped())
     for figure in (plot_coverage(small), plot_comparison({"one": small, "two": small})):
         with Image.open(io.BytesIO(figure_png(figure))) as image:
             assert max(image.size) < 8000

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from coverage_cases import COMPLETE, PICTURE, TX, map_of
+from coverage_cases import COMPLETE, PICTURE, TX, map_of, shipped
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -22,7 +22,7 @@ def coverages():
     complete = map_of(COMPLETE)
     nothing = PartialMap(np.full_like(complete.state, CellState.UNKNOWN), 0.5, (-1.0, 2.0))
     maps = {TRUTH: complete, NOTHING: nothing, PARTIAL: map_of(PICTURE)}
-    return {title: predict_map(scene, TX, spacing_m=0.5) for title, scene in maps.items()}
+    return {title: predict_map(scene, TX, spacing_m=0.5, predictor=shipped()) for title, scene in maps.items()}
 
 
 @pytest.mark.usefixtures("command_line")

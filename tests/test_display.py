@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray as xr
-from coverage_cases import PICTURE, TX, map_of
+from coverage_cases import PICTURE, TX, map_of, shipped
 from PIL import Image
 
 import sionna_partial as sp
@@ -50,8 +50,8 @@ SETTINGS = (
         ),
         (PLACEMENT, "TransmitterPlacement(position_m=(0.6, 3.6, 1.5), score=0.5, "),
         (LINKS, "LinkFeatures(link_state=uint8 (50,), unobserved_distance_m=float64 (50,), "),
-        (sp.Predictor.load(), "Predictor(settings=PredictorSettings(...), homes=tuple of "),
-        (sp.Predictor.load("paper").predict(LINKS), "LinkPrediction(p_los=float64 (50,), "),
+        (shipped(), "Predictor(settings=PredictorSettings(...), homes=tuple of "),
+        (shipped("paper").predict(LINKS), "LinkPrediction(p_los=float64 (50,), "),
         *((kind(), f"{kind.__name__}(") for kind in SETTINGS),
     ],
     ids=lambda value: type(value).__name__,

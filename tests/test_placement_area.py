@@ -2,9 +2,9 @@ from functools import cache
 
 import numpy as np
 import pytest
-from coverage_cases import COMPLETE, PICTURE, TX, map_of
+from coverage_cases import COMPLETE, PICTURE, TX, map_of, shipped
 from placement_cases import TWO_ROOMS, home
-from predictor_links import QUIET, make_links, quick_predictor
+from predictor_links import QUIET, make_links
 
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
@@ -21,7 +21,7 @@ pytestmark = QUIET
 def indoor_in(count: int) -> Predictor:
     """Return a predictor that has learned that one receiver in so many is indoors, wherever it is."""
     phi = make_links(200)[0].take(np.repeat(np.arange(200), count))
-    return quick_predictor().fit_indoor(phi, np.arange(len(phi)) % count == 0)
+    return shipped("paper").fit_indoor(phi, np.arange(len(phi)) % count == 0)
 
 
 def two_rooms() -> PlacementArea:
@@ -86,7 +86,7 @@ class TestPositions:
 class TestReceivers:
     def test_where_predict_map_has_valid_ones(self) -> None:
         partial, settings = map_of(PICTURE), TraceSettings(max_depth=0, diffraction=False)
-        coverage = predict_map(partial, TX, spacing_m=0.5, predictor="paper", trace_settings=settings)
+        coverage = predict_map(partial, TX, spacing_m=0.5, predictor=shipped("paper"), trace_settings=settings)
         rows, columns = np.nonzero(coverage["valid"].to_numpy())
         expected = np.column_stack([coverage["x"].to_numpy()[columns], coverage["y"].to_numpy()[rows]])
         found = placement_area(partial, 1.5, 1.2, indoor_in(4)).rx_m
@@ -110,7 +110,7 @@ class TestReceivers:
 
     def test_the_nearer_to_free_cells_the_more(self) -> None:
         """P(indoor) is predicted for lengths that grow with the distance from the free cells."""
-        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, Predictor.load("paper"))
+        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, shipped("paper"))
         order = np.argsort(area.rx_m[:, 0])
         assert (np.diff(area.weight[order][3:]) < 0.0).all()
 
