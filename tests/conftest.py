@@ -1,8 +1,10 @@
-"""What all tests share: runs that draw the same examples, the process as it was, and a coverage map of a small home."""
+"""What several tests share: the same examples in every run, a process as it was, a full disk, and coverage maps."""
 
 import logging
+import os
 import signal
-from collections.abc import Iterator
+import stat
+from collections.abc import Callable, Iterator
 
 import pytest
 import xarray as xr
@@ -39,3 +41,19 @@ def several() -> xr.Dataset:
     from coverage_cases import small_coverage
 
     return small_coverage(several=True)
+
+
+@pytest.fixture
+def files_that_fit(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Let so many files fit on the disk from now on."""
+
+    def limit(files: int) -> None:
+        def sync(descriptor: int) -> None:
+            nonlocal files
+            files -= stat.S_ISREG(os.fstat(descriptor).st_mode)
+            if files < 0:
+                raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", sync)
+
+    return limit

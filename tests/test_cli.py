@@ -2,9 +2,9 @@
 
 import os
 import shutil
-import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,22 +136,16 @@ class TestPredict:
         assert len(result.stderr.splitlines()) == 1
 
     def test_files_are_written_together_or_not_at_all(
-        self, map_path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+        self, map_path: Path, files_that_fit: Callable[[int], None], tmp_path: Path
     ) -> None:
-        out, room_left, words = tmp_path / "out", [1, 2], ["--tx", 1, 1, "--spacing", 0.5]
-
-        def sync(descriptor: int) -> None:
-            if stat.S_ISREG(os.fstat(descriptor).st_mode) and not (room_left and room_left.pop()):
-                raise OSError(28, "No space left on device")
-
-        with monkeypatch.context() as patch:
-            patch.setattr(os, "fsync", sync)
-            result = run("predict", map_path, *words, "--out", out)
+        out, words = tmp_path / "out", ["--tx", 1, 1, "--spacing", 0.5]
+        files_that_fit(2)
+        result = run("predict", map_path, *words, "--out", out)
         assert result.exit_code == 2
         assert result.stderr.startswith(f"error: path = '{out}' could not be written (No space left on device)")
         assert len(result.stderr.splitlines()) == 1
-        assert not room_left
         assert not out.exists()
+        files_that_fit(99)
         result = run("predict", map_path, *words, "--out", out, "--format", "nc", "--format", "nc")
         assert result.exit_code == 0
         assert [path.name for path in out.iterdir()] == ["coverage.nc"]

@@ -1,5 +1,3 @@
-import os
-import stat
 import time
 
 import numpy as np
@@ -77,21 +75,20 @@ def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
     np.testing.assert_allclose(table["y_m"], np.repeat(coverage["y"], coverage.sizes["x"]))
     for name in TABLE_VARIABLES:
         np.testing.assert_allclose(table[name], table_values(coverage, name).ravel(), rtol=1e-6, err_msg=name)
-
-
-def test_csv_keeps_millimetres_far_from_the_origin(coverage, tmp_path):
     save_coverage(coverage.assign_coords(x=coverage["x"] + 500_000.0), tmp_path / "coverage.csv")
     assert pd.read_csv(tmp_path / "coverage.csv")["x_m"][0] == 499_999.125
 
 
-def test_png_is_the_picture(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "coverage.png")
+@pytest.mark.parametrize("name", ["coverage", "several"])
+def test_png_is_the_picture(name, request, tmp_path):
+    data = request.getfixturevalue(name)
+    save_coverage(data, tmp_path / "coverage.png")
     with Image.open(tmp_path / "coverage.png") as image:
         assert image.width >= 1200
-    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(coverage))
+    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(data))
 
 
-def test_ros_map_holds_the_probability_of_outage(coverage, tmp_path):
+def test_ros_map_holds_the_probability_of_outage_and_loads_as_a_map(coverage, tmp_path):
     """As nav2_map_server reads it in raw mode: shades 0 to 100 are occupancies, others unknown, row 0 is the top."""
     save_coverage(coverage, tmp_path / "outage.yaml")
     sheet = yaml.safe_load((tmp_path / "outage.yaml").read_text())
@@ -99,19 +96,11 @@ def test_ros_map_holds_the_probability_of_outage(coverage, tmp_path):
     assert sheet["resolution"] == 0.25
     assert sheet["origin"] == [-1.0, 2.0, 0.0]
     occupancy = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(int)
-    percent = 100 * coverage["p_outage"].to_numpy()
-    valid = coverage["valid"].to_numpy()
-    assert (occupancy[~valid] == 255).all()
-    assert (np.abs(occupancy - percent)[valid] <= 0.5).all()
-
-
-def test_ros_map_loads_as_a_map(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "outage.yaml")
+    p_outage, valid = coverage["p_outage"].to_numpy(), coverage["valid"].to_numpy()
     loaded = load_map(tmp_path / "outage.yaml")
-    p_outage = coverage["p_outage"].to_numpy()
-    assert loaded.shape == p_outage.shape
-    assert loaded.resolution_m == 0.25
-    assert loaded.origin_m == (-1.0, 2.0)
+    assert (occupancy[~valid] == 255).all()
+    assert (np.abs(occupancy - 100 * p_outage)[valid] <= 0.5).all()
+    assert (loaded.shape, loaded.resolution_m, loaded.origin_m) == (p_outage.shape, 0.25, (-1.0, 2.0))
     assert (loaded.state[p_outage > 0.66] == CellState.WALL).all()
     assert (loaded.state[p_outage < 0.19] == CellState.FREE).all()
     assert (loaded.state[np.isnan(p_outage)] == CellState.UNKNOWN).all()
@@ -164,10 +153,6 @@ class TestSeveralTransmitters:
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in files]
         assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(files)
 
-    def test_png_is_the_picture(self, several, tmp_path):
-        save_coverage(several, tmp_path / "coverage.png")
-        assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(several))
-
     def test_the_ros_map_of_a_network_holds_the_outage_of_all(self, several, tmp_path):
         network = network_map(several, n=50)
         save_network(network, tmp_path / "outage.yaml")
@@ -209,16 +194,11 @@ def test_a_folder_of_that_name_is_named_and_kept(coverage, tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_full_disk_leaves_the_old_files(coverage, tmp_path, monkeypatch, suffix):
+def test_a_full_disk_leaves_the_old_files(coverage, tmp_path, files_that_fit, suffix):
     names = [f"coverage{suffix}"] + ["coverage.pgm"] * (suffix == ".yaml")
     for name in names:
         (tmp_path / name).write_text("old")
-
-    def full(descriptor):
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
+    files_that_fit(0)
     with pytest.raises(OutputError, match=r"No space left.*disk is full"):
         save_coverage(coverage, tmp_path / f"coverage{suffix}")
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(names)
