@@ -250,15 +250,9 @@ def test_a_predictor_is_used_as_it_is():
     [
         ({}, None),
         ({"trace_settings": TraceSettings(frequency_hz=60e9)}, "at 28 GHz, and is used at 60 GHz: its"),
-        (
-            {"trace_settings": TraceSettings(diffraction=False)},
-            "with diffraction, and is used without diffraction",
-        ),
+        ({"trace_settings": TraceSettings(diffraction=False)}, "with diffraction, and is used without diffraction"),
         ({"trace_settings": TraceSettings(max_depth=1)}, "with max_depth = 6, and is used with max_depth = 1: its"),
-        (
-            {"scene_settings": SceneSettings(Material(itu="metal"))},
-            "on walls that transmit, and is used on walls of",
-        ),
+        ({"scene_settings": SceneSettings(Material(itu="metal"))}, "on walls that transmit, and is used on walls of"),
     ],
 )
 def test_a_predictor_trained_on_other_traces_is_warned_about(caplog, settings, words):
