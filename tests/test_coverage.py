@@ -58,7 +58,7 @@ def test_receivers_are_the_centres_of_a_grid_from_the_lower_left_corner_and_vali
     assert set(np.unique(state)) == set(CellState)
 
 
-def test_all_documented_variables_are_there_and_missing_exactly_where_no_receiver_stands(coverage):
+def test_all_documented_variables_are_there_as_cf_has_them_and_missing_exactly_where_no_receiver_stands(coverage):
     assert set(coverage.data_vars) == set(ATTRIBUTES)
     valid = coverage["valid"].to_numpy()
     for name, layer in coverage.data_vars.items():
@@ -68,6 +68,13 @@ def test_all_documented_variables_are_there_and_missing_exactly_where_no_receive
         elif name.endswith("link_state"):
             np.testing.assert_array_equal(layer == NO_RECEIVER, ~valid, err_msg=name)
             assert set(np.unique(layer.to_numpy()[valid])) <= set(LinkState)
+    assert coverage["x"].attrs["standard_name"] == "projection_x_coordinate"
+    assert coverage["link_state"].attrs["flag_meanings"] == "outage los nlos no_receiver"
+    for name, layer in coverage.variables.items():
+        flags = layer.attrs.get("flag_values", ())
+        assert "long_name" in layer.attrs, name
+        assert len(flags) or "units" in layer.attrs or name == "wall_parts"
+        assert len(flags) == len(layer.attrs.get("flag_meanings", "").split())
 
 
 def test_each_receiver_has_the_prediction_of_its_own_link(coverage):
@@ -105,7 +112,7 @@ def test_line_of_sight_has_the_gain_of_friis_and_what_reflections_add(coverage):
 
 
 class TestReceiversAnywhere:
-    def test_outside_is_mixed_in_as_outage(self, coverage, anywhere):
+    def test_outside_is_mixed_in_as_outage_and_attributes_say_so(self, coverage, anywhere):
         for name in ("p_los", "p_nlos"):
             np.testing.assert_allclose(anywhere[name], coverage["p_indoor"] * coverage[name], rtol=1e-5, atol=1e-7)
         np.testing.assert_allclose(anywhere["p_outage"], 1.0 - anywhere["p_los"] - anywhere["p_nlos"], atol=1e-6)
@@ -114,8 +121,6 @@ class TestReceiversAnywhere:
         np.testing.assert_allclose(anywhere["gain_mean_db"], np.maximum(mean_db, -150.0), rtol=1e-5)
         for name in ("p_indoor", "partial_gain_db", "gain_los_mean_db", "gain_nlos_std_db"):
             np.testing.assert_array_equal(anywhere[name], coverage[name])
-
-    def test_attributes_say_whose_probabilities_they_are(self, coverage, anywhere):
         assert coverage.attrs["receivers"] == "indoor"
         assert coverage["p_los"].attrs["long_name"].endswith(", given that the receiver is indoors")
         assert anywhere.attrs["receivers"] == "anywhere"
@@ -281,16 +286,6 @@ def test_settings_reach_the_tracer_and_the_attributes():
     partial = replace(map_of(PICTURE), material=Material(itu="concrete"))
     of_map = predicted(partial, rx_height_m=1.0, spacing_m=0.5, trace_settings=TraceSettings(60e9, 3))
     xr.testing.assert_identical(of_map, coverage)
-
-
-def test_units_and_flags_follow_cf(coverage):
-    assert coverage["x"].attrs["standard_name"] == "projection_x_coordinate"
-    for name, layer in coverage.variables.items():
-        assert "long_name" in layer.attrs, name
-        assert ("units" in layer.attrs) or ("flag_values" in layer.attrs) or name == "wall_parts"
-        if "flag_values" in layer.attrs:
-            assert len(layer.attrs["flag_values"]) == len(layer.attrs["flag_meanings"].split())
-    assert coverage["link_state"].attrs["flag_meanings"] == "outage los nlos no_receiver"
 
 
 def test_progress_grows_to_1():

@@ -131,20 +131,23 @@ class TestTruthAndFeatures:
             np.testing.assert_array_equal(before.state[known], after.state[known])
             assert before.observed_fraction < after.observed_fraction
         np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.map_index], table.stage)
-        partial = table.maps[1]
-        here = table.take(table.stage == 3)
-        assert here.observed_fraction == pytest.approx(partial.observed_fraction)
-        np.testing.assert_array_equal(here.context.tx_seen, partial.state_at(here.context.tx_m) != CellState.UNKNOWN)
-        np.testing.assert_array_equal(here.context.rx_seen, partial.state_at(here.context.rx_m) != CellState.UNKNOWN)
-        tx = here.context.tx_m[0]
-        mine = here.take((here.context.tx_m == tx).all(axis=1))
-        phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, trace_settings=SETTINGS.trace))
-        for found, expected, names in (
-            (mine.phi, phi, ("link_state", "unobserved_distance_m", "gain_db")),
-            (mine.context, phi.context, ("indirect_gain_db", "strongest_unobserved_m")),
-        ):
-            for name in names:
-                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+        for number, partial in enumerate(table.maps):
+            here = table.take(table.map_index == number)
+            assert here.observed_fraction == pytest.approx(partial.observed_fraction)
+            for seen, places_m in (
+                (here.context.tx_seen, here.context.tx_m),
+                (here.context.rx_seen, here.context.rx_m),
+            ):
+                np.testing.assert_array_equal(seen, partial.state_at(places_m) != CellState.UNKNOWN)
+            tx = here.context.tx_m[0]
+            mine = here.take((here.context.tx_m == tx).all(axis=1))
+            phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, trace_settings=SETTINGS.trace))
+            for found, expected, names in (
+                (mine.phi, phi, ("link_state", "unobserved_distance_m", "gain_db")),
+                (mine.context, phi.context, ("indirect_gain_db", "strongest_unobserved_m")),
+            ):
+                for name in names:
+                    np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
     def test_complete_map_comes_along(self, home: PartialMap, table: LinkTable) -> None:
         assert table.complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}

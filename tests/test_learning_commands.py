@@ -116,7 +116,7 @@ class TestDataset:
         ],
     )
     def test_bad_settings(self, words: list[object], message: str, tmp_path: Path) -> None:
-        result = run("dataset", tmp_path / "out", *words)
+        result = run("dataset", tmp_path / "out", "--homes", 1, *words)
         assert result.exit_code == 2
         assert result.stderr.startswith(f"error: {message}")
         assert not (tmp_path / "out").exists()
