@@ -133,14 +133,11 @@ class TestTruthAndFeatures:
         np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.map_index], table.stage)
         for number, partial in enumerate(table.maps):
             here = table.take(table.map_index == number)
+            links, tx = here.context, here.context.tx_m[0]
             assert here.observed_fraction == pytest.approx(partial.observed_fraction)
-            for seen, places_m in (
-                (here.context.tx_seen, here.context.tx_m),
-                (here.context.rx_seen, here.context.rx_m),
-            ):
+            for seen, places_m in ((links.tx_seen, links.tx_m), (links.rx_seen, links.rx_m)):
                 np.testing.assert_array_equal(seen, partial.state_at(places_m) != CellState.UNKNOWN)
-            tx = here.context.tx_m[0]
-            mine = here.take((here.context.tx_m == tx).all(axis=1))
+            mine = here.take((links.tx_m == tx).all(axis=1))
             phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, trace_settings=SETTINGS.trace))
             for found, expected, names in (
                 (mine.phi, phi, ("link_state", "unobserved_distance_m", "gain_db")),

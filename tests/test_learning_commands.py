@@ -1,6 +1,7 @@
 """The commands dataset, train and evaluate: what they pass on, what they write and print, and how they fail."""
 
 import json
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -54,6 +55,12 @@ def write_homes(folder: Path, homes: Iterable[Home], settings: DatasetSettings, 
     return [task.source.name for task in tasks]
 
 
+def assert_found(result: Result, folder: Path, count: int) -> None:
+    """Check that so many homes were there, and none was built."""
+    line = rf"homes in {re.escape(str(folder))}: 0 built in [\d.]+ min, {count} already there\n"
+    assert re.fullmatch(line, result.stdout)
+
+
 class TestDataset:
     """A command that asks for what a folder has finds it built; for anything else it is refused, or builds it."""
 
@@ -61,7 +68,7 @@ class TestDataset:
         names = write_homes(tmp_path / "out", range(20_000, 20_100), DatasetSettings())
         result = run("dataset", tmp_path / "out")
         assert result.exit_code == 0, result.output
-        assert f"homes in {tmp_path / 'out'}: 0 built in 0.0 min, 100 already there" in result.stdout
+        assert_found(result, tmp_path / "out", 100)
         known = json.loads((PREDICTORS_FOLDER / "paper.json").read_text(encoding="utf-8"))["homes"]
         assert known
         assert not set(names) & set(known)
@@ -92,7 +99,7 @@ class TestDataset:
         write_homes(tmp_path / "out", homes, settings)
         result = run("dataset", tmp_path / "out", "--first-seed", 7, *words.split())
         assert result.exit_code == 0, result.output
-        assert f"0 built in 0.0 min, {len(homes)} already there" in result.stdout
+        assert_found(result, tmp_path / "out", len(homes))
 
     def test_maps_alone_and_failed_homes(self, tmp_path: Path) -> None:
         maps = [tmp_path / "good.npz", tmp_path / "ruins" / "one.npz"]
@@ -102,7 +109,7 @@ class TestDataset:
         write_homes(tmp_path / "out", maps, DatasetSettings(), built=1)
         result = run("dataset", tmp_path / "out", "--map", maps[0], "--map", maps[1].parent)
         assert result.exit_code == 1
-        assert "0 built in 0.0 min, 1 already there" in result.stdout
+        assert_found(result, tmp_path / "out", 1)
         assert "one failed: home 'one' is not complete, a free cell touches an unknown one" in result.stderr
         assert "homes that failed: 1; the others can be used" in result.stderr
         assert "the same command tries them again" in result.stderr
