@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 import xarray as xr
 import yaml
 from coverage_cases import PICTURE, TX, map_of, shipped
@@ -19,7 +18,6 @@ from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
 from sionna_partial import __version__, cli
-from sionna_partial.cli.options import parse_material
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
@@ -116,6 +114,7 @@ class TestPredict:
         [
             (["--material", "cheese"], "error: itu = 'cheese' is not allowed: choose one of vacuum"),
             (["--material", "2,3"], "--material '2,3' is neither an ITU name nor permittivity,conductivity,thickness"),
+            (["--material", "a,b,c"], "--material 'a,b,c' is neither an ITU name nor permittivity,conductivity"),
             (["--material", "0,0,1"], "error: relative_permittivity = 0.0 is not allowed"),
             (["--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html, .yaml."),
             (["--frequency", "1"], "error: frequency_hz = 1.0 is not allowed"),
@@ -277,11 +276,3 @@ class TestHelp:
 
     def test_position_is_shown_as_it_is_typed(self) -> None:
         assert "--tx X Y [Z]" in run("predict", "--help").stdout
-
-
-def test_parse_material() -> None:
-    assert parse_material("") == Material()
-    assert parse_material("wood") == Material(itu="wood")
-    assert parse_material("2.5,0.1,0.05") == Material(2.5, 0.1, 0.05)
-    with pytest.raises(typer.BadParameter, match="'a,b,c' is neither an ITU name"):
-        parse_material("a,b,c")

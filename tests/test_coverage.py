@@ -197,18 +197,6 @@ def test_receivers_within_a_centimetre_of_a_wall_are_masked():
     assert 1.5 in np.round(x, 9)
 
 
-def test_a_wall_thinner_than_a_receiver_cell_is_kept_for_pictures():
-    state = np.zeros((6, 6), dtype=np.uint8)
-    state[4, 0] = CellState.WALL
-    coverage = quickly_predicted(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=1.5)
-    assert coverage["valid"].all()
-    expected = np.zeros((2, 2), dtype=np.int64)
-    for row in (2, 3):
-        for column in (0, 1):
-            expected[1, 0] |= 1 << (WALL_PARTS * row + column)
-    np.testing.assert_array_equal(coverage["wall_parts"], expected)
-
-
 @pytest.mark.parametrize("spacing_m", [0.1, 0.3, 0.7, 1.0, 1.1, 1.6, 3.4])
 def test_receivers_fill_the_map_and_wall_parts_cover_every_wall_and_nothing_far_from_one(spacing_m):
     state = (np.random.default_rng(round(10 * spacing_m)).random((7, 9)) < 0.2).astype(np.uint8)

@@ -1,5 +1,6 @@
 import time
 
+import h5netcdf
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,7 +23,7 @@ from sionna_partial.plots.style import figure_png
 SUFFIXES = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 
 
-def test_netcdf_returns_an_equal_dataset(coverage, tmp_path):
+def test_netcdf_returns_an_equal_dataset_with_or_without_xarray(coverage, tmp_path):
     save_coverage(coverage, tmp_path / "coverage.nc")
     loaded = xr.load_dataset(tmp_path / "coverage.nc")
     xr.testing.assert_identical(loaded, coverage)
@@ -33,11 +34,6 @@ def test_netcdf_returns_an_equal_dataset(coverage, tmp_path):
     save_coverage(loaded, tmp_path / "again.nc")
     assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "coverage.nc").read_bytes()
     assert figure_png(plot_coverage(loaded)) == figure_png(plot_coverage(coverage))
-
-
-def test_netcdf_is_read_without_xarrays_help(coverage, tmp_path):
-    h5netcdf = pytest.importorskip("h5netcdf")
-    save_coverage(coverage, tmp_path / "coverage.nc")
     with h5netcdf.File(tmp_path / "coverage.nc") as file:
         assert file.attrs["Conventions"] == "CF-1.11"
         assert file["gain_mean_db"].attrs["units"] == "dB"
