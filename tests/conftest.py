@@ -1,11 +1,13 @@
-"""What all tests share: every run draws the same examples, and a command line leaves its process as it was."""
+"""What several tests share: the same examples in every run, a process as it was, a full disk, and coverage maps."""
 
 import logging
+import os
 import signal
-import warnings
-from collections.abc import Iterator
+import stat
+from collections.abc import Callable, Iterator
 
 import pytest
+import xarray as xr
 from hypothesis import settings
 
 settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)
@@ -17,10 +19,41 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell has started the
 
 @pytest.fixture
 def command_line(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Undo what the command line does to its process."""
+    """Undo what the command line does to its process; pytest itself puts `warnings.showwarning` back."""
     monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "put back in the end")
-    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
     logger = logging.getLogger("sionna_partial")
     handlers = list(logger.handlers)
     yield
     logger.handlers[:] = handlers
+
+
+@pytest.fixture
+def coverage() -> xr.Dataset:
+    """A coverage map of one transmitter, which a test may change."""
+    from coverage_cases import small_coverage
+
+    return small_coverage()
+
+
+@pytest.fixture
+def several() -> xr.Dataset:
+    """A coverage map of two transmitters, which a test may change."""
+    from coverage_cases import small_coverage
+
+    return small_coverage(several=True)
+
+
+@pytest.fixture
+def files_that_fit(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Let so many files fit on the disk from now on."""
+
+    def limit(files: int) -> None:
+        def sync(descriptor: int) -> None:
+            nonlocal files
+            files -= stat.S_ISREG(os.fstat(descriptor).st_mode)
+            if files < 0:
+                raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(os, "fsync", sync)
+
+    return limit

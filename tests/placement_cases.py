@@ -3,7 +3,7 @@
 from functools import cache
 from typing import Any
 
-from coverage_fakes import map_of
+from coverage_cases import map_of
 
 import sionna_partial as sp
 

@@ -2,7 +2,8 @@ import io
 
 import numpy as np
 import pytest
-from coverage_fakes import coverage_of_several, small_coverage
+from coverage_cases import shipped
+from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.path import Path
@@ -20,20 +21,12 @@ LOS, NLOS, OUTAGE = (
 )
 
 
-@pytest.fixture
-def coverage(monkeypatch):
-    return small_coverage(monkeypatch)
-
-
 def panels(figure):
     return [axis for axis in figure.axes if axis.get_xlim() != (0.0, 1.0) and axis.images and axis.axison]
 
 
-def test_a_certain_state_has_its_colour():
-    np.testing.assert_allclose(mix_state_colours([1, 0, 0], [0, 1, 0], [0, 0, 1]), [LOS, NLOS, OUTAGE])
-
-
 def test_colours_are_weighted_by_the_probabilities():
+    np.testing.assert_allclose(mix_state_colours([1, 0, 0], [0, 1, 0], [0, 0, 1]), [LOS, NLOS, OUTAGE])
     np.testing.assert_allclose(mix_state_colours(0.5, 0.2, 0.3), 0.5 * LOS + 0.2 * NLOS + 0.3 * OUTAGE)
     assert np.isnan(mix_state_colours(np.nan, np.nan, np.nan)).all()
 
@@ -98,13 +91,11 @@ def test_the_probability_of_more_than_a_threshold(coverage):
     np.testing.assert_allclose(at_receivers(panel, coverage), above, atol=0.02)
 
 
-def test_colour_bars_say_what_the_mean_counts(coverage):
-    labels = {axis.get_ylabel() for axis in plot_coverage(coverage).axes}
+def test_legend_and_colour_bars_name_what_is_drawn(coverage):
+    figure = plot_coverage(coverage)
+    labels = {axis.get_ylabel() for axis in figure.axes}
     assert {"dB; an outage counts \N{MINUS SIGN}150 dB", "dB; with outages", "probability"} <= labels
-
-
-def test_the_legend_names_what_is_drawn(coverage):
-    assert legend(plot_coverage(coverage)) == ["transmitter", "LOS", "NLOS", "outage", "wall", "not observed"]
+    assert legend(figure) == ["transmitter", "LOS", "NLOS", "outage", "wall", "not observed"]
     seen = coverage.assign(observed=coverage["observed"] | True, wall_parts=0 * coverage["wall_parts"])
     assert legend(plot_coverage(seen, layers=("p_los",))) == ["transmitter"]
     assert "wall, not observed" not in legend(plot_comparison({"truth": coverage, "again": coverage}))
@@ -142,16 +133,21 @@ def test_the_unknown_area_is_hatched_and_a_known_map_is_not(coverage):
     assert not hatches(plot_coverage(known))
 
 
-def test_the_transmitter_is_marked_in_each_panel(coverage):
-    for panel in panels(plot_coverage(coverage)):
+def test_the_transmitter_is_marked_in_each_panel_of_a_figure_unknown_to_pyplot(coverage):
+    figure = plot_coverage(coverage)
+    assert isinstance(figure, Figure)
+    assert not pyplot.get_fignums()
+    for panel in panels(figure):
         (star,) = panel.lines
         assert (star.get_xdata()[0], star.get_ydata()[0]) == (0.6, 3.6)
         assert panel.get_aspect() == 1.0
         assert panel.get_xlim() == pytest.approx((-1.0, 5.0))
+    with Image.open(io.BytesIO(figure_png(figure))) as image:
+        assert image.size[0] >= 1200
+        assert not image.text
 
 
-def test_several_transmitters_have_a_row_each(coverage, monkeypatch):
-    several = coverage_of_several(monkeypatch)
+def test_several_transmitters_have_a_row_each(coverage, several):
     figure = plot_coverage(several, layers=("link_state", "gain_mean_db", "state_mixture"))
     rows = np.array(panels(figure)).reshape(2, 3)
     assert [row[0].get_ylabel().split("\n")[0] for row in rows] == [*several["tx"].to_numpy()]
@@ -195,21 +191,10 @@ def test_the_outside_is_blank_on_a_complete_map_alone(coverage):
         assert (blank[..., :3] == 255).all()
 
 
-def test_figures_are_unknown_to_pyplot_and_become_png(coverage):
-    import matplotlib.pyplot as plt
-
-    figure = plot_coverage(coverage)
-    assert isinstance(figure, Figure)
-    assert not plt.get_fignums()
-    with Image.open(io.BytesIO(figure_png(figure))) as image:
-        assert image.size[0] >= 1200
-        assert not image.text
-
-
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 3)])
-def test_maps_of_any_shape_are_drawn(coverage, shape):
+def test_maps_of_any_shape_are_drawn(shape):
     partial = PartialMap(np.full(shape, 2, dtype=np.uint8), 0.5)
-    small = predict_map(partial, (0.1, 0.1), spacing_m=0.5)
+    small = predict_map(partial, (0.1, 0.1), spacing_m=0.5, predictor=shipped())
     for figure in (plot_coverage(small), plot_comparison({"one": small, "two": small})):
         with Image.open(io.BytesIO(figure_png(figure))) as image:
             assert max(image.size) < 8000

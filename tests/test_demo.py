@@ -1,74 +1,50 @@
 import numpy as np
 import pytest
-import xarray as xr
-from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of, use_fakes
+from coverage_cases import COMPLETE, PICTURE, TX, map_of, shipped
 from PIL import Image
+from typer.testing import CliRunner
 
-from sionna_partial import demo
+from sionna_partial import cli
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
-from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table, demo_scene, run_demo
-from sionna_partial.errors import OutputError, SceneError
-from sionna_partial.maps.map_files import save_map
+from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table, demo_scene
+from sionna_partial.errors import SceneError
+from sionna_partial.export import load_coverage
 from sionna_partial.maps.partial_map import PartialMap
 
-FILES = ["comparison.png", "coverage.csv", "coverage.html", "coverage.nc", "coverage.pgm", "coverage.png"]
-FILES += ["coverage.tif", "coverage.yaml", "table.txt"]
+NAMES = ["coverage.nc", "coverage.tif", "coverage.csv", "coverage.png", "coverage.html", "coverage.yaml"]
+NAMES += ["comparison.png", "table.txt"]
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory):
-    """A scenes folder with one home, the fake tracer and the fake predictor."""
-    folder = tmp_path_factory.mktemp("demo") / "scenes"
-    for stage, picture in (("complete", COMPLETE), ("step050", PICTURE)):
-        save_map(map_of(picture), folder / "hut" / stage / "map.yaml")
-        (folder / "hut" / stage / "scene.xml").write_text("")
-    with pytest.MonkeyPatch.context() as patch:
-        use_fakes(patch)
-        patch.setattr(demo, "scenes_folder", lambda: folder)
-        patch.setattr(demo, "demo_homes", lambda: {"hut": {"transmitter": (*TX, 1.5)}})
-        patch.setattr(demo, "Predictor", FakePredictor)
-        yield folder
+def coverages():
+    """The three maps of the demo, of a smaller home."""
+    complete = map_of(COMPLETE)
+    nothing = PartialMap(np.full_like(complete.state, CellState.UNKNOWN), 0.5, (-1.0, 2.0))
+    maps = {TRUTH: complete, NOTHING: nothing, PARTIAL: map_of(PICTURE)}
+    return {title: predict_map(scene, TX, spacing_m=0.5, predictor=shipped()) for title, scene in maps.items()}
 
 
-@pytest.fixture(scope="module")
-def run(scenes):
-    """Result, folder and progress of one run."""
-    fractions = []
-    out = scenes.parent / "out"
-    return run_demo(out, lambda fraction, message: fractions.append(fraction), home="hut", step=50), out, fractions
-
-
-def test_the_demo_writes_every_file_and_returns_their_names(run):
-    (names, table), out, fractions = run
-    assert sorted(file.name for file in out.iterdir()) == FILES
-    assert set(names) == set(FILES) - {"coverage.pgm"}
-    assert (out / "table.txt").read_text() == table
-    assert fractions == sorted(fractions)
-    assert fractions[-1] == 1.0
-    with Image.open(out / "comparison.png") as image:
-        assert image.width >= 1200
-
-
-def test_the_coverage_files_are_of_the_partial_map(run):
-    _, out, _ = run
-    expected = predict_map(map_of(PICTURE), TX)
-    xr.testing.assert_allclose(xr.load_dataset(out / "coverage.nc"), expected)
-
-
-def test_the_table_compares_three_answers_in_three_areas(run):
-    (_, table), _, _ = run
+@pytest.mark.usefixtures("command_line")
+def test_the_demo_writes_every_file_and_prints_the_table_and_their_names(tmp_path):
+    out = tmp_path / "out"
+    result = CliRunner().invoke(cli.app, ["demo", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    assert {file.name for file in out.iterdir()} == {*NAMES, "coverage.pgm"}
+    table = (out / "table.txt").read_text()
+    assert result.stdout == table + "\n" + "".join(f"wrote {out / name}\n" for name in NAMES)
     rows = {line[:22].strip(): line[22:] for line in table.splitlines()[3:]}
     assert list(rows) == ["nothing observed", "partial trace alone", "partial map"]
     assert all(row.count("%") == row.count("dB") == 3 for row in rows.values())
+    with Image.open(out / "comparison.png") as image:
+        assert image.width >= 1200
+    _, known, tx = demo_scene("apartment", 100)
+    attributes = load_coverage(out / "coverage.nc").attrs
+    assert attributes["map_observed_fraction"] == known.observed_fraction < 1.0
+    assert tuple(attributes["transmitter_m"]) == tx
 
 
-def test_accuracy_and_error_are_those_of_the_receivers_inside_the_home(monkeypatch):
-    use_fakes(monkeypatch)
-    complete, known = map_of(COMPLETE), map_of(PICTURE)
-    nothing = PartialMap(np.full_like(complete.state, CellState.UNKNOWN), 0.5, (-1.0, 2.0))
-    maps = {TRUTH: complete, NOTHING: nothing, PARTIAL: known}
-    coverages = {title: predict_map(scene, TX, spacing_m=0.5) for title, scene in maps.items()}
+def test_accuracy_and_error_are_those_of_the_receivers_inside_the_home(coverages):
     truth = coverages[TRUTH]
     inside = (truth["cell_state"] == CellState.FREE).to_numpy()
     seen = inside & coverages[PARTIAL]["observed"].to_numpy()
@@ -91,22 +67,23 @@ def test_accuracy_and_error_are_those_of_the_receivers_inside_the_home(monkeypat
     assert row.split()[2:] == expected
 
 
-def test_an_area_without_receivers_has_no_score(monkeypatch):
-    use_fakes(monkeypatch)
-    complete = predict_map(map_of(COMPLETE), TX, spacing_m=0.5)
+def test_an_area_without_receivers_has_no_score(coverages):
+    complete = coverages[TRUTH]
     table = comparison_table({TRUTH: complete, NOTHING: complete, PARTIAL: complete})
     assert "not observed (0)" in table
     assert table.splitlines()[-1].split()[2:] == ["100.0", "%", "0.0", "dB", "100.0", "%", "0.0", "dB", "-"]
 
 
-def test_an_unknown_home_or_stage_is_named(scenes):
-    with pytest.raises(SceneError, match=r"home = 'castle' is not in '.*scenes': choose one of hut\."):
+def test_an_unknown_home_or_stage_is_named():
+    with pytest.raises(SceneError, match=r"home = 'castle' is not in '.*scenes': choose one of .*apartment"):
         demo_scene("castle", 50)
-    with pytest.raises(SceneError, match=r"step = 99 is not in '.*hut': choose one of 50\."):
-        demo_scene("hut", 99)
+    with pytest.raises(SceneError, match=r"step = 99 is not in '.*office': choose one of 50, 100, 150, 200\."):
+        demo_scene("office", 99)
 
 
-def test_an_unwritable_folder_is_named(scenes, tmp_path):
+@pytest.mark.usefixtures("command_line")
+def test_an_unwritable_folder_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="file"):
-        run_demo(tmp_path / "file" / "out", home="hut", step=50)
+    result = CliRunner().invoke(cli.app, ["demo", "--out", str(tmp_path / "file" / "out")])
+    assert result.exit_code == 2
+    assert result.stderr.startswith(f"error: path = '{tmp_path / 'file' / 'out'}' could not be written")

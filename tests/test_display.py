@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from coverage_fakes import PICTURE, TX, map_of, small_coverage
+import xarray as xr
+from coverage_cases import PICTURE, TX, map_of, shipped
 from PIL import Image
 
 import sionna_partial as sp
@@ -49,8 +50,8 @@ SETTINGS = (
         ),
         (PLACEMENT, "TransmitterPlacement(position_m=(0.6, 3.6, 1.5), score=0.5, "),
         (LINKS, "LinkFeatures(link_state=uint8 (50,), unobserved_distance_m=float64 (50,), "),
-        (sp.Predictor.load(), "Predictor(settings=PredictorSettings(...), homes=tuple of "),
-        (sp.Predictor.load("paper").predict(LINKS), "LinkPrediction(p_los=float64 (50,), "),
+        (shipped(), "Predictor(settings=PredictorSettings(...), homes=tuple of "),
+        (shipped("paper").predict(LINKS), "LinkPrediction(p_los=float64 (50,), "),
         *((kind(), f"{kind.__name__}(") for kind in SETTINGS),
     ],
     ids=lambda value: type(value).__name__,
@@ -81,8 +82,7 @@ def test_picture(value: Any) -> None:
     assert THUMBNAIL_PX / 2 < picture(html).width <= THUMBNAIL_PX
 
 
-def test_coverage(monkeypatch: pytest.MonkeyPatch) -> None:
-    coverage = small_coverage(monkeypatch)
+def test_coverage(coverage: xr.Dataset) -> None:
     line = "<coverage: 24 x 16 receivers, 0.25 m apart, transmitter at (0.60, 3.60, 1.50) m, 28 GHz>"
     assert repr(coverage.radio) == line
     assert picture(coverage.radio._repr_html_()).width <= THUMBNAIL_PX

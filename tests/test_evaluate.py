@@ -5,12 +5,11 @@ import re
 import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
-from predictor_links import LOS, OUTAGE, QUIET, quick_predictor
+from predictor_links import LOS, NLOS, OUTAGE, QUIET, quick_predictor
 
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import PredictorError
-from sionna_partial.evaluation import evaluate as evaluate_module
-from sionna_partial.evaluation.baselines import Baselines
+from sionna_partial.evaluation.baselines import Baselines, Majority
 from sionna_partial.evaluation.evaluate import (
     ALWAYS_OUTAGE,
     WITH_INDOOR,
@@ -20,6 +19,7 @@ from sionna_partial.evaluation.evaluate import (
 )
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
 
@@ -154,7 +154,7 @@ class TestHomeScores:
         np.testing.assert_allclose(rmses_db, [expected_db, 0.0], atol=1e-9)
 
 
-class TestPaper:
+class TestBaselines:
     def test_the_papers_is_not_compared_with_itself(self, table):
         found = evaluate("paper", table, baselines=fitted_baselines())
         assert {row.model for row in found.select(receivers="indoor")} == {*ANSWERS} - {"paper"}
@@ -164,65 +164,58 @@ class TestPaper:
         found = evaluate(dataclasses.replace(quick_predictor(), settings=settings), table, baselines=fitted_baselines())
         assert "paper" not in {row.model for row in found.rows}
 
-    def test_a_note_says_which_test_homes_it_was_trained_on(self, table):
+    def test_notes_say_what_the_baselines_were_fitted_to_and_which_test_homes_they_know(self, table):
         name = Predictor.load("paper").homes[0]
         known = dataclasses.replace(table, home=np.where(table.home == "home 2", name, table.home))
-        found = evaluate(quick_predictor(), known, baselines=fitted_baselines())
-        assert found.notes[1:] == ("The shipped paper's predictor was trained on 1 of the 4 test homes.",)
+        fitted = Baselines(fitted_baselines().majority, trained_on("home 1", "home 3"))
+        notes = evaluate(trained_on("home 0"), known, baselines=fitted).notes
+        assert notes == (
+            "Majority and distance only were fitted to 2 homes, others than those of the predictor.",
+            "The shipped paper's predictor was trained on 1 of the 3 test homes.",
+            "Distance only was trained on 2 of the 3 test homes.",
+        )
+        (note,) = evaluate(quick_predictor(), table, baselines=fitted_baselines()).notes
+        assert note == "Majority and distance only were fitted to 2 homes, those of the predictor."
 
-    def test_notes_say_what_the_baselines_were_fitted_to(self, table):
-        for homes, whose in ((("a", "b"), "those"), (("home 1",), "others than those")):
-            notes = evaluate(trained_on(*homes), table, baselines=fitted_baselines()).notes
-            assert notes == (f"Majority and distance only were fitted to 2 homes, {whose} of the predictor.",)
-
-    def test_a_note_says_which_test_homes_the_baselines_know(self, table):
-        fitted = Baselines(fitted_baselines().majority, trained_on("home 2", "home 3"))
-        notes = evaluate(trained_on("home 0"), table, baselines=fitted).notes
-        assert notes[1:] == ("Distance only was trained on 2 of the 3 test homes.",)
-
-
-class TestBaselinesFolder:
-    def test_beside_the_predictor(self, table, tmp_path, monkeypatch):
-        quick_predictor().save(tmp_path / "mine.keras")
-        fitted_baselines().save(tmp_path)
-        monkeypatch.setattr(evaluate_module, "PREDICTORS_FOLDER", tmp_path / "none")
-        found = evaluate(tmp_path / "mine.keras", table)
-        (row, *_) = found.select(model="majority", receivers="indoor")
+    def test_beside_the_predictor_else_the_shipped_ones(self, table, tmp_path):
+        outage = Majority((0.8, 0.1, 0.1), (-150.0, -65.0, -85.0), (0.0, 6.0, 10.0))
+        Baselines(outage, quick_predictor()).save(tmp_path)
         truth = table.link_state[~table.anywhere & (table.stage == 0)]
-        assert row.metrics.accuracy == np.mean(truth == 2)
+        for folder, majority in ((tmp_path, OUTAGE), (tmp_path / "alone", NLOS)):
+            folder.mkdir(exist_ok=True)
+            quick_predictor().save(folder / "mine.keras")
+            (row, *_) = evaluate(folder / "mine.keras", table).select(model="majority", receivers="indoor")
+            assert row.metrics.accuracy == np.mean(truth == majority)
+        shipped = Baselines.load(PREDICTORS_FOLDER)
+        found = [evaluate(quick_predictor(), table, baselines=each) for each in (None, shipped)]
+        rows = [[row.metrics.as_json() for row in each.select(model="distance only")] for each in found]
+        assert rows[0] == rows[1] != []
 
-    def test_else_the_shipped_ones(self, table, tmp_path, monkeypatch):
-        fitted_baselines().save(tmp_path)
-        monkeypatch.setattr(evaluate_module, "PREDICTORS_FOLDER", tmp_path)
-        (tmp_path / "alone").mkdir()
-        quick_predictor().save(tmp_path / "alone" / "mine.keras")
-        for predictor in (quick_predictor(), tmp_path / "alone" / "mine.keras"):
-            assert evaluate(predictor, table).select(model="distance only")
 
-
-class TestErrors:
-    def test_no_baselines(self, table):
-        with pytest.raises(PredictorError, match="baselines = 5 is not allowed: give Baselines, or None"):
-            evaluate(trained_on("home 0"), table, baselines=5)
-
-    def test_trained_on_all_homes(self, table):
-        names = [f"home {index}" for index in range(4)]
-        message = (
+@pytest.mark.parametrize(
+    ("predictor", "links", "baselines", "message"),
+    [
+        ((), slice(None), 5, "baselines = 5 is not allowed: give Baselines, or None"),
+        (
+            [f"home {index}" for index in range(4)],
+            slice(None),
+            None,
             "predictor 'fitted' was trained on all 4 homes of the data set: give a data set of other homes, such "
-            "as other seeds, or train with test_fraction above 0."
-        )
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            evaluate(trained_on(*names), table, baselines=fitted_baselines())
+            "as other seeds, or train with test_fraction above 0.",
+        ),
+        ((), slice(0), None, "dataset has no links"),
+    ],
+)
+def test_what_cannot_be_evaluated(table, predictor, links, baselines, message):
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        evaluate(trained_on(*predictor), table.take(links), baselines=baselines)
 
-    def test_other_traces(self, table, tmp_path):
-        folder = make_dataset(tmp_path, table, frequency_hz=60e9)
-        message = (
-            "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
-            "diffraction: choose another predictor"
-        )
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            evaluate(quick_predictor(), folder, baselines=fitted_baselines())
 
-    def test_empty(self, table):
-        with pytest.raises(PredictorError, match="dataset has no links"):
-            evaluate(quick_predictor(), table.take(slice(0)), baselines=fitted_baselines())
+def test_other_traces(table, tmp_path):
+    folder = make_dataset(tmp_path, table, frequency_hz=60e9)
+    message = (
+        "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
+        "diffraction: choose another predictor"
+    )
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        evaluate(quick_predictor(), folder)

@@ -1,14 +1,13 @@
-import os
-import stat
 import time
 
+import h5netcdf
 import numpy as np
 import pandas as pd
 import pytest
 import rasterio
 import xarray as xr
 import yaml
-from coverage_fakes import PICTURE, SEVERAL, coverage_of_several, map_of, small_coverage, use_fakes
+from coverage_cases import PICTURE, SEVERAL, map_of
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -24,12 +23,7 @@ from sionna_partial.plots.style import figure_png
 SUFFIXES = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 
 
-@pytest.fixture
-def coverage(monkeypatch):
-    return small_coverage(monkeypatch)
-
-
-def test_netcdf_returns_an_equal_dataset(coverage, tmp_path):
+def test_netcdf_returns_an_equal_dataset_with_or_without_xarray(coverage, tmp_path):
     save_coverage(coverage, tmp_path / "coverage.nc")
     loaded = xr.load_dataset(tmp_path / "coverage.nc")
     xr.testing.assert_identical(loaded, coverage)
@@ -37,11 +31,9 @@ def test_netcdf_returns_an_equal_dataset(coverage, tmp_path):
         assert loaded[name].dtype == layer.dtype, name
     assert loaded["p_los"].encoding["zlib"]
     assert "_FillValue" not in loaded["x"].encoding
-
-
-def test_netcdf_is_read_without_xarrays_help(coverage, tmp_path):
-    h5netcdf = pytest.importorskip("h5netcdf")
-    save_coverage(coverage, tmp_path / "coverage.nc")
+    save_coverage(loaded, tmp_path / "again.nc")
+    assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "coverage.nc").read_bytes()
+    assert figure_png(plot_coverage(loaded)) == figure_png(plot_coverage(coverage))
     with h5netcdf.File(tmp_path / "coverage.nc") as file:
         assert file.attrs["Conventions"] == "CF-1.11"
         assert file["gain_mean_db"].attrs["units"] == "dB"
@@ -49,49 +41,26 @@ def test_netcdf_is_read_without_xarrays_help(coverage, tmp_path):
         assert file["valid"][...].min() == 0
 
 
-def test_netcdf_saved_again_has_the_same_bytes(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "coverage.nc")
-    save_coverage(xr.load_dataset(tmp_path / "coverage.nc"), tmp_path / "again.nc")
-    assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "coverage.nc").read_bytes()
-
-
-def test_a_loaded_map_is_drawn_as_the_original(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "coverage.nc")
-    loaded = xr.load_dataset(tmp_path / "coverage.nc")
-    assert figure_png(plot_coverage(loaded)) == figure_png(plot_coverage(coverage))
-
-
-@pytest.mark.parametrize(("x", "y"), [(-0.875, 2.125), (0.625, 3.625), (4.875, 5.875), (-0.375, 3.625)])
-def test_geotiff_has_the_value_of_the_dataset_at_a_world_point(coverage, tmp_path, x, y):
+def test_geotiff_has_the_values_of_the_dataset_and_their_units_and_settings(coverage, tmp_path):
+    coverage["distance_m"][3, 4] = 255.0
     save_coverage(coverage, tmp_path / "coverage.tif")
     with rasterio.open(tmp_path / "coverage.tif") as image:
         assert image.descriptions == TABLE_VARIABLES
         assert image.crs is None
         assert tuple(image.bounds) == pytest.approx((-1.0, 2.0, 5.0, 6.0))
-        values = next(image.sample([(x, y)]))
-    here = coverage.sel(x=x, y=y)
-    expected = [float(here[name]) for name in TABLE_VARIABLES]
-    masked = [name in ("link_state", "partial_link_state") and not here["valid"] for name in TABLE_VARIABLES]
-    np.testing.assert_allclose(values, np.where(masked, np.nan, expected), rtol=1e-6)
-
-
-def test_geotiff_tells_units_and_settings(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "coverage.tif")
-    with rasterio.open(tmp_path / "coverage.tif") as image:
         assert np.isnan(image.nodata)
         assert image.units[TABLE_VARIABLES.index("gain_mean_db")] == "dB"
         assert image.tags()["units"] == "m"
-        assert image.tags()["predictor"] == "fake"
-        band = 1 + TABLE_VARIABLES.index("link_state")
-        assert image.tags(band)["flag_meanings"] == "outage los nlos no_receiver"
+        assert image.tags()["predictor"] == "map"
+        assert image.tags(1 + TABLE_VARIABLES.index("link_state"))["flag_meanings"] == "outage los nlos no_receiver"
+        for name, layer in zip(TABLE_VARIABLES, image.read(), strict=True):
+            np.testing.assert_allclose(np.flipud(layer), table_values(coverage, name), rtol=1e-6, err_msg=name)
 
 
-def test_a_distance_of_255_m_is_a_number(coverage, tmp_path):
-    coverage["distance_m"][3, 4] = 255.0
-    save_coverage(coverage, tmp_path / "coverage.tif")
-    with rasterio.open(tmp_path / "coverage.tif") as image:
-        layer = np.flipud(image.read(1 + TABLE_VARIABLES.index("distance_m")))
-    assert layer[3, 4] == 255.0
+def table_values(coverage, name):
+    """Values of a variable in a table; link states are missing where no receiver stands."""
+    values = coverage[name].to_numpy().astype(np.float64)
+    return np.where(coverage["valid"], values, np.nan) if name.endswith("link_state") else values
 
 
 def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
@@ -101,25 +70,21 @@ def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
     assert len(table) == coverage["valid"].size
     np.testing.assert_allclose(table["y_m"], np.repeat(coverage["y"], coverage.sizes["x"]))
     for name in TABLE_VARIABLES:
-        layer = coverage[name].to_numpy().ravel().astype(float)
-        if name.endswith("link_state"):
-            layer[~coverage["valid"].to_numpy().ravel()] = np.nan
-        np.testing.assert_allclose(table[name], layer, rtol=1e-6, err_msg=name)
-
-
-def test_csv_keeps_millimetres_far_from_the_origin(coverage, tmp_path):
+        np.testing.assert_allclose(table[name], table_values(coverage, name).ravel(), rtol=1e-6, err_msg=name)
     save_coverage(coverage.assign_coords(x=coverage["x"] + 500_000.0), tmp_path / "coverage.csv")
     assert pd.read_csv(tmp_path / "coverage.csv")["x_m"][0] == 499_999.125
 
 
-def test_png_is_the_picture(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "coverage.png")
+@pytest.mark.parametrize("name", ["coverage", "several"])
+def test_png_is_the_picture(name, request, tmp_path):
+    data = request.getfixturevalue(name)
+    save_coverage(data, tmp_path / "coverage.png")
     with Image.open(tmp_path / "coverage.png") as image:
         assert image.width >= 1200
-    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(coverage))
+    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(data))
 
 
-def test_ros_map_holds_the_probability_of_outage(coverage, tmp_path):
+def test_ros_map_holds_the_probability_of_outage_and_loads_as_a_map(coverage, tmp_path):
     """As nav2_map_server reads it in raw mode: shades 0 to 100 are occupancies, others unknown, row 0 is the top."""
     save_coverage(coverage, tmp_path / "outage.yaml")
     sheet = yaml.safe_load((tmp_path / "outage.yaml").read_text())
@@ -127,19 +92,11 @@ def test_ros_map_holds_the_probability_of_outage(coverage, tmp_path):
     assert sheet["resolution"] == 0.25
     assert sheet["origin"] == [-1.0, 2.0, 0.0]
     occupancy = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(int)
-    percent = 100 * coverage["p_outage"].to_numpy()
-    valid = coverage["valid"].to_numpy()
-    assert (occupancy[~valid] == 255).all()
-    assert (np.abs(occupancy - percent)[valid] <= 0.5).all()
-
-
-def test_ros_map_loads_as_a_map(coverage, tmp_path):
-    save_coverage(coverage, tmp_path / "outage.yaml")
+    p_outage, valid = coverage["p_outage"].to_numpy(), coverage["valid"].to_numpy()
     loaded = load_map(tmp_path / "outage.yaml")
-    p_outage = coverage["p_outage"].to_numpy()
-    assert loaded.shape == p_outage.shape
-    assert loaded.resolution_m == 0.25
-    assert loaded.origin_m == (-1.0, 2.0)
+    assert (occupancy[~valid] == 255).all()
+    assert (np.abs(occupancy - 100 * p_outage)[valid] <= 0.5).all()
+    assert (loaded.shape, loaded.resolution_m, loaded.origin_m) == (p_outage.shape, 0.25, (-1.0, 2.0))
     assert (loaded.state[p_outage > 0.66] == CellState.WALL).all()
     assert (loaded.state[p_outage < 0.19] == CellState.FREE).all()
     assert (loaded.state[np.isnan(p_outage)] == CellState.UNKNOWN).all()
@@ -157,10 +114,6 @@ def test_equal_maps_give_equal_files(coverage, tmp_path):
 
 
 class TestSeveralTransmitters:
-    @pytest.fixture
-    def several(self, monkeypatch):
-        return coverage_of_several(monkeypatch)
-
     def test_csv_has_the_transmitter_first(self, several, tmp_path):
         save_coverage(several, tmp_path / "coverage.csv")
         table = pd.read_csv(tmp_path / "coverage.csv")
@@ -186,8 +139,7 @@ class TestSeveralTransmitters:
                 assert image.units[band - 1] == "dB"
 
     @pytest.mark.usefixtures("command_line")
-    def test_the_command_network_writes_the_page(self, monkeypatch, tmp_path):
-        use_fakes(monkeypatch)
+    def test_the_command_network_writes_the_page(self, tmp_path):
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
         options = [word for x, y in SEVERAL.values() for word in ("--tx", x, y)]
         words = ["network", tmp_path / "map.yaml", *options, "--spacing", 0.5, "--out", tmp_path / "out"]
@@ -196,10 +148,6 @@ class TestSeveralTransmitters:
         files = ["coverage.nc", "coverage.html", "network.nc", "network.png"]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in files]
         assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(files)
-
-    def test_png_is_the_picture(self, several, tmp_path):
-        save_coverage(several, tmp_path / "coverage.png")
-        assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(several))
 
     def test_the_ros_map_of_a_network_holds_the_outage_of_all(self, several, tmp_path):
         network = network_map(several, n=50)
@@ -242,16 +190,11 @@ def test_a_folder_of_that_name_is_named_and_kept(coverage, tmp_path, suffix):
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-def test_a_full_disk_leaves_the_old_files(coverage, tmp_path, monkeypatch, suffix):
+def test_a_full_disk_leaves_the_old_files(coverage, tmp_path, files_that_fit, suffix):
     names = [f"coverage{suffix}"] + ["coverage.pgm"] * (suffix == ".yaml")
     for name in names:
         (tmp_path / name).write_text("old")
-
-    def full(descriptor):
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
+    files_that_fit(0)
     with pytest.raises(OutputError, match=r"No space left.*disk is full"):
         save_coverage(coverage, tmp_path / f"coverage{suffix}")
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(names)

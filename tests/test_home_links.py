@@ -1,22 +1,19 @@
 """Links of one home: places, truth, features, and what does not depend on what."""
 
-from collections.abc import Callable
+import itertools
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from link_tables import assert_same, make_table
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets import home_links as module
-from sionna_partial.datasets.home_links import NEAREST_M, closed_home, home_links, home_sensor, map_area
+from sionna_partial.datasets.home_links import NEAREST_M, home_links, home_sensor, map_area
 from sionna_partial.datasets.link_table import LinkTable, stage_name
 from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
-from sionna_partial.simulation.explore import Exploration, explore_trajectory
 from sionna_partial.tracing.trace import trace_links
 
 SETTINGS = DatasetSettings(
@@ -102,14 +99,6 @@ class TestPlaces:
             assert (table.observed_fraction[table.stage == stage] >= stage).all()
         assert [stage_name(stage) for stage in (0.0, 0.3, 50.0)] == ["0 steps", "30 % observed", "50 steps"]
 
-    def test_too_small(self) -> None:
-        state = np.full((3, 3), CellState.WALL, dtype=np.uint8)
-        state[1, 1] = CellState.FREE
-        with pytest.raises(
-            MapError, match=r"home 'shaft' is too small, all of it is within 0\.1 m of a transmitter: leave"
-        ):
-            home_links(PartialMap(state, 0.1), "shaft", DatasetSettings())
-
 
 class TestTruthAndFeatures:
     def test_truth_is_the_trace_on_the_complete_home(self, home: PartialMap, table: LinkTable) -> None:
@@ -134,32 +123,28 @@ class TestTruthAndFeatures:
         assert (here.phi.link_state == LinkState.LOS).all()
         np.testing.assert_allclose(here.phi.unobserved_distance_m, here.phi.distance_m)
 
-    def test_features_are_those_of_the_partial_map(self, home: PartialMap, table: LinkTable, monkeypatch: Any) -> None:
-        maps: list[PartialMap] = []
-
-        def noted(*args: Any, **options: Any) -> Exploration:
-            exploration = explore_trajectory(*args, **options)
-            maps.extend(exploration.maps)
-            return exploration
-
-        monkeypatch.setattr(module, "explore_trajectory", noted)
+    def test_features_are_those_of_the_partial_map(self, home: PartialMap, table: LinkTable) -> None:
         assert_same(home_links(home, "two rooms", SETTINGS), table)
-        assert table.maps == tuple(maps)
+        area = map_area(home, SETTINGS.margin_m)
+        for before, after in itertools.pairwise((*table.maps, area)):
+            known = before.state != CellState.UNKNOWN
+            np.testing.assert_array_equal(before.state[known], after.state[known])
+            assert before.observed_fraction < after.observed_fraction
         np.testing.assert_array_equal(np.array(SETTINGS.stages)[table.map_index], table.stage)
-        partial = maps[1]
-        here = table.take(table.stage == 3)
-        assert here.observed_fraction == pytest.approx(partial.observed_fraction)
-        np.testing.assert_array_equal(here.context.tx_seen, partial.state_at(here.context.tx_m) != CellState.UNKNOWN)
-        np.testing.assert_array_equal(here.context.rx_seen, partial.state_at(here.context.rx_m) != CellState.UNKNOWN)
-        tx = here.context.tx_m[0]
-        mine = here.take((here.context.tx_m == tx).all(axis=1))
-        phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, trace_settings=SETTINGS.trace))
-        np.testing.assert_array_equal(mine.phi.link_state, phi.link_state)
-        np.testing.assert_array_equal(mine.phi.unobserved_distance_m, phi.unobserved_distance_m)
-        np.testing.assert_array_equal(mine.phi.gain_db, phi.gain_db)
-        assert phi.context is not None
-        np.testing.assert_array_equal(mine.context.indirect_gain_db, phi.context.indirect_gain_db)
-        np.testing.assert_array_equal(mine.context.strongest_unobserved_m, phi.context.strongest_unobserved_m)
+        for number, partial in enumerate(table.maps):
+            here = table.take(table.map_index == number)
+            links, tx = here.context, here.context.tx_m[0]
+            assert here.observed_fraction == pytest.approx(partial.observed_fraction)
+            for seen, places_m in ((links.tx_seen, links.tx_m), (links.rx_seen, links.rx_m)):
+                np.testing.assert_array_equal(seen, partial.state_at(places_m) != CellState.UNKNOWN)
+            mine = here.take((links.tx_m == tx).all(axis=1))
+            phi = link_features(partial, trace_links(partial, tx, mine.context.rx_m, trace_settings=SETTINGS.trace))
+            for found, expected, names in (
+                (mine.phi, phi, ("link_state", "unobserved_distance_m", "gain_db")),
+                (mine.context, phi.context, ("indirect_gain_db", "strongest_unobserved_m")),
+            ):
+                for name in names:
+                    np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
     def test_complete_map_comes_along(self, home: PartialMap, table: LinkTable) -> None:
         assert table.complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
@@ -167,13 +152,9 @@ class TestTruthAndFeatures:
 
 
 class TestSeeds:
-    @pytest.mark.parametrize(
-        "change", [lambda settings: (settings, "other"), lambda settings: (replace(settings, seed=1), "two rooms")]
-    )
-    def test_places_depend_on_name_and_seed(
-        self, home: PartialMap, table: LinkTable, change: Callable[[DatasetSettings], tuple[DatasetSettings, str]]
-    ) -> None:
-        settings, name = change(replace(SETTINGS, stages=(0,)))
+    @pytest.mark.parametrize(("name", "seed"), [("other", 0), ("two rooms", 1)])
+    def test_places_depend_on_name_and_seed(self, home: PartialMap, table: LinkTable, name: str, seed: int) -> None:
+        settings = replace(SETTINGS, stages=(0,), seed=seed)
         assert not np.isin(home_links(home, name, settings).context.rx_m[:, 0], table.context.rx_m[:, 0]).any()
 
     def test_sensor_is_that_of_the_settings(self, home: PartialMap, table: LinkTable) -> None:
@@ -232,48 +213,40 @@ class TestMapArea:
 
 
 class TestRefused:
-    def test_home_without_free_cells(self) -> None:
-        with pytest.raises(MapError, match=r"home 'block' has no free cell: give maps of whole homes, with rooms"):
-            closed_home(PartialMap(np.full((3, 3), CellState.WALL), 0.5), "block")
+    @pytest.mark.parametrize(
+        ("cells", "message"),
+        [
+            ([[1, 1], [1, 1]], "has no free cell: give maps of whole homes, with rooms"),
+            ([[1, 1, 1], [1, 0, 1], [1, 1, 1]], r"is too small, all of it is within 0\.1 m of a transmitter: leave"),
+            ([[0, 2]], "is not complete, a free cell touches an unknown one: give maps of"),
+        ],
+    )
+    def test_homes(self, cells: list[list[int]], message: str) -> None:
+        with pytest.raises(MapError, match=f"home 'ruin' {message}"):
+            home_links(PartialMap(cells, 0.1), "ruin", SETTINGS)
+        with pytest.raises(MapError, match="home is of type list: give a PartialMap"):
+            home_links(cells, "ruin")  # type: ignore[arg-type]
 
-    def test_home_with_a_gap(self, home: PartialMap) -> None:
-        state = home.state.copy()
-        state[2, 20] = CellState.FREE
-        with pytest.raises(
-            MapError, match=r"home 'ruin' is not complete, a free cell touches an unknown one: give maps of"
-        ):
-            home_links(replace(home, state=state), "ruin", SETTINGS)
+    def test_height_above_the_ceiling(self, home: PartialMap) -> None:
+        with pytest.raises(PositionError, match="is not between floor and ceiling"):
+            home_links(home, "two rooms", replace(SETTINGS, rx_height_m=9.0))
 
     def test_home_that_is_cut_off_at_the_border_of_its_grid_is_closed_there(
         self, home: PartialMap, caplog: pytest.LogCaptureFixture
     ) -> None:
         column = int(np.flatnonzero((home.state == CellState.FREE).any(axis=0))[-3])
-        table = home_links(replace(home, state=home.state[:, :column]), "cut", SETTINGS)
+        table = home_links(replace(home, state=home.state[:, :column]), "cut", replace(SETTINGS, stages=(0,)))
         assert len(table) > 0
         assert "home 'cut' has free cells at the border of its grid" in caplog.text
 
-    def test_table_without_context(self) -> None:
-        table = make_table(homes=1, links=3)
-        with pytest.raises(PredictorError, match=r"features has no context: give the LinkFeatures of link_features\."):
-            replace(table, features=replace(table.features, context=None))
-
-    def test_truth_that_is_none(self) -> None:
+    def test_tables(self) -> None:
         table = make_table(homes=1, links=3)
         for change, message in (
+            ({"features": replace(table.features, context=None)}, "features has no context: give the LinkFeatures of"),
             ({"gain_db": np.where(np.arange(len(table)) == 1, np.nan, table.gain_db)}, r"gain_db\[1\] = nan"),
             ({"link_state": np.full(len(table), 7, dtype=np.uint8)}, r"link_state\[0\] = 7"),
         ):
             with pytest.raises(PredictorError, match=message):
                 replace(table, **change)
-
-    def test_no_tables(self) -> None:
         with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
             LinkTable.concatenate([])
-
-    def test_no_map(self) -> None:
-        with pytest.raises(MapError, match="home is of type str: give a PartialMap"):
-            home_links("home", "home", SETTINGS)  # type: ignore[arg-type]
-
-    def test_height_above_the_ceiling(self, home: PartialMap) -> None:
-        with pytest.raises(PositionError, match="is not between floor and ceiling"):
-            home_links(home, "two rooms", replace(SETTINGS, rx_height_m=9.0))

@@ -1,20 +1,25 @@
 """The commands dataset, train and evaluate: what they pass on, what they write and print, and how they fail."""
 
 import json
+import re
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
 from predictor_links import QUIET, quick_predictor
 from typer.testing import CliRunner, Result
 
-import sionna_partial as sp
 from sionna_partial import cli
-from sionna_partial.datasets.dataset import DatasetReport
+from sionna_partial.constants import CellState
+from sionna_partial.datasets.home_process import HomeTask, installed_versions
+from sionna_partial.datasets.home_sources import Home, home_sources
+from sionna_partial.datasets.shards import shard_path, write_shard
+from sionna_partial.maps.map_files import save_map
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.settings import DatasetSettings, Material, PredictorSettings, SensorSettings
+from sionna_partial.settings import DatasetSettings, Material, PredictorSettings, SceneSettings, SensorSettings
 
 pytestmark = [QUIET, pytest.mark.usefixtures("command_line")]
 
@@ -38,102 +43,123 @@ def run(*args: object) -> Result:
     return CliRunner().invoke(cli.app, [str(arg) for arg in args])
 
 
+def write_homes(folder: Path, homes: Iterable[Home], settings: DatasetSettings, *, built: int = 1_000) -> list[str]:
+    """Write a data set as if the first homes were built, and return the names of all: others are refused there."""
+    table = make_table(homes=1, links=2)
+    tasks = [HomeTask(str(folder), "", each, settings, installed_versions(), 1.0) for each in home_sources(homes)]
+    for task in tasks[:built]:
+        shard_path(folder, task.source.name).parent.mkdir(parents=True, exist_ok=True)
+        write_shard(table, shard_path(folder, task.source.name), task.metadata)
+    index = {"settings": tasks[0].metadata["settings"], "versions": installed_versions()}
+    (folder / "dataset.json").write_text(json.dumps(index | {"homes": [task.source.record for task in tasks]}))
+    return [task.source.name for task in tasks]
+
+
+def assert_found(result: Result, folder: Path, count: int) -> None:
+    """Check that so many homes were there, and none was built."""
+    line = rf"homes in {re.escape(str(folder))}: 0 built in [\d.]+ min, {count} already there\n"
+    assert re.fullmatch(line, result.stdout)
+
+
 class TestDataset:
-    @pytest.fixture
-    def calls(self, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-        """What `dataset` passes on, instead of a data set; homes from files fail."""
-        calls: list[Any] = []
+    """A command that asks for what a folder has finds it built; for anything else it is refused, or builds it."""
 
-        def build(folder: Path, homes: list[int | Path], settings: DatasetSettings, **options: Any) -> DatasetReport:
-            options.pop("progress")(1, len(homes), "half way")
-            calls.append((folder, homes, settings, options))
-            failed = {str(home): "the roof fell in\nTraceback" for home in homes if isinstance(home, Path)}
-            return DatasetReport(folder, ("a", "b"), ("c",), failed, 90.0)
-
-        monkeypatch.setattr(sp, "build_dataset", build)
-        return calls
-
-    def test_defaults(self, calls: list[Any]) -> None:
-        result = run("dataset", "out")
-        assert result.exit_code == 0
-        (call,) = calls
-        options = {"scheduler": None, "workers": None, "home_time_limit_s": 900.0}
-        assert call == (Path("out"), [*range(20_000, 20_100)], DatasetSettings(), options)
-        assert "homes in out: 2 built in 1.5 min, 1 already there" in result.stdout
-
-    def test_options(self, calls: list[Any]) -> None:
-        settings = "--links 20 --transmitters 2 --stage 50 --stage 0 --seed 3 --field-of-view 360 --range 8"
-        settings += " --range-noise 0.02 --drift 0.01 --missed-walls 0.1 --material concrete"
-        where = ("--scheduler", "tcp://host:8786", "--workers", 3, "--time-limit", 60)
-        result = run("dataset", "out", "--homes", 2, "--first-seed", 7, *settings.split(), *where)
-        assert result.exit_code == 0
-        _, homes, passed, options = calls[0]
-        assert homes == [7, 8]
-        assert (passed.links_per_home, passed.transmitters_per_home, passed.stages, passed.seed) == (20, 2, (0, 50), 3)
-        assert passed.sensor == SensorSettings(0.02, 0.01, 0.1, 360.0, 8.0)
-        assert passed.scene.material == Material(itu="concrete")
-        assert options == {"scheduler": "tcp://host:8786", "workers": 3, "home_time_limit_s": 60.0}
-
-    def test_kinds_in_turn_fractions_and_mixed_sensors(self, calls: list[Any]) -> None:
-        options = ("--kind", "floor", "--kind", "hall", "--mixed-sensors", "--short-links", 0.5)
-        result = run("dataset", "out", "--homes", 3, "--first-seed", 7, "--stage", 0.25, "--stage", 0, *options)
-        assert result.exit_code == 0
-        _, homes, passed, _ = calls[0]
-        assert homes == [(7, "floor"), (8, "hall"), (9, "floor")]
-        assert (passed.stages, passed.sensor, passed.short_link_fraction) == ((0, 0.25), "mixed", 0.5)
-
-    def test_maps_alone_and_failed_homes(self, calls: list[Any]) -> None:
-        result = run("dataset", "out", "--map", "one.yaml", "--map", "two")
-        assert calls[0][1] == [Path("one.yaml"), Path("two")]
-        assert result.exit_code == 1
-        assert "one.yaml failed: the roof fell in\ntwo failed: the roof fell in\n" in result.stderr
-        assert "homes that failed: 2; the others can be used" in result.stderr
-        assert "the same command tries them again" in result.stderr
-
-    def test_default_homes_are_new_to_the_shipped_predictor(self, calls: list[Any]) -> None:
-        run("dataset", "out")
+    def test_defaults(self, tmp_path: Path) -> None:
+        names = write_homes(tmp_path / "out", range(20_000, 20_100), DatasetSettings())
+        result = run("dataset", tmp_path / "out")
+        assert result.exit_code == 0, result.output
+        assert_found(result, tmp_path / "out", 100)
         known = json.loads((PREDICTORS_FOLDER / "paper.json").read_text(encoding="utf-8"))["homes"]
         assert known
-        assert not {f"make_home({seed})" for seed in calls[0][1]} & set(known)
+        assert not set(names) & set(known)
 
-    def test_bad_setting(self, calls: list[Any]) -> None:
-        result = run("dataset", "out", "--links", 2)
+    @pytest.mark.parametrize(
+        ("words", "homes", "settings"),
+        [
+            (
+                "--homes 2 --links 20 --transmitters 2 --stage 50 --stage 0 --seed 3 --field-of-view 360 --range 8 "
+                "--range-noise 0.02 --drift 0.01 --missed-walls 0.1 --material concrete --workers 3 --time-limit 60",
+                [7, 8],
+                DatasetSettings(
+                    *(20, 2, (0, 50)),
+                    seed=3,
+                    sensor=SensorSettings(0.02, 0.01, 0.1, 360.0, 8.0),
+                    scene=SceneSettings(material=Material(itu="concrete")),
+                ),
+            ),
+            (
+                "--homes 3 --stage 0.25 --stage 0 --kind floor --kind hall --mixed-sensors --short-links 0.5",
+                [(7, "floor"), (8, "hall"), (9, "floor")],
+                DatasetSettings(stages=(0, 0.25), sensor="mixed", short_link_fraction=0.5),
+            ),
+        ],
+        ids=["settings", "kinds in turn, fractions and mixed sensors"],
+    )
+    def test_options(self, words: str, homes: list[Home], settings: DatasetSettings, tmp_path: Path) -> None:
+        write_homes(tmp_path / "out", homes, settings)
+        result = run("dataset", tmp_path / "out", "--first-seed", 7, *words.split())
+        assert result.exit_code == 0, result.output
+        assert_found(result, tmp_path / "out", len(homes))
+
+    def test_maps_alone_and_failed_homes(self, tmp_path: Path) -> None:
+        maps = [tmp_path / "good.npz", tmp_path / "ruins" / "one.npz"]
+        maps[1].parent.mkdir()
+        for path in maps:
+            save_map(PartialMap([[CellState.FREE, CellState.UNKNOWN]], 1.0), path)
+        write_homes(tmp_path / "out", maps, DatasetSettings(), built=1)
+        result = run("dataset", tmp_path / "out", "--map", maps[0], "--map", maps[1].parent)
+        assert result.exit_code == 1
+        assert_found(result, tmp_path / "out", 1)
+        assert "one failed: home 'one' is not complete, a free cell touches an unknown one" in result.stderr
+        assert "homes that failed: 1; the others can be used" in result.stderr
+        assert "the same command tries them again" in result.stderr
+
+    @pytest.mark.parametrize(
+        ("words", "message"),
+        [
+            (["--links", 2], "links_per_home = 2 is not allowed: give at least 4, one for each of"),
+            (["--workers", 3, "--scheduler", "tcp://host:8786"], "workers = 3 is for this machine, and scheduler is"),
+            (["--time-limit", 0], "home_time_limit_s = 0.0 is not allowed"),
+        ],
+    )
+    def test_bad_settings(self, words: list[object], message: str, tmp_path: Path) -> None:
+        result = run("dataset", tmp_path / "out", "--homes", 1, *words)
         assert result.exit_code == 2
-        assert result.stderr.startswith("error: links_per_home = 2 is not allowed: give at least 4, one for each of")
-        assert calls == []
+        assert result.stderr.startswith(f"error: {message}")
+        assert not (tmp_path / "out").exists()
 
 
 class TestTrain:
     @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
-    @pytest.mark.parametrize("networks", ["paper", "map"])
-    def test_what_it_writes_and_says(self, networks: str, dataset: Path, tmp_path: Path) -> None:
-        out = tmp_path / "run"
-        options = ["--test-fraction", 0.5, "--networks", networks, "--passes", 2, "--seed", 3]
-        result = run("train", dataset, "--out", out, *options)
+    @pytest.mark.parametrize(
+        ("words", "settings", "fraction"),
+        [
+            ("", PredictorSettings("map", 60e9, diffraction=False), 0.3),
+            (
+                "--test-fraction 0.5 --networks paper --passes 2 --seed 3",
+                PredictorSettings("paper", 60e9, diffraction=False, passes=2, seed=3),
+                0.5,
+            ),
+        ],
+        ids=["defaults", "options"],
+    )
+    def test_what_it_writes_and_says(
+        self, words: str, settings: PredictorSettings, fraction: float, tmp_path: Path
+    ) -> None:
+        table, out = make_table(homes=3, links=20), tmp_path / "run"
+        dataset = make_dataset(tmp_path / "links", table, frequency_hz=60e9, diffraction=False)
+        result = run("train", dataset, "--out", out, *words.split())
         assert result.exit_code == 0, result.output
         names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
         assert sorted(path.name for path in out.iterdir()) == names
         *lines, hint = result.stdout.splitlines()
         assert lines[-6:] == [f"wrote {out / name}" for name in names]
         assert hint.endswith(f"sionna-partial evaluate {dataset} --predictor {out / 'predictor.keras'} --out REPORT")
-        assert "### Test homes (2), receivers indoors" in result.stdout
-        found = Predictor.load(out / "predictor.keras").settings
-        assert (found.networks, found.passes, found.seed, found.frequency_hz) == (networks, 2, 3, 28e9)
+        assert Predictor.load(out / "predictor.keras").settings == settings
         split = json.loads((out / "split.json").read_text())
-        assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
-
-    def test_defaults_and_the_frequency_of_the_data_set(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        folder = make_dataset(tmp_path, make_table(homes=1, links=5), frequency_hz=60e9, diffraction=False)
-        seen: dict[str, Any] = {}
-
-        def train(links: Any, **options: Any) -> Any:
-            seen.update(options)
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(sp, "train", train)
-        run("train", folder, "--out", tmp_path / "run")
-        assert seen["settings"] == PredictorSettings("map", frequency_hz=60e9, diffraction=False)
-        assert seen["test_fraction"] == 0.3
+        tests = round(3 * fraction)
+        assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (fraction, 3 - tests, tests)
+        assert f"### Test homes ({tests}), receivers indoors" in result.stdout
 
     @pytest.mark.parametrize(
         ("words", "message"),
@@ -151,26 +177,16 @@ class TestTrain:
 
 
 class TestEvaluate:
-    def test_what_it_writes_and_says(self, dataset: Path, predictor: Path, tmp_path: Path) -> None:
-        out = tmp_path / "report"
-        result = run("evaluate", dataset, "--predictor", predictor, "--out", out)
+    @pytest.mark.parametrize("given", [True, False])
+    def test_what_it_writes_and_says(self, given: bool, dataset: Path, predictor: Path, tmp_path: Path) -> None:
+        out, name = tmp_path / "report", str(predictor) if given else "map"
+        result = run("evaluate", dataset, "--out", out, *(["--predictor", predictor] if given else []))
         assert result.exit_code == 0, result.output
         names = ["report.md", "report.json", "stages.png", "calibration.png"]
         assert result.stdout.splitlines()[-4:] == [f"wrote {out / name}" for name in names]
         assert "| with indoor model    |" in result.stdout
-        assert json.loads((out / "report.json").read_text())["predictor"] == str(predictor)
-        assert f"# Evaluation of predictor `{predictor}`" in (out / "report.md").read_text()
-
-    def test_the_shipped_default(self, dataset: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        seen: list[Any] = []
-
-        def evaluate(*arguments: Any, progress: Any) -> Any:
-            seen.extend(arguments)
-            raise KeyboardInterrupt
-
-        monkeypatch.setattr(sp, "evaluate", evaluate)
-        run("evaluate", dataset, "--out", tmp_path / "report")
-        assert seen == ["map", [dataset]]
+        assert json.loads((out / "report.json").read_text())["predictor"] == name
+        assert f"# Evaluation of predictor `{name}`" in (out / "report.md").read_text()
 
     def test_unknown_predictor(self, dataset: Path, tmp_path: Path) -> None:
         result = run("evaluate", dataset, "--predictor", "nobody", "--out", tmp_path / "report")

@@ -1,25 +1,27 @@
-from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
-from coverage_fakes import COMPLETE, PICTURE, TX, FakePredictor, map_of
-from numpy.typing import NDArray
+from coverage_cases import COMPLETE, PICTURE, TX, map_of, shipped
 from placement_cases import TWO_ROOMS, home
+from predictor_links import QUIET, make_links
 
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area
-from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import TraceSettings
 
+pytestmark = QUIET
 
-class IndoorBy(FakePredictor):
-    """Predicts the probability of being indoors by a function of the features."""
 
-    def __init__(self, predict_indoor: Callable[[LinkFeatures], NDArray[np.float64]]) -> None:
-        self.predict_indoor = predict_indoor  # type: ignore[method-assign]
+@cache
+def indoor_in(count: int) -> Predictor:
+    """Return a predictor that has learned that one receiver in so many is indoors, wherever it is."""
+    phi = make_links(200)[0].take(np.repeat(np.arange(200), count))
+    return shipped("paper").fit_indoor(phi, np.arange(len(phi)) % count == 0)
 
 
 def two_rooms() -> PlacementArea:
@@ -60,17 +62,14 @@ class TestRoom:
 
 
 class TestPositions:
-    def test_all_over_the_area(self) -> None:
+    def test_all_over_the_area_by_seed(self) -> None:
         area = two_rooms()
         places = area.positions(3)
         assert area.stands(places).all()
         assert (places[:, 2] == 1.5).all()
         assert len(places) == pytest.approx(area.size_m2 / 0.25**2, rel=0.25)
-
-    def test_seed(self) -> None:
-        area = two_rooms()
-        np.testing.assert_array_equal(area.positions(3), area.positions(3))
-        assert not np.isin(area.positions(4)[:, 0], area.positions(3)[:, 0]).any()
+        np.testing.assert_array_equal(area.positions(3), places)
+        assert not np.isin(area.positions(4)[:, 0], places[:, 0]).any()
 
     def test_no_more_than_wanted_on_a_large_map(self) -> None:
         area = placement_area(PartialMap(np.zeros((200, 300), dtype=np.uint8), 0.2), 1.5, 1.5, None)
@@ -79,7 +78,7 @@ class TestPositions:
     def test_area_that_the_grid_misses(self) -> None:
         state = np.full((40, 40), CellState.UNKNOWN, dtype=np.uint8)
         state[20, 20:23] = CellState.FREE
-        area = placement_area(PartialMap(state, 0.05), 1.5, 1.5, FakePredictor())
+        area = placement_area(PartialMap(state, 0.05), 1.5, 1.5, indoor_in(4))
         for seed in range(5):
             assert area.stands(area.positions(seed)).all()
 
@@ -87,19 +86,21 @@ class TestPositions:
 class TestReceivers:
     def test_where_predict_map_has_valid_ones(self) -> None:
         partial, settings = map_of(PICTURE), TraceSettings(max_depth=0, diffraction=False)
-        coverage = predict_map(partial, TX, spacing_m=0.5, predictor="paper", trace_settings=settings)
+        coverage = predict_map(partial, TX, spacing_m=0.5, predictor=shipped("paper"), trace_settings=settings)
         rows, columns = np.nonzero(coverage["valid"].to_numpy())
         expected = np.column_stack([coverage["x"].to_numpy()[columns], coverage["y"].to_numpy()[rows]])
-        found = placement_area(partial, 1.5, 1.2, FakePredictor()).rx_m
+        found = placement_area(partial, 1.5, 1.2, indoor_in(4)).rx_m
         np.testing.assert_allclose(found[:, :2], expected)
         assert (found[:, 2] == 1.2).all()
 
     def test_unknown_ones_count_as_much_as_they_are_indoors(self) -> None:
         partial = map_of(PICTURE)
-        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        area = placement_area(partial, 1.5, 1.5, indoor_in(4))
         free = partial.state_at(area.rx_m) == CellState.FREE
         assert 0 < free.sum() < len(free)
-        np.testing.assert_array_equal(area.weight, np.where(free, 1.0, 0.25))
+        np.testing.assert_allclose(area.weight, np.where(free, 1.0, 0.25), atol=0.01)
+        hardly = placement_area(partial, 1.5, 1.5, indoor_in(100))
+        assert (partial.state_at(hardly.rx_m) == CellState.FREE).all()
 
     def test_outside_of_a_complete_map_does_not_count(self) -> None:
         partial = map_of(COMPLETE)
@@ -107,15 +108,9 @@ class TestReceivers:
         assert (partial.state_at(area.rx_m) == CellState.FREE).all()
         assert (area.weight == 1.0).all()
 
-    def test_those_hardly_indoors_are_left_out(self) -> None:
-        partial = map_of(PICTURE)
-        area = placement_area(partial, 1.5, 1.5, IndoorBy(lambda phi: np.full(len(phi), 0.01)))
-        assert (partial.state_at(area.rx_m) == CellState.FREE).all()
-
     def test_the_nearer_to_free_cells_the_more(self) -> None:
         """P(indoor) is predicted for lengths that grow with the distance from the free cells."""
-        model = IndoorBy(lambda phi: np.exp(-phi.unobserved_distance_m))
-        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, model)
+        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, shipped("paper"))
         order = np.argsort(area.rx_m[:, 0])
         assert (np.diff(area.weight[order][3:]) < 0.0).all()
 
@@ -137,6 +132,7 @@ class TestThinned:
         partial = PartialMap(np.zeros((100, 160), dtype=np.uint8), 0.1)
         area = placement_area(partial, 1.5, 1.5, None)
         thinned = area.thinned(60)
+        assert area.thinned(10_000) is area
         assert len(thinned.rx_m) == 60
         for axis in (0, 1):
             mean, all_mean = (np.average(each.rx_m[:, axis], weights=each.weight) for each in (thinned, area))
@@ -144,15 +140,11 @@ class TestThinned:
 
     def test_more_where_they_weigh_more(self) -> None:
         partial = PartialMap(np.repeat([[0], [0], [2], [2]], 40, axis=1).repeat(10, axis=0).astype(np.uint8), 0.2)
-        area = placement_area(partial, 1.5, 1.5, FakePredictor())
+        area = placement_area(partial, 1.5, 1.5, indoor_in(4))
         thinned = area.thinned(50)
         free = partial.state_at(thinned.rx_m) == CellState.FREE
         assert thinned.weight[free].sum() / thinned.weight.sum() == pytest.approx(0.8, abs=0.05)
         assert thinned.weight.sum() == 50
-
-    def test_few_are_kept(self) -> None:
-        area = two_rooms()
-        assert area.thinned(10_000) is area
 
 
 class TestVisibility:

@@ -1,5 +1,4 @@
 import dataclasses
-import doctest
 import re
 
 import numpy as np
@@ -19,8 +18,6 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction import features as features_module
-from sionna_partial.prediction import predictor as predictor_module
 from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
 from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
@@ -39,31 +36,27 @@ def seeing(request):
     return context_predictor(request.param)
 
 
+def predictor_of(networks):
+    return quick_predictor() if networks == "paper" else context_predictor(networks)
+
+
 @pytest.fixture
 def saved(quick, tmp_path):
     quick.save(tmp_path / "mine.keras")
     return tmp_path / "mine.keras"
 
 
-@pytest.mark.parametrize("module", [features_module, predictor_module])
-def test_examples_in_the_docstrings(module):
-    result = doctest.testmod(module)
-    assert result.attempted > 0
-    assert result.failed == 0
-
-
-def test_valid_on_other_links(quick):
-    phi, _, _ = make_links(2000, seed=2)
-    answer = quick.predict(phi)
+@pytest.mark.parametrize("networks", ["paper", "paths", "map"])
+def test_valid_on_other_links_and_on_none(networks):
+    model, phi = predictor_of(networks), make_seen_links(500, seed=2)[0]
+    answer = model.predict(phi)
     assert_valid(answer)
-    assert answer.gain_los_std_db.min() >= STD_RANGE_DB[0] - 1e-5
-    assert answer.gain_nlos_std_db.max() <= STD_RANGE_DB[1] + 1e-4
-
-
-def test_no_links(quick):
-    empty = make_links(0)[0]
-    assert all(values.shape == (0,) for values in arrays(quick.predict(empty)).values())
-    assert quick.predict_indoor(empty).shape == (0,)
+    for std_db in (answer.gain_los_std_db, answer.gain_nlos_std_db):
+        assert std_db.min() >= STD_RANGE_DB[0] - 1e-5
+        assert std_db.max() <= STD_RANGE_DB[1] + 1e-4
+    empty = phi.take(slice(0))
+    assert all(values.shape == (0,) for values in arrays(model.predict(empty)).values())
+    assert model.predict_indoor(empty).shape == (0,)
 
 
 def test_total_expectation_and_variance():
@@ -120,8 +113,7 @@ def test_bad_probability_of_being_indoors(p_indoor, message):
 @pytest.mark.parametrize("networks", ["paper", "paths", "map"])
 def test_save_and_load(networks, saved):
     phi, _, _ = make_seen_links(500, seed=5)
-    model = quick_predictor() if networks == "paper" else context_predictor(networks)
-    model = model.fit_indoor(phi, phi.unobserved_distance_m < 4.0)
+    model = predictor_of(networks).fit_indoor(phi, phi.unobserved_distance_m < 4.0)
     model = dataclasses.replace(model, metrics={"accuracy": 0.5})
     model.save(saved)
     loaded = Predictor.load(saved)
@@ -137,20 +129,11 @@ def test_save_and_load(networks, saved):
         assert saved.with_name(f"again{suffix}").read_bytes() == saved.with_suffix(suffix).read_bytes()
 
 
-def test_shipped_names(quick, tmp_path, monkeypatch):
-    monkeypatch.setattr(predictor_module, "PREDICTORS_FOLDER", tmp_path)
-    quick.save(tmp_path / "paper.keras")
-    context_predictor("map").save(tmp_path / "map.keras")
-    assert Predictor.load("paper").name == "paper"
-    assert Predictor.load("paper").fingerprint == quick.fingerprint
-    assert Predictor.load().name == Predictor.load("map").name == "map"
-    assert Predictor.load().fingerprint == context_predictor("map").fingerprint
-
-
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_predictor(name):
     model = Predictor.load(name)
-    assert model.settings.networks == name
+    assert model.name == model.settings.networks == name
+    assert (Predictor.load().fingerprint == model.fingerprint) == (name == "map")
     assert len(model.archive) < 20_000_000
     assert len(model.homes) >= 10
     assert not set(model.homes) & set(model.metrics["held_out_homes"])
@@ -163,13 +146,6 @@ def test_shipped_predictor(name):
 
 
 class TestNetworksOfMapsAndPaths:
-    def test_valid_on_other_links(self, seeing):
-        answer = seeing.predict(make_seen_links(500, seed=2)[0])
-        assert_valid(answer)
-        for std_db in (answer.gain_los_std_db, answer.gain_nlos_std_db):
-            assert std_db.min() >= STD_RANGE_DB[0] - 1e-5
-            assert std_db.max() <= STD_RANGE_DB[1] + 1e-4
-
     def test_its_networks_answer_where_maps_are_partial(self, seeing):
         phi = make_seen_links(100, seed=3)[0]
         expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, 28e9))
@@ -205,11 +181,6 @@ class TestNetworksOfMapsAndPaths:
         for index in ([7], [200, 3, 41], np.arange(150)):
             for name, values in arrays(seeing.predict(phi.take(np.array(index)))).items():
                 np.testing.assert_allclose(values, getattr(together, name)[index], rtol=1e-5, err_msg=name)
-
-    def test_no_links(self, seeing):
-        empty = make_seen_links(0)[0]
-        assert all(values.shape == (0,) for values in arrays(seeing.predict(empty)).values())
-        assert seeing.predict_indoor(empty).shape == (0,)
 
     def test_fit_indoor_keeps_its_networks(self, seeing):
         phi = make_seen_links(400, seed=4)[0]

@@ -1,5 +1,8 @@
 """The shipped predictor, evaluated on two shipped homes that it was not trained on, is as good as it was or better."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from predictor_links import QUIET
 
@@ -7,6 +10,7 @@ import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.evaluation.evaluate import WITH_INDOOR, Evaluation
+from sionna_partial.prediction.map_networks import LEAST_NOISE, SEEN_WIDENING, WIDENING
 from sionna_partial.resources import scenes_folder
 
 pytestmark = QUIET
@@ -45,3 +49,22 @@ def test_map_is_worth_more_than_the_distance_alone(evaluation: Evaluation) -> No
     for baseline in ("distance only", "partial trace"):
         assert metrics["predictor"].accuracy > metrics[baseline].accuracy
         assert metrics["predictor"].rmse_db < metrics[baseline].rmse_db
+
+
+@pytest.mark.parametrize(("range_noise_m", "noise"), [(0.0, 0.0), (0.03, 1.0)])
+def test_a_map_with_range_noise_is_predicted_less_certainly(range_noise_m: float, noise: float) -> None:
+    settings = replace(SETTINGS, stages=(100,), sensor=sp.SensorSettings(range_noise_m=range_noise_m))
+    links = home_links(sp.make_home(3, "apartment"), "home", settings)
+    wall_noise = links.context.wall_noise[0]
+    assert wall_noise == pytest.approx(noise, abs=LEAST_NOISE)
+    phi = links.phi
+    as_exact = replace(phi, context=replace(phi.context, wall_noise=np.zeros(len(links))))
+    wider, usual = (sp.Predictor.load().predict(each) for each in (phi, as_exact))
+    both_seen = links.context.tx_seen & links.context.rx_seen
+    assert 10 < both_seen.sum() < len(links) - 10
+    excess = max(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE)
+    ratio = 1.0 + excess * np.where(both_seen, SEEN_WIDENING, WIDENING)
+    np.testing.assert_allclose(wider.gain_nlos_std_db, ratio * usual.gain_nlos_std_db, rtol=1e-6)
+    np.testing.assert_allclose(wider.gain_los_std_db, ratio * usual.gain_los_std_db, rtol=1e-6)
+    np.testing.assert_array_equal(wider.p_los, usual.p_los)
+    np.testing.assert_array_equal(wider.gain_nlos_mean_db, usual.gain_nlos_mean_db)
