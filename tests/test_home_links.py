@@ -225,7 +225,7 @@ class TestRefused:
         with pytest.raises(MapError, match=f"home 'ruin' {message}"):
             home_links(PartialMap(cells, 0.1), "ruin", SETTINGS)
         with pytest.raises(MapError, match="home is of type list: give a PartialMap"):
-            home_links(cells, "ruin")  # type: ignore[arg-type]
+            home_links(cells, "ruin", SETTINGS)  # type: ignore[arg-type]
 
     def test_height_above_the_ceiling(self, home: PartialMap) -> None:
         with pytest.raises(PositionError, match="is not between floor and ceiling"):
