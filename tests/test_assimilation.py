@@ -88,6 +88,16 @@ def test_walls_stop_what_measurements_tell():
     assert measured.update(here, prior(1)).p_outage[0] < 0.3
 
 
+def test_where_nothing_was_seen_measurements_tell_of_places_farther_away():
+    """A seen transmitter: what misleads predictions are walls not seen, and these shadow whole rooms."""
+    seen_tx, at = LEFT[0], UNSEEN[None]
+    measured = sp.Measurements(seen_tx, at, [-90.0])
+    told = Assimilation(HOUSE, seen_tx, measured, prior(1))
+    farther, in_sight = told.update([(8.6, 2.8, 1.5), (8.6, 1.0, 1.5)], prior(2)).p_outage
+    assert farther < 0.4
+    assert in_sight > 0.48
+
+
 def test_a_certain_state_stays_and_its_gain_heeds_the_measurement():
     certain = prior(30, p_outage=0.0, mean_db=-80.0, std_db=0.0)
     measured = sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0))

@@ -32,8 +32,8 @@ CELL_M = 0.3
 UNKNOWN_COST = 3.0
 """Length of a walk through unknown cells, in lengths of one through free cells."""
 
-UNSEEN_REACH_M = 14.0
-"""Walk over which residuals stay correlated where the transmitter is in a cell that was not seen [m]."""
+UNSEEN_REACH_M = 12.0
+"""Walk over which residuals stay correlated where both links have an end in a cell that was not seen [m]."""
 
 LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
 """Fraction of the variance of residuals that is correlated over this walk only [m]."""
@@ -59,7 +59,7 @@ class Kind(NamedTuple):
     """Mean and standard deviation of a factor on what is predicted below the gain in free space [1]."""
 
     seen_reach_m: float
-    """Walk over which residuals stay correlated where the transmitter is in a cell that was seen [m]."""
+    """Walk over which residuals stay correlated where both ends of a link are in cells that were seen [m]."""
 
     trace_std_db: float
     """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
@@ -198,7 +198,7 @@ class Assimilation:
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
         self._tx_m, self._frequency_hz = tx_m, float(frequency_hz)
         rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
-        seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
+        tx_seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
         heard = gain_db > measured.sensitivity_db
         first, place, count = places_of(rx_m, heard, MOST_POINTS)
         heard = heard[first]
@@ -215,20 +215,20 @@ class Assimilation:
             noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
         best = -math.inf
         for kind in KINDS:
-            reach_m, chance = (kind.seen_reach_m, kind.chance) if seen else (UNSEEN_REACH_M, kind.unseen_chance)
+            chance = kind.chance if tx_seen else kind.unseen_chance
             scale_db = averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
             factor, spread = kind.shadow
             residual = averaged(above_db - (factor - 1.0) * below_db) / scale_db
             common = np.stack([np.full(len(first), kind.offset_db), spread * averaged(below_db)]) / scale_db
-            covariance = _positive(self._correlation(rx_m[first], reach_m)) + common.T @ common
+            covariance = _positive(self._correlation(rx_m[first], kind.seen_reach_m)) + common.T @ common
             for noise, noise_db in noises.items():
                 log_chance = math.log(chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
                 log_chance += _log_evidence(covariance, residual, noise_db / scale_db, heard)
                 log_chance -= np.log(scale_db[heard]).sum()
                 if log_chance > best:
-                    best, chosen = log_chance, (kind, reach_m, common, covariance, residual, noise_db, scale_db)
-        kind, self._reach_m, common, covariance, residual, noise_db, scale_db = chosen
-        self._trace_std_db = kind.trace_std_db
+                    best, chosen = log_chance, (kind, common, covariance, residual, noise_db, scale_db)
+        kind, common, covariance, residual, noise_db, scale_db = chosen
+        self._seen_reach_m, self._trace_std_db = kind.seen_reach_m, kind.trace_std_db
         self.noise_db = float(np.sqrt(np.mean(noise_db**2 * count)))
         self._weights, self._precision = _posterior(covariance, residual, heard, noise_db / scale_db)
         in_common = common @ self._weights
@@ -260,7 +260,7 @@ class Assimilation:
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m))
         prior = self._shadowed(rx_m, prior)
-        across = self._correlation(rx_m, self._reach_m)
+        across = self._correlation(rx_m, self._seen_reach_m)
         told = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
         touched = told > _LEAST_TOLD
         told = np.where(touched, told, 1.0)
@@ -288,12 +288,19 @@ class Assimilation:
         scaled_db[LinkState.OUTAGE] = GAIN_FLOOR_DB
         return LinkPrediction.of_parts(probabilities, scaled_db, stds_db)
 
+    def _ends_unseen(self, rx_m: Floats) -> Bools:
+        """Whether links to receivers (N, 3) have an end in a cell that was not seen."""
+        ends_m = np.stack([np.broadcast_to(self._tx_m, rx_m.shape), rx_m])
+        return (self._walks.partial.state_at(ends_m) != CellState.FREE).any(axis=0)
+
     def _free_space_db(self, rx_m: Floats) -> Floats:
         return free_space_gain_db(np.linalg.norm(rx_m - self._tx_m, axis=1), self._frequency_hz)
 
-    def _correlation(self, rx_m: Floats, reach_m: float) -> Floats:
+    def _correlation(self, rx_m: Floats, seen_reach_m: float) -> Floats:
         """Correlation (M, N) of residuals at the measured places and at other receivers."""
         walks_m = self._walks.lengths_m(rx_m)
+        unseen = self._ends_unseen(self._walks.points_m)[:, None] & self._ends_unseen(rx_m)
+        reach_m = np.where(unseen, UNSEEN_REACH_M, seen_reach_m)
         return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
