@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from importlib import metadata
-from itertools import permutations
 from pathlib import Path
 
 import pytest
@@ -59,6 +58,16 @@ IMPORTS = {
     "mitsuba": "import drjit, mitsuba; mitsuba.set_variant('llvm_ad_mono_polarized')",
     "tensorflow": "import tensorflow",
 }
+ORDERS = (
+    "ours sionna mitsuba tensorflow",
+    "ours tensorflow mitsuba sionna",
+    "sionna tensorflow ours mitsuba",
+    "mitsuba sionna ours tensorflow",
+    "mitsuba tensorflow ours sionna",
+    "tensorflow sionna mitsuba ours",
+)
+"""Any three of them are in every order in one of these."""
+
 STOCK_AND_OURS = """
 import tempfile
 import numpy as np, sionna.rt as rt
@@ -111,8 +120,9 @@ def require_refusal(done: subprocess.CompletedProcess[str], message: str) -> Non
     assert re.fullmatch(message, done.stderr.splitlines()[-1])
 
 
-@pytest.mark.parametrize("order", [*permutations(IMPORTS)], ids="-".join)
-def test_any_order_of_imports_works_or_ends_in_one_line(order: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("names", ORDERS)
+def test_any_order_of_imports_works_or_ends_in_one_line(names: str) -> None:
+    order = names.split()
     done = run(*(IMPORTS[name] for name in order), STOCK_AND_OURS)
     mitsuba_at = min(order.index("sionna"), order.index("mitsuba"))
     if mitsuba_at > order.index("ours"):
