@@ -1,5 +1,6 @@
 """PartialMap -> the wall cells that outlines run through: holes filled, ragged faces smoothed, short gaps closed."""
 
+import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -18,6 +19,9 @@ MAX_FREE_GAP_M = 0.11
 
 MIN_RUN_CELLS = 3
 """How far a wall must go on, on both sides of a gap, for the gap to be one in a seen wall [cells]."""
+
+DEEP_CELLS = 4
+"""How far FREE cells are behind the face of a wall that is deep [cells]."""
 
 PINHOLE_CELLS = 6
 """Largest hole in a wall that is filled [cells]."""
@@ -49,22 +53,45 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float = 0.5) -> CleanWalls:
     Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
     UNKNOWN cells in seen walls are closed (up to `bridge_gap_m`), and short ones of FREE cells in straight walls
     (`MAX_FREE_GAP_M`). Of walls that were seen from FREE cells, only the cells beside these are left: what is behind
-    was not seen. Walls two cells thick are thinned. Thin walls, posts and specks stay.
+    was not seen. Of deep walls these are the cells that rays meet, and those of inner corners. Walls two cells thick
+    are thinned. Thin walls, posts and specks stay.
     """
     wall = _fill_pinholes(partial.state == CellState.WALL)
     free = ~_fill_pinholes((partial.state != CellState.FREE) | wall)
+    wall |= _hidden_corners(wall, free)[0]
     longest = int(bridge_gap_m / partial.resolution_m + 1e-6)
     filled = _close_unknown_gaps(wall, free, longest)
     noise = _level(wall, free)
     filled |= _close_unknown_gaps(wall, free, longest)
     for cells, is_free in ((wall, free), (wall.T, free.T)):
         _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
-    seen = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    seen = wall & ndimage.binary_dilation(free, structure=_SQUARE) & ~_hidden_corners(wall, free)[1]
     label, count = ndimage.label(wall, structure=_SQUARE)
     unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
     unseen[label[seen]] = False
     thinned, peeled = _thin(seen | (wall & (unseen[label] | filled)), free)
     return CleanWalls(thinned, peeled, noise)
+
+
+def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
+    """Cells between two faces of a deep wall that no ray meets: those of inner corners, and those behind other ones.
+
+    Both touch a FREE cell by a corner alone. The faces end at an inner corner; behind an outer one, and behind a step
+    of a tilted face, another FREE cell is beside one of them. Deep are walls without FREE cells within `DEEP_CELLS`.
+    """
+    inner, behind = np.zeros((2, *wall.shape), dtype=bool)
+    ahead = np.arange(DEEP_CELLS)
+    for flip in itertools.product((1, -1), repeat=2):
+        turn = (slice(None, None, flip[0]), slice(None, None, flip[1]))
+        is_wall, is_free = (np.pad(mask[turn], DEEP_CELLS) for mask in (wall, free))
+        row, column = np.nonzero(is_free[:-1, :-1] & is_wall[:-1, 1:] & is_wall[1:, :-1])
+        row, column = row + 1, column + 1
+        deep = ~is_free[row[:, None, None] + ahead[:, None], column[:, None, None] + ahead].any(axis=(1, 2))
+        row, column = row[deep], column[deep]
+        ends = ~(is_free[row - 2, column] | is_free[row, column - 2])
+        for found, which in ((inner, ends), (behind, ~ends)):
+            found[turn][row[which] - DEEP_CELLS, column[which] - DEEP_CELLS] = True
+    return inner, behind & ~inner
 
 
 def _level(wall: Bools, free: Bools) -> float:
