@@ -198,7 +198,7 @@ class Assimilation:
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
         self._tx_m, self._frequency_hz = tx_m, float(frequency_hz)
         rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
-        tx_seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
+        self._tx_seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
         heard = gain_db > measured.sensitivity_db
         first, place, count = places_of(rx_m, heard, MOST_POINTS)
         heard = heard[first]
@@ -215,7 +215,7 @@ class Assimilation:
             noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
         best = -math.inf
         for kind in KINDS:
-            chance = kind.chance if tx_seen else kind.unseen_chance
+            chance = kind.chance if self._tx_seen else kind.unseen_chance
             scale_db = averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
             factor, spread = kind.shadow
             residual = averaged(above_db - (factor - 1.0) * below_db) / scale_db
@@ -288,10 +288,9 @@ class Assimilation:
         scaled_db[LinkState.OUTAGE] = GAIN_FLOOR_DB
         return LinkPrediction.of_parts(probabilities, scaled_db, stds_db)
 
-    def _ends_unseen(self, rx_m: Floats) -> Bools:
-        """Whether links to receivers (N, 3) have an end in a cell that was not seen."""
-        ends_m = np.stack([np.broadcast_to(self._tx_m, rx_m.shape), rx_m])
-        return (self._walks.partial.state_at(ends_m) != CellState.FREE).any(axis=0)
+    def _both_seen(self, rx_m: Floats) -> Bools:
+        """Whether both ends of the links to receivers (N, 3) are in cells that were seen."""
+        return self._tx_seen & (self._walks.partial.state_at(rx_m) == CellState.FREE)
 
     def _free_space_db(self, rx_m: Floats) -> Floats:
         return free_space_gain_db(np.linalg.norm(rx_m - self._tx_m, axis=1), self._frequency_hz)
@@ -299,8 +298,8 @@ class Assimilation:
     def _correlation(self, rx_m: Floats, seen_reach_m: float) -> Floats:
         """Correlation (M, N) of residuals at the measured places and at other receivers."""
         walks_m = self._walks.lengths_m(rx_m)
-        unseen = self._ends_unseen(self._walks.points_m)[:, None] & self._ends_unseen(rx_m)
-        reach_m = np.where(unseen, UNSEEN_REACH_M, seen_reach_m)
+        either_seen = self._both_seen(self._walks.points_m)[:, None] | self._both_seen(rx_m)
+        reach_m = np.where(either_seen, seen_reach_m, UNSEEN_REACH_M)
         return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 

@@ -1,6 +1,5 @@
 """PartialMap -> the wall cells that outlines run through: holes filled, ragged faces smoothed, short gaps closed."""
 
-import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -81,16 +80,15 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
-    for flip in itertools.product((1, -1), repeat=2):
-        turn = (slice(None, None, flip[0]), slice(None, None, flip[1]))
-        is_wall, is_free = (np.pad(mask[turn], DEEP_CELLS) for mask in (wall, free))
+    for *masks, is_inner, is_behind in _orientations(wall, free, inner, behind):
+        is_wall, is_free = (np.pad(mask, DEEP_CELLS) for mask in masks)
         row, column = np.nonzero(is_free[:-1, :-1] & is_wall[:-1, 1:] & is_wall[1:, :-1])
         row, column = row + 1, column + 1
         deep = ~is_free[row[:, None, None] + ahead[:, None], column[:, None, None] + ahead].any(axis=(1, 2))
         row, column = row[deep], column[deep]
         ends = ~(is_free[row - 2, column] | is_free[row, column - 2])
-        for found, which in ((inner, ends), (behind, ~ends)):
-            found[turn][row[which] - DEEP_CELLS, column[which] - DEEP_CELLS] = True
+        for found, which in ((is_inner, ends), (is_behind, ~ends)):
+            found[row[which] - DEEP_CELLS, column[which] - DEEP_CELLS] = True
     return inner, behind & ~inner
 
 
@@ -140,8 +138,8 @@ def _close_unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
 
 
 def _orientations(*masks: Bools) -> Iterator[tuple[Bools, ...]]:
-    """Yield views of masks with each of their four sides at row 0."""
-    for turned in (lambda m: m, lambda m: m[::-1], lambda m: m.T, lambda m: m.T[::-1]):
+    """Yield views of masks in their four rotations: each side is at row 0 once, and each corner at row and column 0."""
+    for turned in (lambda m: m, lambda m: m[::-1, ::-1], lambda m: m.T[:, ::-1], lambda m: m.T[::-1]):
         yield tuple(turned(mask) for mask in masks)
 
 
