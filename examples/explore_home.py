@@ -34,6 +34,8 @@ for step, partial in zip(trajectory.steps, trajectory.maps, strict=True):
 
 steps, _, mean_db, std_db = np.array(rows).T
 truth_db = sp.trace_links(home, tx, rx).gain_db[0]
+assert std_db[-1] < std_db[0] / 2
+assert abs(mean_db[-1] - truth_db) < 2 * std_db[-1]
 figure = Figure(figsize=(6, 3), layout="constrained")
 axis = figure.subplots()
 axis.errorbar(steps, mean_db, std_db, marker="o", capsize=3, label="prediction: mean and standard deviation")

@@ -43,6 +43,7 @@ gain_db = 20 * np.log10(np.abs(links.cfr(SUBCARRIERS_HZ).h.to_numpy()[:, 0, 0]))
 snr_db = TX_POWER_DBM[:, None, None] - 10 * np.log10(len(SUBCARRIERS_HZ)) + gain_db - NOISE_DBM
 expected = erfc(np.sqrt(10 ** (snr_db / 10) / 2)).mean(axis=2) / 2
 print(f"largest difference from theory: {np.abs(simulated - expected).max():.4f}")
+assert np.abs(simulated - expected).max() < 0.005
 for i, state in enumerate(links.link_state):
     needed = TX_POWER_DBM[np.argmax(expected[:, i] < 1e-3)]
     print(f"link {i}, {sp.LinkState(state).name}: bit error rate below 0.001 from {needed:.0f} dBm")

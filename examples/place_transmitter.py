@@ -43,5 +43,7 @@ def coverage(tx: ArrayLike) -> float:
 
 free = centres_m(np.argwhere(partial.state == sp.CellState.FREE), partial)
 middle = free[np.linalg.norm(free - free.mean(axis=0), axis=1).argmin()]
-print(f"in truth it covers {coverage(found.position_m):.1%}")
-print(f"the middle of what was seen covers {coverage(middle):.1%}")
+covered, covered_from_middle = coverage(found.position_m), coverage(middle)
+print(f"in truth it covers {covered:.1%}")
+print(f"the middle of what was seen covers {covered_from_middle:.1%}")
+assert covered > covered_from_middle

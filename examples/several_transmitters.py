@@ -22,7 +22,9 @@ network = sp.network_map(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6, load=0
 for name, share in network.p_best.mean(("x", "y")).to_series().items():
     print(f"{name}: strongest at {share:.0%} of the receivers")
 alone = coverage.p_outage.prod("tx", skipna=False).mean().item()
-print(f"all fail: {network.p_all_outage.mean().item():.1%}; if they were independent, {alone:.1%}")
+together = network.p_all_outage.mean().item()
+print(f"all fail: {together:.1%}; if they were independent, {alone:.1%}")
+assert 0.0 < alone < together
 
 # %%
 # Best server, SINR, the probability of 10 dB, and the rate.

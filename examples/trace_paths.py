@@ -17,6 +17,7 @@ tx, rx = (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)]
 links = sp.trace_links(home, tx, rx)
 for i, (state, gain_db) in enumerate(zip(links.link_state, links.gain_db, strict=True)):
     print(f"link {i}: {sp.LinkState(state).name}, {gain_db:.1f} dB, {np.sum(links.path_rx == i)} paths")
+assert links.link_state.tolist() == [sp.LinkState.LOS, sp.LinkState.NLOS]
 
 # %%
 # The power of each path against its delay. Sionna RT's codes tell what happens on the path: 1 is a reflection, 8 a

@@ -1,17 +1,15 @@
-"""Progress of long work: a bar in a terminal or a notebook, lines of a command elsewhere, or what a caller does."""
+"""Progress of long work: a bar of tqdm, or what a caller does."""
 
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from html import escape
-from importlib import import_module
-from time import monotonic
-from typing import Any, Protocol
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache
+from typing import Any
 
 from sionna_partial.checks import CountProgress, Progress, require
 
-WAIT_S, DRAW_S, LINE_S = 2.0, 0.1, 60.0
-"""Time until a bar appears, between two pictures of it in a notebook, and between two lines [s]."""
+WAIT_S, LINE_S = 2.0, 60.0
+"""Time until a bar appears, and between two lines of a command without a terminal [s]."""
 
 
 @contextmanager
@@ -24,36 +22,34 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
     if callable(progress):
         yield progress
         return
-    with _display(progress, command=command) as draw:
-        started = monotonic()
+    with _bar(progress, command, total=1.0, bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining} {desc}") as bar:
 
         def report(fraction: float, message: str) -> None:
-            elapsed_s = monotonic() - started
-            rest = _time_left(elapsed_s * (1.0 / fraction - 1.0)) if fraction > 0.0 and elapsed_s > WAIT_S else ""
-            draw(fraction, f"{fraction:.0%} {message} {rest}".rstrip())
+            bar.set_description_str(message, refresh=False)
+            bar.update(fraction - bar.n)
 
         yield report
+        bar.update(1.0 - bar.n)
 
 
 @contextmanager
 def counting(progress: CountProgress | bool | None, unit: str, *, command: bool = False) -> Iterator[CountProgress]:
-    """Open the same for things (`unit`, in the plural) that are counted, with how many are done a minute.
+    """Open the same for things (`unit`, in the plural) that are counted.
 
-    Those that were done at the first report do not count for the rate. A command also prints the first and last line.
+    Those that were done at the first report do not count for the rate.
     """
     if callable(progress):
         yield progress
         return
-    with _display(progress, command=command) as draw:
-        first: tuple[int, float] | None = None
+    style = f"{{n_fmt}} of {{total_fmt}} {unit} |{{bar}}| {{elapsed}}<{{remaining}} {{desc}}"
+    with ExitStack() as stack:
+        bar: Any = None
 
         def report(done: int, total: int, message: str) -> None:
-            nonlocal first
-            now, starting = monotonic(), first is None
-            first = first or (done, now)
-            pace = rate_and_rest(done - first[0], total - done, now - first[1])
-            text = f"{done} of {total} {unit} {pace} {message}".replace("  ", " ")
-            draw(done / max(1, total), text, at_once=starting or done == total)
+            nonlocal bar
+            bar = bar or stack.enter_context(_bar(progress, command, total=total, initial=done, bar_format=style))
+            bar.set_description_str(message, refresh=False)
+            bar.update(done - bar.n)
 
         yield report
 
@@ -63,112 +59,30 @@ def part_of(report: Progress, low: float, high: float) -> Progress:
     return lambda fraction, message: report(low + (high - low) * fraction, message)
 
 
-def rate_and_rest(done: int, rest: int, elapsed_s: float) -> str:
-    """Return how many a minute were done, and how long the rest takes at that rate; "" where nothing was done."""
-    if not done or elapsed_s <= 0.0:
-        return ""
-    return f"({60.0 * done / elapsed_s:.3g}/min, {_time_left(rest * elapsed_s / done)})"
-
-
-def _time_left(rest_s: float) -> str:
-    seconds = round(rest_s)
-    return f"{seconds // 3600}:{seconds // 60 % 60:02}:{seconds % 60:02} left"
-
-
-class _Bar(Protocol):
-    """What shows progress."""
-
-    def draw(self, fraction: float, text: str, *, at_once: bool) -> None: ...
-
-    def close(self, *, done: bool) -> None: ...
-
-
 @contextmanager
-def _display(progress: object, *, command: bool) -> Iterator[Callable[..., None]]:
-    """Open what shows a fraction and a text."""
+def _bar(progress: object, command: bool, **options: Any) -> Iterator[Any]:
+    """Open a bar of tqdm, which stays when the work is done, and vanishes before an error."""
     require(progress is None or isinstance(progress, bool), "progress", progress, "give True, False or a callable.")
-    bar = None if progress is False else _bar(command=command)
-    started = monotonic()
-
-    def draw(fraction: float, text: str, *, at_once: bool = False) -> None:
-        if bar and (command or monotonic() - started >= WAIT_S):
-            bar.draw(fraction, text, at_once=at_once)
-
-    try:
-        yield draw
-    except BaseException:  # the error that follows stands alone
-        if bar:
-            bar.close(done=False)
-        raise
-    if bar:
-        bar.close(done=True)
-
-
-def _bar(*, command: bool) -> _Bar | None:
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    if hasattr(shell, "kernel"):
-        return _NotebookBar()
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if console.is_terminal:
-        return _TerminalBar(console)
-    return _Lines() if command else None
-
-
-class _TerminalBar:
-    def __init__(self, console: Any) -> None:
-        from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
-        from rich.progress import Progress as Bar
-
-        self._bar = Bar(
-            BarColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False), console=console
-        )
-        self._task = self._bar.add_task("", total=1.0)
-
-    def draw(self, fraction: float, text: str, *, at_once: bool) -> None:
-        self._bar.update(self._task, completed=fraction, description=text)
-        self._bar.start()
-
-    def close(self, *, done: bool) -> None:
-        if self._bar.live.is_started:
-            if done:
-                self._bar.update(self._task, completed=1.0, description="done")
-            self._bar.live.transient = not done
-            self._bar.stop()
+    drawn = sys.stderr.isatty() or hasattr(shell, "kernel")
+    options |= {"disable": progress is False or not (drawn or command), "smoothing": 0.0, "file": sys.stderr}
+    if command:
+        options |= {} if drawn else {"mininterval": LINE_S, "maxinterval": LINE_S}
+    else:
+        options |= {"delay": WAIT_S}
+    with _tqdm()(**options, dynamic_ncols=drawn, leave=True) as bar:
+        try:
+            yield bar
+        except BaseException:
+            bar.leave = False
+            raise
 
 
-class _NotebookBar:
-    """A bar of plain HTML, as `rich` has none without ipywidgets."""
+@cache
+def _tqdm() -> Any:
+    from tqdm import tqdm
 
-    def __init__(self) -> None:
-        self._started, self._drawn, self._handle = monotonic(), -DRAW_S, None
+    class Bar(tqdm):
+        monitor_interval = 0  # no thread
 
-    def draw(self, fraction: float, text: str, *, at_once: bool) -> None:
-        if monotonic() - self._drawn >= DRAW_S:
-            self._show(f'<progress value="{fraction:.3f}" max="1"></progress> {escape(text)}')
-
-    def close(self, *, done: bool) -> None:
-        if self._handle is not None:
-            took_s = monotonic() - self._started
-            self._show(f'<progress value="1" max="1"></progress> done in {took_s:.0f} s' if done else "")
-
-    def _show(self, html: str) -> None:
-        ipython, self._drawn = import_module("IPython.display"), monotonic()
-        if self._handle is None:
-            self._handle = ipython.display(ipython.HTML(html), display_id=True)
-        else:
-            self._handle.update(ipython.HTML(html))
-
-
-class _Lines:
-    def __init__(self) -> None:
-        self._printed = monotonic()
-
-    def draw(self, fraction: float, text: str, *, at_once: bool) -> None:
-        if at_once or monotonic() - self._printed >= LINE_S:
-            self._printed = monotonic()
-            print(text, file=sys.stderr, flush=True)
-
-    def close(self, *, done: bool) -> None:
-        pass
+    return Bar

@@ -156,15 +156,16 @@ class TestOneDirection:
         files = (path.relative_to(PACKAGE).with_suffix("") for path in PACKAGE.rglob("*.py") if path.stem != "__init__")
         assert sorted(MODULES) == sorted(".".join(file.parts) for file in files)
 
-    @pytest.mark.parametrize("module", MODULES)
-    def test_module_imports_only_from_those_before_it(self, module: str) -> None:
-        assert own_imports(module) <= set(MODULES[: MODULES.index(module)])
+    def test_modules_import_only_from_those_before_them(self) -> None:
+        late = {module: own_imports(module) - set(MODULES[:number]) for number, module in enumerate(MODULES)}
+        assert {module: names for module, names in late.items() if names} == {}
 
-    @pytest.mark.parametrize("module", MODULES)
-    def test_room_imports_only_from_rooms_before_it(self, module: str) -> None:
-        order, room_of = list(ROOMS), dict(zip(MODULES, (room for room in ROOMS for _ in ROOMS[room]), strict=True))
-        rooms = {room_of[name] for name in own_imports(module)}
-        assert rooms <= set(order[: order.index(room_of[module]) + 1])
+    def test_rooms_import_only_from_rooms_before_them(self) -> None:
+        room_of = dict(zip(MODULES, (room for room in ROOMS for _ in ROOMS[room]), strict=True))
+        order = list(ROOMS)
+        for module in MODULES:
+            rooms = {room_of[name] for name in own_imports(module)}
+            assert rooms <= set(order[: order.index(room_of[module]) + 1]), module
 
     def test_plots_are_a_leaf(self) -> None:
         users = [module for module in MODULES if any(name.startswith("plots.") for name in own_imports(module))]
@@ -183,9 +184,8 @@ class TestOneDirection:
             )
             assert not lazy or module.startswith("cli."), module
 
-    @pytest.mark.parametrize("module", MODULES)
-    def test_libraries_that_need_llvm_first_are_imported_in_functions(self, module: str) -> None:
-        assert not imported_at_the_top(tree_of(module)) & IN_FUNCTIONS
+    def test_libraries_that_need_llvm_first_are_imported_in_functions(self) -> None:
+        assert [module for module in MODULES if imported_at_the_top(tree_of(module)) & IN_FUNCTIONS] == []
 
 
 class TestLightImports:
@@ -206,14 +206,14 @@ class TestLightImports:
 
 
 class TestPublicNames:
-    @pytest.mark.parametrize("name", sionna_partial.__all__)
-    def test_name_resolves_to_what_it_says(self, name: str) -> None:
+    def test_names_resolve_to_what_they_say(self) -> None:
         for module in MODULES:
             import_module(f"sionna_partial.{module}")
-        value = getattr(sionna_partial, name)
-        assert not isinstance(value, ModuleType)
-        assert getattr(value, "__name__", name) == name
-        assert name in dir(sionna_partial)
+        for name in sionna_partial.__all__:
+            value = getattr(sionna_partial, name)
+            assert not isinstance(value, ModuleType)
+            assert getattr(value, "__name__", name) == name
+            assert name in dir(sionna_partial)
 
     def test_unknown_name(self) -> None:
         with pytest.raises(AttributeError, match="module 'sionna_partial' has no attribute 'teleport'"):
