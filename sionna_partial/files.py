@@ -2,11 +2,9 @@
 
 import csv
 import errno
-import fcntl
 import io
 import os
 import shutil
-import socket
 import stat
 import tempfile
 from collections.abc import Callable, Collection, Iterator
@@ -28,7 +26,7 @@ MAX_CSV_BYTES = 100_000_000
 """Largest CSV that is read."""
 
 LOCK_FILE = ".lock"
-"""File in a locked folder that names the process that writes there."""
+"""File in a locked folder."""
 
 HIDDEN, TEMPORARY = ".tmp-sionna_partial_", "sionna_partial_"
 """Beginnings of the names of hidden folders beside outputs, and of those in the folder of temporary files."""
@@ -259,36 +257,23 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Make a folder and keep other runs from writing to it; a lock ends with its process, however that ends.
+    """Make a folder and keep other runs from writing to it; a lock ends with its process, however that ends."""
+    from filelock import FileLock, Timeout
 
-    On a file system without locks, nothing is locked.
-    """
     target = output_path(folder)
     require_writable(target)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        stream = (target / LOCK_FILE).open("a+", encoding="utf-8")
-    except OSError as error:
-        raise _output_error(target / LOCK_FILE, error) from error
-    with stream:
+    with ExitStack() as lock:
         try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            stream.seek(0)
+            target.mkdir(parents=True, exist_ok=True)
+            lock.enter_context(FileLock(target / LOCK_FILE, timeout=0))
+        except Timeout:
             raise OutputError(
-                f"folder = '{target}' is being written by {stream.read() or 'another process'}: wait until that has "
-                "ended, or choose another folder."
+                f"folder = '{target}' is being written by another process: wait until that has ended, or choose "
+                "another folder."
             ) from None
         except OSError as error:
-            if error.errno not in _NO_LOCKS:
-                raise _output_error(target, error) from error
-        stream.truncate(0)
-        stream.write(f"process {os.getpid()} on {socket.gethostname()}")
-        stream.flush()
-        try:
-            yield
-        finally:
-            stream.truncate(0)
+            raise _output_error(target / LOCK_FILE, error) from error
+        yield
 
 
 def _hidden_folder(target: Path, parent: Path) -> AbstractContextManager[Path]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation, Slerp
 
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M
@@ -31,18 +32,20 @@ ROBOT_FRAMES = ("base_link", "base_footprint")
 
 
 class _Track(NamedTuple):
-    """Poses of one frame in another one: N times [s], x, y, z [m] (N, 3), unit quaternions x, y, z, w (N, 4)."""
+    """Poses of one frame in another one: N times [s], x, y, z [m] (N, 3), N rotations."""
 
     parent: str
     time_s: NDArray[np.float64]
     position_m: NDArray[np.float64]
-    quaternion: NDArray[np.float64]
+    rotation: Rotation
 
     def at(self, time_s: NDArray[np.float64]) -> "_Track":
-        """Interpolate linearly; beyond the ends the first and the last pose stay."""
-        rows = np.hstack([self.position_m, self.quaternion])
-        rows = np.column_stack([np.interp(time_s, self.time_s, row) for row in rows.T])
-        return _Track(self.parent, time_s, rows[:, :3], rows[:, 3:])
+        """Interpolate; beyond the ends the first and the last pose stay."""
+        position_m = np.column_stack([np.interp(time_s, self.time_s, axis) for axis in self.position_m.T])
+        if len(self.time_s) == 1:
+            return _Track(self.parent, time_s, position_m, self.rotation[np.zeros(len(time_s), int)])
+        inside_s = np.clip(time_s, self.time_s[0], self.time_s[-1])
+        return _Track(self.parent, time_s, position_m, Slerp(self.time_s, self.rotation)(inside_s))
 
 
 def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, frame: str | None = None) -> "xr.Dataset":
@@ -168,7 +171,7 @@ def measurements_from_bag(
 def _pose_table(track: _Track) -> "xr.Dataset":
     import xarray as xr
 
-    x, y, z, w = track.quaternion.T
+    x, y, z, w = track.rotation.as_quat().T
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     variables = {"position_m": (("time", "axis"), track.position_m), "yaw_rad": ("time", yaw)}
     return xr.Dataset(variables, {"time_s": ("time", track.time_s), "axis": [*"xyz"]}, {"frame_id": track.parent})
@@ -247,7 +250,7 @@ def _transforms(recording: Recording, *, stamped: bool) -> dict[str, _Track]:
 
 
 def _track(parent: str, rows: Iterable[Any]) -> _Track:
-    """Sort poses by time, and turn quaternions so that neighbours can be interpolated."""
+    """Sort poses by time; each time once."""
     table = np.array([(time, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for time, p, q in rows], dtype=np.float64)
     table = table[np.isfinite(table).all(axis=1)]
     table = table[np.unique(table[:, 0], return_index=True)[1]]
@@ -255,10 +258,7 @@ def _track(parent: str, rows: Iterable[Any]) -> _Track:
         raise MeasurementError("the recording has no finite pose: name another topic.")
     quaternion = table[:, 4:]
     quaternion[~quaternion.any(axis=1), 3] = 1.0
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-    turned = np.where((quaternion[1:] * quaternion[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    quaternion *= np.cumprod([1.0, *turned])[:, None]
-    return _Track(parent, table[:, 0], table[:, 1:4], quaternion)
+    return _Track(parent, table[:, 0], table[:, 1:4], Rotation.from_quat(quaternion))
 
 
 def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]:
@@ -274,11 +274,8 @@ def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]
 
 def _composed(chain: list[_Track]) -> _Track:
     """Poses of the first frame of a chain in the last one, at the times of the transform that changes most often."""
-    from scipy.spatial.transform import Rotation
-
     time_s = max(chain, key=lambda each: len(each.time_s)).time_s
     position_m, turn = np.zeros((len(time_s), 3)), Rotation.identity(len(time_s))
     for each in (link.at(time_s) for link in chain):
-        outer = Rotation.from_quat(each.quaternion)
-        position_m, turn = outer.apply(position_m) + each.position_m, outer * turn
-    return _Track(chain[-1].parent, time_s, position_m, turn.as_quat())
+        position_m, turn = each.rotation.apply(position_m) + each.position_m, each.rotation * turn
+    return _Track(chain[-1].parent, time_s, position_m, turn)
