@@ -308,7 +308,8 @@ class _Links:
         """Trace and predict the links to receivers (N, 3) [m] that are indoors; without a model the trace predicts."""
         context = self.model is not None and self.model.settings.networks != "paper"
         paths = self.tracer.paths(tx_m, rx_m, report)
-        phi = features_of_paths(self.partial, tx_m, rx_m, paths, context=context)
+        frequency_hz = self.tracer.settings.frequency_hz
+        phi = features_of_paths(self.partial, tx_m, rx_m, paths, frequency_hz, context=context)
         return phi, LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
 
     def predict_all(self, tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:

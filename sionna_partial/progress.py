@@ -8,8 +8,8 @@ from typing import Any
 
 from sionna_partial.checks import CountProgress, Progress, require
 
-WAIT_S, LINE_S = 2.0, 60.0
-"""Time until a bar appears, and between two lines of a command without a terminal [s]."""
+WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
+"""Time until a bar of a call appears, of a command, and between two lines of a command without a terminal [s]."""
 
 
 @contextmanager
@@ -17,7 +17,7 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
     """Open what work reports to: a callable itself, nothing for False, and else a bar with the time left.
 
     The bar appears when the work takes longer than 2 s; without a terminal or a notebook there is none. A `command`
-    has it at once, and prints a line a minute where there is none.
+    has it after 0.1 s, and prints a line a minute without a terminal.
     """
     if callable(progress):
         yield progress
@@ -66,10 +66,9 @@ def _bar(progress: object, command: bool, **options: Any) -> Iterator[Any]:
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     drawn = sys.stderr.isatty() or hasattr(shell, "kernel")
     options |= {"disable": progress is False or not (drawn or command), "smoothing": 0.0, "file": sys.stderr}
-    if command:
-        options |= {} if drawn else {"mininterval": LINE_S, "maxinterval": LINE_S}
-    else:
-        options |= {"delay": WAIT_S}
+    options |= {"delay": COMMAND_WAIT_S if command else WAIT_S}
+    if not drawn:
+        options |= {"mininterval": LINE_S, "maxinterval": LINE_S}
     with _tqdm()(**options, dynamic_ncols=drawn, leave=True) as bar:
         try:
             yield bar

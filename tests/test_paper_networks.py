@@ -132,7 +132,7 @@ class TestAssemble:
 
     def test_evaluation_of_the_papers_leaves_others_out(self, quick, model):
         phi = make_links(30, seed=3)[0]
-        alone, found = (evaluate_paper(parts(each), phi) for each in (quick.model, model))
+        alone, found = (evaluate_paper(parts(each), phi, 28e9) for each in (quick.model, model))
         for one, other in zip(alone, found, strict=True):
             np.testing.assert_array_equal(one, other)
 

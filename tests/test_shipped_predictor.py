@@ -68,3 +68,14 @@ def test_a_map_with_range_noise_is_predicted_less_certainly(range_noise_m: float
     np.testing.assert_allclose(wider.gain_los_std_db, ratio * usual.gain_los_std_db, rtol=1e-6)
     np.testing.assert_array_equal(wider.p_los, usual.p_los)
     np.testing.assert_array_equal(wider.gain_nlos_mean_db, usual.gain_nlos_mean_db)
+
+
+@pytest.mark.parametrize("name", ["map", "paper"])
+@pytest.mark.parametrize("frequency_hz", [5e9, 60e9])
+def test_seen_links_are_right_at_any_frequency(name: str, frequency_hz: float) -> None:
+    partial = sp.load_map(scenes_folder() / "apartment" / "step100")
+    settings = sp.TraceSettings(frequency_hz=frequency_hz)
+    coverage = sp.predict_map(partial, (7.0, 9.8, 1.5), spacing_m=0.5, predictor=name, trace_settings=settings)
+    seen = (coverage.partial_link_state == sp.LinkState.LOS) & (coverage.unobserved_distance_m == 0.0)
+    error_db = (coverage.gain_los_mean_db - coverage.partial_gain_db).where(seen & coverage.observed)
+    assert abs(error_db).max() < 0.5

@@ -251,12 +251,14 @@ class DifferentiableLinks:
             return LinkDistribution.of_parts(*trace, ops=ops)
         moved_m = given.get("tx_m")
         numeric = self._moved_features(moved_m, gain_db)
+        carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
+        shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / self._scene.predictor.settings.frequency_hz)
         if LINK_NETWORK in self._scene.networks:
             numeric |= self._indirect_features(numeric["distance_m"], moved_m, power, vertices_m)
-            predicted = self._by_context(moved_m, numeric)
+            predicted = self._by_context(moved_m, numeric, shift_db)
         else:
-            inputs = {name: tf.cast(numeric[name], tf.float32)[:, None] for name in FEATURES}
-            predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state)
+            inputs = {name: numeric[name][:, None] for name in FEATURES}
+            predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db)
         pairs = zip(trace, predicted, strict=True)
         return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
 
@@ -310,14 +312,14 @@ class DifferentiableLinks:
         strongest_m = tf.where(legs.strongest >= 0, strongest_m, distance_m)
         return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
 
-    def _by_context(self, tx_m: Any, numeric: dict[str, Any]) -> tuple[Any, Any, Any]:
+    def _by_context(self, tx_m: Any, numeric: dict[str, Any], shift_db: Any) -> tuple[Any, Any, Any]:
         """Evaluate the networks that read maps and paths: see `distribution`."""
         ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
-        columns = input_columns(tf.constant(binary_features(self._phi)), numeric, frequency_hz, ops)
+        columns = input_columns(tf.constant(binary_features(self._phi)), numeric, frequency_hz, shift_db, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
         columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
         outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)
-        free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops)
+        free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops) - shift_db
         return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi))
 
     def _maps(self, tx_m: Any) -> list[Any]:

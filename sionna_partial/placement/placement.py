@@ -268,8 +268,8 @@ class Search:
         features = []
         for tx_m, kept in zip(positions_m, far, strict=True):
             paths = self.tracer.paths(tx_m, area.rx_m[kept], no_progress)
-            phi = features_of_paths(area.partial, tx_m, area.rx_m[kept], paths, context=self.model is not None)
-            features.append(phi)
+            links = area.partial, tx_m, area.rx_m[kept], paths, self.tracer.settings.frequency_hz
+            features.append(features_of_paths(*links, context=self.model is not None))
         phi = LinkFeatures.concatenate(features)
         found = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
         columns = {}

@@ -4,6 +4,8 @@ import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -312,6 +314,8 @@ class LinkFeatures(Shown):
     context : LinkContext, optional
         What the map shows along and around the links, as arrays, from `link_features`; one link after the other. The
         paper's predictor does not use it.
+    frequency_hz : float, optional
+        Carrier frequency of the trace [Hz], from `link_features`. None is that of the predictor.
 
     Raises
     ------
@@ -331,6 +335,7 @@ class LinkFeatures(Shown):
     distance_m: Floats
     gain_db: Floats
     context: LinkContext | None = None
+    frequency_hz: float | None = None
 
     def __post_init__(self) -> None:
         count, shape = np.size(self.distance_m), np.shape(self.distance_m)
@@ -362,17 +367,25 @@ class LinkFeatures(Shown):
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
         """Return the links that an index array, a mask or a slice selects, one after the other."""
         context = None if self.context is None else self.context.take(index)
-        return LinkFeatures(**{name: getattr(self, name).ravel()[index] for name in _PAPER}, context=context)
+        columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
+        return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz)
+
+    def free_space_shift_db(self, frequency_hz: float) -> float:
+        """Return how much stronger free space is at another frequency [dB]."""
+        return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkFeatures"]) -> "LinkFeatures":
         """Return the links of all `parts`, one after the other."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
+        frequencies_hz = {part.frequency_hz for part in parts}
+        if len(frequencies_hz) > 1:
+            raise PredictorError(f"parts are of several frequency_hz ({frequencies_hz}): give links of one frequency.")
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
         columns = {name: np.concatenate([getattr(part, name).ravel() for part in parts]) for name in _PAPER}
-        return cls(**columns, context=context)
+        return cls(**columns, context=context, frequency_hz=frequencies_hz.pop())
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
         """Return the features with what map networks read of the maps; `map_index` (N,) is the map of each link."""
@@ -381,7 +394,12 @@ class LinkFeatures(Shown):
         return replace(self, context=self.context.with_windows(maps, map_index))
 
 
-_PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name != "context")
+_PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in ("context", "frequency_hz"))
+
+
+def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:
+    """Change gains by so many dB, but not those of outages. `ops` is NumPy, or keras.ops for tensors."""
+    return ops.where(gain_db > GAIN_FLOOR_DB, gain_db + shift_db, gain_db)
 
 
 def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
@@ -449,12 +467,19 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
         raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")
     paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx)
     paths.add(links)
-    phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), windows=windows)
+    frequency_hz = links.settings.frequency_hz
+    phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz, windows=windows)
     return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
 
 def features_of_paths(
-    partial: PartialMap, tx_m: Floats, rx_m: Floats, blocks: Iterable[SolvedPaths], *, context: bool = True
+    partial: PartialMap,
+    tx_m: Floats,
+    rx_m: Floats,
+    blocks: Iterable[SolvedPaths],
+    frequency_hz: float,
+    *,
+    context: bool = True,
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
@@ -467,17 +492,23 @@ def features_of_paths(
         is_direct[paths.path_rx[paths.is_direct]] = True
         if context:
             indirect.add(paths)
-    return _features(indirect, *link_summary(power, is_direct), context=context)
+    return _features(indirect, *link_summary(power, is_direct), frequency_hz, context=context)
 
 
 def _features(
-    paths: IndirectPaths, link_state: States, gain_db: Floats, *, context: bool = True, windows: bool = True
+    paths: IndirectPaths,
+    link_state: States,
+    gain_db: Floats,
+    frequency_hz: float,
+    *,
+    context: bool = True,
+    windows: bool = True,
 ) -> LinkFeatures:
     """Return the features of all links of `paths`, whose states and gains (N,) are given."""
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
     distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
     found = paths.context(link_state, unobserved_m) if context else None
-    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db, found)
+    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db, found, frequency_hz)
     return phi.with_windows((paths.partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
 
 

@@ -22,7 +22,7 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures, shifted_gain_db
 from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
@@ -119,11 +119,16 @@ def numeric_features(phi: LinkFeatures) -> dict[str, Floats]:
     return of_phi | {name: getattr(phi.context, name) for name in names}
 
 
-def input_columns(binary: Any, numeric: Mapping[str, Any], frequency_hz: float, ops: ModuleType = np) -> Any:
+def input_columns(
+    binary: Any, numeric: Mapping[str, Any], frequency_hz: float, shift_db: Any, ops: ModuleType = np
+) -> Any:
     """Scale features to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
 
-    They are those of `binary_features` and `numeric_features`; `ops` is NumPy, or keras.ops for tensors.
+    They are those of `binary_features` and `numeric_features`; `ops` is NumPy, or keras.ops for tensors. Free space is
+    stronger by `shift_db` at the frequency of the networks, `frequency_hz`, than at that of the links.
     """
+    gains_db = {name: shifted_gain_db(numeric[name], shift_db, ops) for name in ("gain_db", "indirect_gain_db")}
+    numeric = {**numeric, **gains_db}
     distance_m, unobserved_m, gain_db = (numeric[name] for name in FEATURES)
     free_db, near_m = free_space_gain_db(distance_m, frequency_hz, ops), ops.maximum(distance_m, _NEAREST_M)
     traced_db = [gain_db, *(numeric["indirect_gain_db"][:, column] for column in range(len(ATTENUATION_LENGTHS_M)))]
@@ -139,7 +144,8 @@ def input_columns(binary: Any, numeric: Mapping[str, Any], frequency_hz: float, 
 
 def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
     """Return the inputs (N, `LINK_INPUTS`) of the link network for the features of N links, which have a context."""
-    return input_columns(binary_features(phi), numeric_features(phi), frequency_hz).astype(np.float32)
+    shift_db = phi.free_space_shift_db(frequency_hz)
+    return input_columns(binary_features(phi), numeric_features(phi), frequency_hz, shift_db).astype(np.float32)
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
@@ -269,14 +275,14 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
 def evaluate_context_networks(
     networks: Networks, phi: LinkFeatures, frequency_hz: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Evaluate the networks on the features of N links, which have a context: see `distribution`."""
+    """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`."""
     inputs, offsets_m = link_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for maps, links in _by_window(networks, context_of(phi)):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
-    free_db = free_space_gain_db(phi.distance_m, frequency_hz)
+    free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
     probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi))
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 

@@ -25,7 +25,7 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
-from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.features import LinkFeatures, shifted_gain_db
 from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
 
@@ -222,12 +222,15 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict
 
 
 def distribution_by_paper(
-    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: States
+    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: States, shift_db: Any = 0.0
 ) -> tuple[Any, Any, Any]:
     """Evaluate the paper's networks on `inputs` (N, 1) of `FEATURES` and partial link states (N,).
 
+    Free space is stronger by `shift_db` at the frequency of the networks than at that of the links.
     Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
+    inputs = {**inputs, "gain_db": shifted_gain_db(inputs["gain_db"], shift_db, tf)}
+    inputs = {name: tf.cast(values, tf.float32) for name, values in inputs.items()}
 
     def outputs(name: str) -> Any:
         network = networks[name]
@@ -239,15 +242,21 @@ def distribution_by_paper(
     means_db, stds_db = [outage] * len(LinkState), [tf.zeros_like(outage)] * len(LinkState)
     for row in GAIN_NETWORKS:
         served, (mean_db, log_variance) = np.isin(link_state, row.partial_states), tf.unstack(outputs(row.name), axis=1)
-        means_db[row.link_state] = tf.where(served, tf.maximum(mean_db, GAIN_FLOOR_DB), means_db[row.link_state])
+        mean_db = tf.maximum(mean_db - shift_db, GAIN_FLOOR_DB)
+        means_db[row.link_state] = tf.where(served, mean_db, means_db[row.link_state])
         stds_db[row.link_state] = tf.where(served, tf.exp(0.5 * log_variance), stds_db[row.link_state])
     total = tf.reduce_sum(probabilities, axis=1, keepdims=True)
     return tf.transpose(probabilities / total), tf.stack(means_db), tf.stack(stds_db)
 
 
-def evaluate_paper(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> tuple[Floats, Floats, Floats]:
-    """Evaluate `distribution_by_paper` on the features of N links, to arrays."""
-    blocks = [distribution_by_paper(networks, network_inputs(block), block.link_state) for block in _blocks(phi)]
+def evaluate_paper(
+    networks: Mapping[str, "keras.Model"], phi: LinkFeatures, frequency_hz: float
+) -> tuple[Floats, Floats, Floats]:
+    """Evaluate `distribution_by_paper` on the features of N links, to arrays; `frequency_hz` is the networks'."""
+    shift_db = phi.free_space_shift_db(frequency_hz)
+    blocks = [
+        distribution_by_paper(networks, network_inputs(block), block.link_state, shift_db) for block in _blocks(phi)
+    ]
     probabilities, means_db, stds_db = (np.concatenate(part, axis=1) for part in zip(*blocks, strict=True))
     return probabilities, means_db, stds_db
 

@@ -359,6 +359,8 @@ class Predictor(Shown):
     def predict(self, features: LinkFeatures) -> LinkPrediction:
         """Predict link state and path gain of links whose receivers are indoors.
 
+        Gains are predicted relative to free space at the frequency of the features.
+
         Parameters
         ----------
         features : LinkFeatures
@@ -379,7 +381,7 @@ class Predictor(Shown):
         if len(features.shape) == 2:
             return self.predict(features.flat()).reshaped(features.shape)
         if features.context is None or LINK_NETWORK not in networks:
-            return LinkPrediction.of_parts(*evaluate_paper(networks, features))
+            return LinkPrediction.of_parts(*evaluate_paper(networks, features, self.settings.frequency_hz))
         if self.reads_maps:
             _require_windows(features)
         prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
