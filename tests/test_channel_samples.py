@@ -64,6 +64,27 @@ def test_draws_agree_with_the_prediction_and_with_themselves(
     assert np.ptp(samples.gain_db, axis=0).max() > 20.0
 
 
+def test_what_was_seen_is_in_every_draw(partial: sp.PartialMap) -> None:
+    rx_m = np.array([(7.8, 10.2, 1.5)])
+    links = sp.trace_links(partial, TX, rx_m)
+    seen = sp.link_features(partial, links).context.indirect_gain_db[0, -1]
+    assert seen > -90.0
+    samples = sp.sample_channels(partial, TX, rx_m, n=100)
+    for draw in range(100):
+        drawn = samples.links(draw)
+        indirect = np.abs(drawn.a[(drawn.interactions > 0).any(axis=1)]) ** 2
+        assert 10 * np.log10(indirect.sum()) > seen - 0.1
+
+
+def test_the_order_of_transmitters_does_not_matter(home: sp.PartialMap) -> None:
+    cells = np.argwhere(home.state == sp.CellState.UNKNOWN)[::500, ::-1]
+    outside = np.insert((cells + 0.5) * home.resolution_m + home.origin_m, 2, 1.5, axis=1)
+    first, second = (sp.sample_channels(home, tx, outside[1:], n=64) for tx in ([TX, outside[0]], [outside[0], TX]))
+    assert first.gain_db[:, 1].std(axis=0).max() > 1.0
+    np.testing.assert_array_equal(first.gain_db[:, 0], second.gain_db[:, 1])
+    np.testing.assert_allclose(first.gain_db[:, 1].mean(axis=0), second.gain_db[:, 0].mean(axis=0), atol=3.0)
+
+
 def test_no_receivers_have_no_paths(partial: sp.PartialMap) -> None:
     samples = sp.sample_channels(partial, TX, np.zeros((0, 3)), n=5)
     assert samples.gain_db.shape == (5, 0)

@@ -21,9 +21,8 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MemoryLimitError
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import link_features, traced_unobserved_m
+from sionna_partial.prediction.features import SEEN_M, link_features, traced_unobserved_m
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.links import TracedLinks
@@ -170,8 +169,8 @@ def sample_channels(
     Link state and gain of each link are drawn from what `predict_map` predicts, so that they agree with it; with 64
     draws or more, states occur as often as predicted. Links have spatial latents in common (`JointLatents`), so that a
     draw looks like one building: neighbours, and transmitters behind the same unseen wall, fail together. Given state
-    and gain, traced paths survive with a learned probability, and analogues from procedural homes supply the rest
-    (`PathModel`). On a complete map every draw is the trace.
+    and gain, traced paths in observed space are there, others survive with a learned probability, and analogues from
+    procedural homes supply the rest (`PathModel`). On a complete map every draw is the trace.
 
     Parameters
     ----------
@@ -236,9 +235,8 @@ def sample_channels(
             memory_gb=memory_gb,
             progress=False,
         )
-        tx_m = traced.tx.reshape(-1, 3)
         phi = link_features(partial, traced).flat()
-        if bool(is_enclosed(partial, tx_m[:1], tx_m[:1])[0]):
+        if phi.context is not None and phi.context.complete.all():
             prediction = LinkPrediction.of_trace(phi)
         else:
             prediction = Predictor.load(predictor).predict(phi)
@@ -265,10 +263,6 @@ class _Draws:
         self._certain_paths, self._uncertain = np.flatnonzero(certain[self._link]), np.flatnonzero(~certain)
         seeds = [[seed, each] for each in (_STATE, _GAIN, _SURVIVAL, _ANALOGUE)]
         of_state, of_gain, of_survival, of_analogue = JointLatents(partial).quantiles(*ends, count, seeds)
-        state, gain_db = states_and_gains(prediction, of_state, of_gain)
-        # no path with LOS is weaker than free space
-        gain_db = np.where(state == LinkState.LOS, np.maximum(gain_db, self._geometry.free_space_db), gain_db)
-        self.state, self.gain_db = state, np.where(certain, traced.gain_db.ravel(), gain_db)
         self._survival_latent = ndtri(of_survival[:, self._uncertain])
         self._analogue_quantile = of_analogue[:, self._uncertain]
         self._model = PathModel.load()
@@ -276,11 +270,19 @@ class _Draws:
         shape = len(self._paths), len(self._uncertain)
         self._power = csr_array((power, (np.arange(len(power)), self._of_link)), shape=shape)
         unobserved_m = traced_unobserved_m(partial, traced, self._paths)
+        seen = unobserved_m < SEEN_M
+        # with LOS there are the direct path and all paths in observed space, at least
+        least = 10.0 ** (self._geometry.free_space_db / 10.0)
+        least[self._uncertain] += np.bincount(self._of_link, power * seen, shape[1])
+        state, gain_db = states_and_gains(prediction, of_state, of_gain)
+        gain_db = np.where(state == LinkState.LOS, np.maximum(gain_db, path_gain_db(least)), gain_db)
+        self.state, self.gain_db = state, np.where(certain, traced.gain_db.ravel(), gain_db)
         self._crosses = np.zeros(len(self._link), dtype=bool)
         self._crosses[self._paths] = unobserved_m > 0.0
         inputs = survival_inputs(traced, self._paths, unobserved_m, self._geometry)
         self._survives_below = [
-            math.sqrt(2.0) * ndtri(self._model.survival(inputs, each)) for each in (LinkState.LOS, LinkState.NLOS)
+            np.where(seen, math.inf, math.sqrt(2.0) * ndtri(self._model.survival(inputs, each)))
+            for each in (LinkState.LOS, LinkState.NLOS)
         ]
 
         paths = count * (len(self._link) + _PATHS_OF_DRAW * len(self._uncertain))
