@@ -38,7 +38,7 @@ ROOMS = {
         "antennas",
     ),
     "prediction": (
-        *("unobserved", "windows", "features"),
+        *("unobserved", "windows", "features", "inputs"),
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),

@@ -11,9 +11,9 @@ from predictor_links import FREQUENCY_HZ, NLOS, QUIET, features, make_seen_links
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M
+from sionna_partial.prediction.inputs import LINK_INPUTS, free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     CONTEXT_SHAPES,
-    LINK_INPUTS,
     LINK_NETWORK,
     LINK_OUTPUTS,
     MAP_FEATURES,
@@ -21,29 +21,21 @@ from sionna_partial.prediction.map_networks import (
     context_networks,
     decode,
     evaluate_context_networks,
-    link_inputs,
     read_links,
     read_maps,
+    scaled_inputs,
 )
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
 from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS
 
 pytestmark = QUIET
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 
-COLUMNS = (
-    *("outage", "los", "nlos", "tx_seen", "rx_seen", "outage_possible", "los_possible", "nlos_possible"),
-    *("walled", "log_distance", "unobserved_fraction", "distance", "unobserved", "observed", "strongest_unobserved"),
-    *("gain", "free_gain", *(f"indirect_{reach:g}" for reach in ATTENUATION_LENGTHS_M)),
-    *("gain_above_free", *(f"indirect_{reach:g}_above_free" for reach in ATTENUATION_LENGTHS_M)),
-)
-"""What the columns of `link_inputs` are called here."""
-
 
 def inputs(phi):
-    """Return the columns of `link_inputs` by name."""
-    return dict(zip(COLUMNS, link_inputs(phi, FREQUENCY_HZ).T, strict=True))
+    """Return the columns of `scaled_inputs` by name."""
+    return dict(zip(LINK_INPUTS, scaled_inputs(phi, FREQUENCY_HZ).T, strict=True))
 
 
 def shaken(networks, seed=0):
@@ -76,11 +68,11 @@ def nothing():
 
 class TestLinkInputs:
     def test_every_column_is_there_and_finite(self):
-        found = link_inputs(make_seen_links(500)[0], FREQUENCY_HZ)
-        assert found.shape == (500, LINK_INPUTS) == (500, len(COLUMNS))
+        found = scaled_inputs(make_seen_links(500)[0], FREQUENCY_HZ)
+        assert found.shape == (500, len(LINK_INPUTS))
         assert found.dtype == np.float32
         assert np.isfinite(found).all()
-        same = {name for name, spread in zip(COLUMNS, np.ptp(found, axis=0), strict=True) if spread == 0.0}
+        same = {name for name, spread in zip(LINK_INPUTS, np.ptp(found, axis=0), strict=True) if spread == 0.0}
         assert same == {"walled", *(f"{state.name.lower()}_possible" for state in LinkState)}
 
     @settings(max_examples=30, deadline=None)
@@ -194,7 +186,7 @@ class TestReadMapsAndLinks:
     @staticmethod
     def of_maps(links):
         """Return the first three numbers of each scale, and one of the rest."""
-        read = np.reshape(links[:, LINK_INPUTS:], (-1, len(CELLS_M), MAP_FEATURES))
+        read = np.reshape(links[:, len(LINK_INPUTS) :], (-1, len(CELLS_M), MAP_FEATURES))
         return np.concatenate([read[:, :, :3].reshape(len(read), -1), read[:, 0, 3:4]], axis=1)
 
     @staticmethod
@@ -211,7 +203,7 @@ class TestReadMapsAndLinks:
 
     def seen(self, windows, offsets_m):
         offsets_m = np.asarray(offsets_m, dtype=np.float32)
-        links = np.zeros((*offsets_m.shape[:2], LINK_INPUTS), dtype=np.float32)
+        links = np.zeros((*offsets_m.shape[:2], len(LINK_INPUTS)), dtype=np.float32)
         networks = {**dict.fromkeys(MAP_NETWORKS, self.values), LINK_NETWORK: self.of_maps}
         found = np.asarray(read_links(networks, read_maps(networks, windows.astype(np.float32)), links, offsets_m))
         return found[..., :-1].reshape(*offsets_m.shape[:2], self.SCALES, 3), found[..., -1]
@@ -248,7 +240,7 @@ class TestReadMapsAndLinks:
         assert not found.any()
 
     def test_without_a_map_network_links_alone_are_read(self):
-        links = np.random.default_rng(6).normal(size=(2, 3, LINK_INPUTS)).astype(np.float32)
+        links = np.random.default_rng(6).normal(size=(2, 3, len(LINK_INPUTS))).astype(np.float32)
         networks = {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]}
         outputs = read_links(networks, read_maps(networks, None), links, np.zeros((2, 3, 2), dtype=np.float32))
         np.testing.assert_array_equal(outputs, links[..., :LINK_OUTPUTS])
@@ -306,7 +298,7 @@ class TestEvaluateContextNetworks:
         state = home.state.copy()
         state[8:12, 8:12] = FREE
         phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), place, tx_m=(0.5, 0.5, 1.5), unobserved_m=1.0)
-        one, other = link_inputs(phi, FREQUENCY_HZ)
+        one, other = scaled_inputs(phi, FREQUENCY_HZ)
         np.testing.assert_array_equal(one, other)
         probabilities, *_ = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
         assert abs(probabilities[:, 0] - probabilities[:, 1]).max() > 1e-3

@@ -16,13 +16,13 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkFeatures
+from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     evaluate_context_networks,
     fit_context_networks,
-    link_inputs,
     receiver_offsets_m,
+    scaled_inputs,
 )
-from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.windows import WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 
@@ -103,7 +103,7 @@ class TestFitContextNetworks:
     def test_links_of_the_rules_look_alike(self):
         """The rooms are seen on the map alone, the paths in one column and what is made of it alone."""
         links = make_room_links(*OTHERS)
-        assert np.flatnonzero(np.ptp(link_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [21, 27]
+        assert np.flatnonzero(np.ptp(scaled_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [21, 27]
         assert not links.phi.context.rx_seen.any()
         assert 0.4 < links.in_seen_room.mean() < 0.6
 
@@ -166,7 +166,7 @@ class TestExamples:
     def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
         """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
         phi, half, cell_m = links.phi, WINDOW_CELLS / 2, 0.3
-        inputs, state = link_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
+        inputs, state = scaled_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
         turns = set()
         for batch in examples.batches(4, np.random.default_rng(4)):
             for number, drawn in enumerate(batch["gain_db"].astype(int)):

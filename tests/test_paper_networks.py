@@ -23,8 +23,8 @@ from predictor_links import (
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.inputs import GAIN_INPUTS
 from sionna_partial.prediction.paper_networks import (
-    FEATURES,
     GAIN_NETWORKS,
     OUTPUT_WIDTHS,
     assemble,
@@ -121,9 +121,9 @@ class TestAssemble:
     def test_others_have_inputs_and_outputs_of_their_own(self, model):
         others = ["double", "never", "once", "twice"]
         assert own_input("double") == "input_of_double"
-        assert list(model.input) == [*FEATURES, *map(own_input, others)]
+        assert list(model.input) == [*GAIN_INPUTS, *map(own_input, others)]
         assert list(model.output) == [*OUTPUT_WIDTHS, *others] == list(parts(model))
-        inputs = {name: np.ones((3, 1), dtype=np.float32) for name in FEATURES}
+        inputs = {name: np.ones((3, 1), dtype=np.float32) for name in GAIN_INPUTS}
         inputs |= {own_input(name): np.full((3, 5), number, dtype=np.float32) for number, name in enumerate(others)}
         outputs = model(inputs)
         for name, expected in {"double": 0.0, "never": 0.0, "once": 2.0, "twice": 6.0}.items():

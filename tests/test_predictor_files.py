@@ -20,8 +20,9 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import OutputError, PredictorError
-from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
-from sionna_partial.prediction.paper_networks import FEATURES, assemble, import_keras, parts
+from sionna_partial.prediction.inputs import GAIN_INPUTS, LINK_INPUTS
+from sionna_partial.prediction.map_networks import LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
+from sionna_partial.prediction.paper_networks import assemble, import_keras, parts
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.predictor_files import FORMAT, digest, pack
 
@@ -42,7 +43,7 @@ def saved(quick, tmp_path):
 def test_card(quick, saved):
     card = json.loads(saved.with_suffix(".json").read_text())
     assert card["format"] == FORMAT
-    assert card["features"] == list(FEATURES) == ["distance_m", "unobserved_distance_m", "gain_db"]
+    assert card["features"] == list(GAIN_INPUTS) == ["distance_m", "unobserved_distance_m", "gain_db"]
     assert card["sha256"] == digest(saved.read_bytes()) == quick.fingerprint
     assert card["homes"] == ["a", "b"]
     assert card["settings"]["steps"] == QUICK.steps
@@ -57,7 +58,7 @@ def test_card(quick, saved):
 def test_stock_keras_loads_it(quick, saved):
     model = import_keras().saving.load_model(saved, safe_mode=True)
     phi = make_links(20)[0]
-    outputs = model({name: getattr(phi, name)[:, None] for name in FEATURES})
+    outputs = model({name: getattr(phi, name)[:, None] for name in GAIN_INPUTS})
     probabilities = np.asarray(outputs["state_given_los"])[phi.link_state == LOS]
     np.testing.assert_allclose(probabilities[:, LOS], quick.predict(phi).p_los[phi.link_state == LOS], rtol=1e-5)
 
@@ -176,10 +177,10 @@ def _dense(inputs, outputs, name=LINK_NETWORK):
 @pytest.mark.parametrize(
     "change",
     [
-        {LINK_NETWORK: lambda: _dense(LINK_INPUTS, LINK_OUTPUTS)},
+        {LINK_NETWORK: lambda: _dense(len(LINK_INPUTS), LINK_OUTPUTS)},
         {LINK_NETWORK: None},
         {MAP_NETWORKS[1]: None},
-        {"third_network": lambda: _dense(LINK_INPUTS, LINK_OUTPUTS, "third_network")},
+        {"third_network": lambda: _dense(len(LINK_INPUTS), LINK_OUTPUTS, "third_network")},
     ],
     ids=["link network without what the map says", "map alone", "reader of a map alone", "one too many"],
 )
@@ -196,7 +197,7 @@ def test_foreign_networks_are_refused(saved, change):
 
 
 def test_link_network_of_other_shape_is_refused(saved):
-    for inputs, outputs in ((LINK_INPUTS + 1, LINK_OUTPUTS), (LINK_INPUTS, LINK_OUTPUTS + 1)):
+    for inputs, outputs in ((len(LINK_INPUTS) + 1, LINK_OUTPUTS), (len(LINK_INPUTS), LINK_OUTPUTS + 1)):
         networks = parts(quick_predictor().model) | {LINK_NETWORK: _dense(inputs, outputs)}
         _forge(saved, pack(assemble(networks)))
         with pytest.raises(PredictorError, match=r"has inputs .*'input_of_link_network'.* and outputs"):

@@ -22,7 +22,7 @@ from sionna_partial.cores import core_count
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.tracing.links import TracedLinks

@@ -20,7 +20,8 @@ from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
+from sionna_partial.prediction.features import LinkContext, LinkFeatures
+from sionna_partial.prediction.inputs import FEATURES, columns_of, features_of_columns
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
@@ -37,14 +38,6 @@ _MAX_NAME_BYTES = 200
 
 _PREFIX = "sionna_partial."
 
-_FEATURES = {
-    "partial_link_state": "link_state",
-    "partial_gain_db": "gain_db",
-    "unobserved_distance_m": "unobserved_distance_m",
-    "distance_m": "distance_m",
-}
-_REACHES = [f"indirect_gain_reach_{reach:g}_m_db" for reach in ATTENUATION_LENGTHS_M]
-
 _TYPES = {
     "home": pa.string(),
     "map_index": pa.int64(),
@@ -56,7 +49,8 @@ _TYPES = {
 _NAMES = (
     *("home", "stage"),
     *(f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"),
-    *(*_FEATURES, *_REACHES, "strongest_unobserved_m", "map_index"),
+    *(name for feature in FEATURES for name in feature.columns),
+    "map_index",
     *("link_state", "gain_db", "inside", "anywhere", "observed_fraction"),
 )
 _FIELDS = [pa.field(name, _TYPES.get(name, pa.float64()), nullable=False) for name in _NAMES]
@@ -68,9 +62,7 @@ def _columns(table: LinkTable) -> dict[str, Any]:
         **{name: getattr(table, name) for name in COLUMNS},
         **{f"tx_{axis}_m": context.tx_m[:, index] for index, axis in enumerate("xyz")},
         **{f"rx_{axis}_m": context.rx_m[:, index] for index, axis in enumerate("xyz")},
-        **{name: getattr(table.features, field) for name, field in _FEATURES.items()},
-        **{name: context.indirect_gain_db[:, index] for index, name in enumerate(_REACHES)},
-        "strongest_unobserved_m": context.strongest_unobserved_m,
+        **columns_of(table.features),
         "map_index": table.map_index,
     }
 
@@ -212,20 +204,15 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
     maps, map_index = tuple(_unpacked(each) for each in notes["partial"]), columns.pop("map_index")
-    features = {field: columns.pop(name) for name, field in _FEATURES.items()}
-    context = LinkContext.on_maps(
-        maps,
-        map_index,
-        link_state=features["link_state"],
-        unobserved_distance_m=features["unobserved_distance_m"],
-        indirect_gain_db=np.column_stack([columns.pop(name) for name in _REACHES]),
-        strongest_unobserved_m=columns.pop("strongest_unobserved_m"),
-        **positions,
-    )
-    home = columns.pop("home").astype(np.str_)
+    found = features_of_columns(columns)
+    of_context = {name: found.pop(name) for name in ("indirect_gain_db", "strongest_unobserved_m")}
+    traced = {name: found[name] for name in ("link_state", "unobserved_distance_m")}
+    context = LinkContext.on_maps(maps, map_index, **traced, **of_context, **positions)
+    table = {name: columns[name] for name in COLUMNS if name != "home"}
+    home = columns["home"].astype(np.str_)
     complete_maps = {name: _unpacked(each) for name, each in notes["complete"].items()}
-    known = {"features": LinkFeatures(**features, context=context), "maps": maps, "map_index": map_index}
-    return LinkTable(home=home, complete_maps=complete_maps, **known, **columns)
+    known = {"features": LinkFeatures(**found, context=context), "maps": maps, "map_index": map_index}
+    return LinkTable(home=home, complete_maps=complete_maps, **known, **table)
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:

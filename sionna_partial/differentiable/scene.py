@@ -36,24 +36,20 @@ from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, link_features
+from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
-    binary_features,
     context_of,
     distribution,
-    input_columns,
-    numeric_features,
     read_links,
     read_maps,
     reads_maps,
 )
 from sionna_partial.prediction.paper_networks import (
-    FEATURES,
     GAIN_NETWORKS,
     STATE_NETWORKS,
     distribution_by_paper,
-    free_space_gain_db,
     import_keras,
     parts,
     tf,
@@ -257,7 +253,7 @@ class DifferentiableLinks:
             numeric |= self._indirect_features(numeric["distance_m"], moved_m, power, vertices_m)
             predicted = self._by_context(moved_m, numeric, shift_db)
         else:
-            inputs = {name: numeric[name][:, None] for name in FEATURES}
+            inputs = {name: numeric[name][:, None] for name in GAIN_INPUTS}
             predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db)
         pairs = zip(trace, predicted, strict=True)
         return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
@@ -285,7 +281,7 @@ class DifferentiableLinks:
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the gain, and what derives from the transmitter position alone, None being where it was."""
-        numeric, rx_m = numeric_features(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
+        numeric, rx_m = feature_values(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
         if tx_m is None:
             return numeric
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
@@ -315,7 +311,7 @@ class DifferentiableLinks:
     def _by_context(self, tx_m: Any, numeric: dict[str, Any], shift_db: Any) -> tuple[Any, Any, Any]:
         """Evaluate the networks that read maps and paths: see `distribution`."""
         ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
-        columns = input_columns(tf.constant(binary_features(self._phi)), numeric, frequency_hz, shift_db, ops)
+        columns = link_inputs(numeric, frequency_hz, shift_db, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
         columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
         outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)

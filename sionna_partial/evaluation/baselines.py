@@ -14,7 +14,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.settings import PredictorSettings
 

@@ -19,7 +19,7 @@ from sionna_partial.errors import MeasurementError, PositionError
 from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.planar import grid_edges
-from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import FREQUENCIES_HZ
 

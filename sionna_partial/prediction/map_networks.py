@@ -12,7 +12,6 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,8 +21,9 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures, shifted_gain_db
-from sionna_partial.prediction.paper_networks import FEATURES, STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
+from sionna_partial.prediction.features import LinkContext, LinkFeatures
+from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 
@@ -41,12 +41,6 @@ MAP_FEATURES = 16
 
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
-
-BINARY_INPUTS = len(LinkState) + 2 + len(LinkState)
-"""Number of values that `binary_features` gives of a link."""
-
-LINK_INPUTS = BINARY_INPUTS + 7 + 2 + len(ATTENUATION_LENGTHS_M) + 1 + len(ATTENUATION_LENGTHS_M)
-"""Number of values that `link_inputs` gives of a link."""
 
 WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
 """Number of windows in a gradient step, and of links that are drawn for each of them."""
@@ -77,8 +71,6 @@ _STATISTICS_MOMENTUM = 0.9
 _FADE_CELLS = 8.0
 """Width of the rim of a window in which its numbers fade to 0 [cells]."""
 
-_SCALE_M, _SCALE_DB = 3.0, 100.0
-_NEAREST_M = 0.1
 _IMPOSSIBLE = -1e30
 _LINKS_AT_ONCE, _MAPS_AT_ONCE = 16_384, 8
 _REPORT_STEPS = 50
@@ -87,11 +79,11 @@ _log = logging.getLogger(__name__)
 
 
 _SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
-_LINK_INPUTS_WITH_MAP = LINK_INPUTS + len(CELLS_M) * MAP_FEATURES
+_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + len(CELLS_M) * MAP_FEATURES
 
 CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
     {},
-    {LINK_NETWORK: ((None, LINK_INPUTS), (None, LINK_OUTPUTS))},
+    {LINK_NETWORK: ((None, len(LINK_INPUTS)), (None, LINK_OUTPUTS))},
     {
         LINK_NETWORK: ((None, _LINK_INPUTS_WITH_MAP), (None, LINK_OUTPUTS)),
         **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
@@ -106,46 +98,10 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     return phi.context
 
 
-def binary_features(phi: LinkFeatures) -> Floats:
-    """Return binary features (N, `BINARY_INPUTS`) of N links, which have a context: 0 or 1."""
-    context, states = context_of(phi), (phi.link_state == state for state in LinkState)
-    return np.stack([*states, context.tx_seen, context.rx_seen, *context.possible.T], axis=1) * 1.0
-
-
-def numeric_features(phi: LinkFeatures) -> dict[str, Floats]:
-    """Return numeric features of N links, which have a context, as named in `LinkFeatures` and `LinkContext`."""
-    of_phi = {name: getattr(phi, name) for name in ("distance_m", "unobserved_distance_m", "gain_db")}
-    names = ("walled_m", "indirect_gain_db", "strongest_unobserved_m")
-    return of_phi | {name: getattr(phi.context, name) for name in names}
-
-
-def input_columns(
-    binary: Any, numeric: Mapping[str, Any], frequency_hz: float, shift_db: Any, ops: ModuleType = np
-) -> Any:
-    """Scale features to a few units: the inputs (N, `LINK_INPUTS`) of the link network.
-
-    They are those of `binary_features` and `numeric_features`; `ops` is NumPy, or keras.ops for tensors. Free space is
-    stronger by `shift_db` at the frequency of the networks, `frequency_hz`, than at that of the links.
-    """
-    gains_db = {name: shifted_gain_db(numeric[name], shift_db, ops) for name in ("gain_db", "indirect_gain_db")}
-    numeric = {**numeric, **gains_db}
-    distance_m, unobserved_m, gain_db = (numeric[name] for name in FEATURES)
-    free_db, near_m = free_space_gain_db(distance_m, frequency_hz, ops), ops.maximum(distance_m, _NEAREST_M)
-    traced_db = [gain_db, *(numeric["indirect_gain_db"][:, column] for column in range(len(ATTENUATION_LENGTHS_M)))]
-    lengths_m = (distance_m, unobserved_m, distance_m - unobserved_m, numeric["strongest_unobserved_m"])
-    columns = [
-        *(ops.minimum(numeric["walled_m"], 1.0), ops.log(near_m), unobserved_m / near_m),
-        *(ops.log(1.0 + length_m / _SCALE_M) for length_m in lengths_m),
-        *((each_db - GAIN_FLOOR_DB) / _SCALE_DB for each_db in (gain_db, free_db, *traced_db[1:])),
-        *(ops.clip((each_db - free_db) / 30.0, -2.0, 0.5) for each_db in traced_db),
-    ]
-    return ops.concatenate([binary, ops.stack(columns, axis=1)], axis=1)
-
-
-def link_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
-    """Return the inputs (N, `LINK_INPUTS`) of the link network for the features of N links, which have a context."""
-    shift_db = phi.free_space_shift_db(frequency_hz)
-    return input_columns(binary_features(phi), numeric_features(phi), frequency_hz, shift_db).astype(np.float32)
+def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
+    """Return the inputs of the link network of a frequency for the features of N links, which have a context."""
+    inputs: Floats = link_inputs(feature_values(phi), frequency_hz, phi.free_space_shift_db(frequency_hz))
+    return inputs.astype(np.float32)
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
@@ -162,7 +118,7 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
     def start() -> Any:
         return keras.initializers.GlorotUniform(seed=next(seeds))
 
-    networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else LINK_INPUTS)}
+    networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
         networks[name] = _map_network(keras, start, name, widths)
     return networks
@@ -222,7 +178,7 @@ def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> li
 def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
     """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters.
 
-    `maps` are from `read_maps`, `links` are (B, R, LINK_INPUTS), `offsets_m` (B, R, 2) of `receiver_offsets_m`.
+    `maps` are from `read_maps`, `links` are (B, R, len(LINK_INPUTS)), `offsets_m` (B, R, 2) of `receiver_offsets_m`.
     """
     at_receivers = [_interpolated(each, offsets_m / cell_m) for each, cell_m in zip(maps, CELLS_M, strict=False)]
     links = tf.concat([links, *at_receivers], axis=-1)
@@ -276,7 +232,7 @@ def evaluate_context_networks(
     networks: Networks, phi: LinkFeatures, frequency_hz: float
 ) -> tuple[Floats, Floats, Floats]:
     """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`."""
-    inputs, offsets_m = link_inputs(phi, frequency_hz), receiver_offsets_m(phi)
+    inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for maps, links in _by_window(networks, context_of(phi)):
         for start in range(0, len(links), _LINKS_AT_ONCE):
@@ -343,7 +299,7 @@ class _Examples:
         self._windows = context_of(phi).windows if settings.networks == "map" else None
         self._first = np.cumsum([0, *map(len, links)])
         columns = {
-            "links": link_inputs(phi, settings.frequency_hz),
+            "links": scaled_inputs(phi, settings.frequency_hz),
             "offsets_m": receiver_offsets_m(phi),
             "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
             "link_state": link_state.astype(np.int32),

@@ -1,6 +1,6 @@
 """The networks of the paper's predictor, as Keras 3 models: architecture, evaluation, and training by likelihood.
 
-All of them are side by side in one functional model. Its inputs are the features of `FEATURES` in their own units,
+All of them are side by side in one functional model. Its inputs are the features of `GAIN_INPUTS` in their own units,
 each (N, 1); its outputs, by name, are P(link state) given each partial link state (N, 3), mean and log-variance of the
 gain for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are
 scaled and clamped to the range of the training links inside the networks, so that nothing is extrapolated but an anchor
@@ -22,24 +22,26 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.features import LinkFeatures, shifted_gain_db
+from sionna_partial.prediction.inputs import (
+    GAIN_INPUTS,
+    INDOOR_INPUTS,
+    NEAREST_M,
+    STATE_INPUTS,
+    free_space_gain_db,
+    gain_at_1m_db,
+)
 from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
     import keras
 
-FEATURES = ("distance_m", "unobserved_distance_m", "gain_db")
-"""Numeric features in the order of the inputs; the partial link state chooses among the networks."""
-
 STD_RANGE_DB = (0.3, 40.0)
 """Range of the standard deviation that a gain network can give [dB]."""
-
-NEAREST_M = 0.01
-"""Distance below which the gain of free space rises no more [m]."""
 
 _LINKS_AT_ONCE = 65_536
 _LARGEST = 1e30
@@ -82,9 +84,9 @@ class GainNetwork:
 _NOT_LOS = (LinkState.NLOS, LinkState.OUTAGE)
 
 GAIN_NETWORKS = (
-    GainNetwork("gain_los_given_los", LinkState.LOS, (LinkState.LOS,), FEATURES, 20, 0.0, 6.0),
+    GainNetwork("gain_los_given_los", LinkState.LOS, (LinkState.LOS,), GAIN_INPUTS, 20, 0.0, 6.0),
     GainNetwork("gain_los_given_nlos_outage", LinkState.LOS, _NOT_LOS, ("distance_m",), 10, 0.0, 6.0),
-    GainNetwork("gain_nlos_given_nlos_outage", LinkState.NLOS, _NOT_LOS, FEATURES, 20, -20.0, 15.0),
+    GainNetwork("gain_nlos_given_nlos_outage", LinkState.NLOS, _NOT_LOS, GAIN_INPUTS, 20, -20.0, 15.0),
     GainNetwork("gain_nlos_given_los", LinkState.NLOS, (LinkState.LOS,), ("distance_m",), 10, -20.0, 15.0),
 )
 """The gain networks of the paper (tab:path_loss_network). An outage has the gain -150 dB and needs none."""
@@ -92,12 +94,8 @@ GAIN_NETWORKS = (
 STATE_NETWORKS = {state: f"state_given_{state.name.lower()}" for state in LinkState}
 """One multinomial logistic classifier of the link state for each partial link state (paper, Section III-D)."""
 
-STATE_INPUTS = ("distance_m", "unobserved_distance_m")
-
 INDOOR_NETWORKS = {state: f"indoor_given_{state.name.lower()}" for state in LinkState}
 """One logistic classifier P(indoor) for each partial link state (paper, "Indoor-Outdoor Estimation")."""
-
-INDOOR_INPUTS = ("unobserved_distance_m",)
 
 OUTPUT_WIDTHS = {
     **dict.fromkeys(STATE_NETWORKS.values(), len(LinkState)),
@@ -147,11 +145,6 @@ class _TensorFlow:
 tf: Any = _TensorFlow()
 
 
-def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
-    """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
-    return _gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
-
-
 def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
     """Build a logistic classifier on clamped inputs: by softmax or, for one event, sigmoid; `bias` (K,) are logits."""
     keras = import_keras()
@@ -183,7 +176,7 @@ def gain_network(
         anchor = tensors["gain_db"]
     else:
         decades = keras.ops.log10(keras.ops.maximum(tensors["distance_m"], NEAREST_M))
-        anchor = layer(keras, "Rescaling", "free_space_gain_db", -20.0, _gain_at_1m_db(frequency_hz))(decades)
+        anchor = layer(keras, "Rescaling", "free_space_gain_db", -20.0, gain_at_1m_db(frequency_hz))(decades)
     mean = layer(keras, "Add", "mean_db")([anchor, offset])
     low, high = (2.0 * math.log(std) for std in STD_RANGE_DB)
     first = min(max((2.0 * math.log(max(std_db, 1e-9)) - low) / (high - low), 0.02), 0.98)
@@ -196,7 +189,7 @@ def gain_network(
 def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
     """Put networks side by side in one model: those of `OUTPUT_WIDTHS`, and any others, which share no inputs."""
     keras = import_keras()
-    inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in FEATURES}
+    inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in GAIN_INPUTS}
     outputs = {name: networks[name]({key: inputs[key] for key in networks[name].input}) for name in OUTPUT_WIDTHS}
     for name in sorted(networks.keys() - outputs.keys()):
         own = own_input(name)
@@ -215,7 +208,7 @@ def parts(model: "keras.Model") -> dict[str, "keras.Model"]:
     return {name: model.get_layer(name) for name in model.output}
 
 
-def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict[str, NDArray[np.float32]]:
+def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = GAIN_INPUTS) -> dict[str, NDArray[np.float32]]:
     """Return features as the inputs (N, 1) of a network."""
     columns = {name: np.clip(getattr(phi, name), -_LARGEST, _LARGEST) for name in names}
     return {name: column.astype(np.float32)[:, None] for name, column in columns.items()}
@@ -224,7 +217,7 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = FEATURES) -> dict
 def distribution_by_paper(
     networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: States, shift_db: Any = 0.0
 ) -> tuple[Any, Any, Any]:
-    """Evaluate the paper's networks on `inputs` (N, 1) of `FEATURES` and partial link states (N,).
+    """Evaluate the paper's networks on `inputs` (N, 1) of `GAIN_INPUTS` and partial link states (N,).
 
     Free space is stronger by `shift_db` at the frequency of the networks than at that of the links.
     Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
@@ -283,7 +276,7 @@ def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
     for name in OUTPUT_WIDTHS:
         network = model.get_layer(name)
         scaling = network.get_layer("scaled").get_config()
-        names = [key for key in FEATURES if key in network.input]
+        names = [key for key in GAIN_INPUTS if key in network.input]
         spans = zip(names, scaling["scale"], scaling["offset"], strict=True)
         ranges[name] = {key: [-offset / scale, (1.0 - offset) / scale] for key, scale, offset in spans}
     return ranges
@@ -299,10 +292,6 @@ def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, An
     offset = [-ranges[name][0] * factor for name, factor in zip(names, scale, strict=True)]
     scaled = layer(keras, "Rescaling", "scaled", scale, offset)(joined)
     return tensors, layer(keras, "ReLU", "clamped", max_value=1.0)(scaled)
-
-
-def _gain_at_1m_db(frequency_hz: float) -> float:
-    return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
 
 
 def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:

@@ -18,8 +18,9 @@ import numpy as np
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes, temporary_folder
+from sionna_partial.prediction.inputs import GAIN_INPUTS
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
-from sionna_partial.prediction.paper_networks import FEATURES, OUTPUT_WIDTHS, import_keras, own_input
+from sionna_partial.prediction.paper_networks import OUTPUT_WIDTHS, import_keras, own_input
 
 if TYPE_CHECKING:
     import keras
@@ -42,12 +43,12 @@ _CLASSES = {
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
 """Names that Keras numbers through a process; each of our networks has one of each."""
 
-_INPUTS = dict.fromkeys(FEATURES, (None, 1))
+_INPUTS = dict.fromkeys(GAIN_INPUTS, (None, 1))
 _OUTPUTS = {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}
 
 _FIXED_ENTRIES = {
     "format": FORMAT,
-    "features": list(FEATURES),
+    "features": list(GAIN_INPUTS),
     "link_states": {state.name: state.value for state in LinkState},
     "outputs": OUTPUT_WIDTHS,
 }
