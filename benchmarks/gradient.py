@@ -87,7 +87,7 @@ def compare(
     scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.float64], *, skip_centres: bool
 ) -> Iterator[tuple[tuple[str, str], Errors]]:
     """Yield the errors of the derivatives of every output with respect to every parameter."""
-    paths = scene.paths.paths(tx, rx)
+    paths = scene.simulation.paths(tx, rx)
     links = DifferentiableLinks(scene, paths)
     outputs = ["gain_mean_db"] if scene.partial.is_complete else OUTPUTS  # the rest is constant
     exact = jacobians(links, outputs)
@@ -146,7 +146,7 @@ def changes(scene: DifferentiableScene, paths: PathSet, name: str, reach: float)
         return changed  # paths are a matter of geometry
     for step in (-reach, reach):
         place = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
-        there = scene.paths.paths(place, paths.rx_m)
+        there = scene.simulation.paths(place, paths.rx_m)
         kept = paths.at(replace(paths.base, tx_m=place))[0]
         old = np.bincount(paths.path_rx, weights=paths.power, minlength=len(changed))
         gone = np.bincount(paths.path_rx, weights=paths.power * (kept == 0.0), minlength=len(changed))

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.tracing.slab import reflection_loss_db
-from sionna_partial.tracing.trace import trace_each
 
 HIDDEN = {
     "drywall": sp.Material(),
@@ -135,7 +134,7 @@ def loss_errors(result: sp.MaterialCalibration, hidden: sp.Material) -> tuple[ND
             hidden.relative_permittivity,
             hidden.conductivity_s_m,
             hidden.thickness_m,
-            result.settings.frequency_hz,
+            result.trace_settings.frequency_hz,
             ANGLES_DEG,
             polarisation,
         )
@@ -150,7 +149,8 @@ def gains_db(
 ) -> NDArray[np.float64]:
     """Traced gains of all links [dB], with the scene's own material for None."""
     settings = None if material is None else sp.SceneSettings(material=material)
-    return np.concatenate([links.gain_db for links in trace_each(scene, list(tx), rx, scene_settings=settings)])
+    simulation = sp.Simulation(scene, scene_settings=settings)
+    return np.concatenate([simulation.links(*each).gain_db for each in zip(tx, rx, strict=True)])
 
 
 def free_positions(partial: sp.PartialMap, count: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -53,7 +53,7 @@ def case(
     print(f"hidden {hidden}: {found.materials[0]}, noise {found.noise_db:.2f} dB, {found.used.sum()} links")
     rows = []
     for polarisation in ("te", "tm"):
-        rest = hidden.thickness_m, found.settings.frequency_hz, np.array(ANGLES_DEG), polarisation
+        rest = hidden.thickness_m, found.trace_settings.frequency_hz, np.array(ANGLES_DEG), polarisation
         true_db = reflection_loss_db(hidden.relative_permittivity, hidden.conductivity_s_m, *rest)
         found_db, std_db = found.reflection_loss_db(ANGLES_DEG, polarisation)
         posterior = found.posteriors[0]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.measurements.assimilation import Assimilation
-from sionna_partial.tracing.trace import clear_of_walls
+from sionna_partial.tracing.simulation import clear_of_walls
 
 NUMBERS, DRAWS = (5, 10, 20, 40), 20
 TRACE = sp.TraceSettings(frequency_hz=2.44e9, max_depth=4)

@@ -31,7 +31,7 @@ from sionna_partial.evaluation.metrics import measure
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import likely_region, locate_transmitter
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.tracing.trace import clear_of_walls
+from sionna_partial.tracing.simulation import clear_of_walls
 
 Predict = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[sp.LinkPrediction, NDArray[np.float64]]]
 Links = tuple[sp.LinkPrediction, NDArray[np.uint8], NDArray[np.float64]]

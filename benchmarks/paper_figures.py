@@ -37,7 +37,6 @@ from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.style import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.simulation.homes import HomeKind
-from sionna_partial.tracing.trace import trace_each
 
 Homes = dict[str, sp.PartialMap]
 
@@ -294,7 +293,8 @@ def nothing_observed(home: sp.PartialMap, predictor: sp.Predictor) -> tuple[int,
     angle = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, (20, len(DISTANCES_M)))
     away = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1) * np.array(DISTANCES_M)[:, None]
     tx = list(free_places(home, 20))
-    links = trace_each(nothing, tx, [(position + away).reshape(-1, 3) for position in tx])
+    simulation = sp.Simulation(nothing)
+    links = [simulation.links(position, (position + away).reshape(-1, 3)) for position in tx]
     phi = sp.LinkFeatures.concatenate([sp.link_features(nothing, each) for each in links])
     answer = predictor.predict(phi)
     spreads = {

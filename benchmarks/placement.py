@@ -27,7 +27,6 @@ from sionna_partial.placement.area import PlacementArea, placement_area
 from sionna_partial.placement.placement import link_values, placement_score
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import PlacementSettings
-from sionna_partial.tracing.trace import trace_each
 
 FIRST_SEED = 50_100
 SPACING_M, HEIGHT_M = 0.5, 1.5
@@ -99,13 +98,12 @@ def exhaustive(
     area: PlacementArea, positions_m: NDArray[np.float64], model: sp.Predictor, settings: PlacementSettings
 ) -> NDArray[np.float64]:
     """Return the objective at every position, the fastest public way: scenes are built once for many positions."""
-    scores = []
+    scores, simulation = [], sp.Simulation(area.partial)
     for start in range(0, len(positions_m), POSITIONS_AT_ONCE):
         some_m = positions_m[start : start + POSITIONS_AT_ONCE]
         far = [np.linalg.norm(area.rx_m - tx_m, axis=1) > 0.02 for tx_m in some_m]
-        traced = trace_each(area.partial, list(some_m), [area.rx_m[kept] for kept in far])
-        for links, kept in zip(traced, far, strict=True):
-            phi = sp.link_features(area.partial, links)
+        for tx_m, kept in zip(some_m, far, strict=True):
+            phi = sp.link_features(area.partial, simulation.links(tx_m, area.rx_m[kept]))
             prediction = LinkPrediction.of_trace(phi) if area.partial.is_complete else model.predict(phi)
             values = np.full(len(kept), 1.0)  # a receiver at the transmitter is covered
             values[kept] = link_values(prediction, settings)
@@ -118,7 +116,9 @@ def truth(home: sp.PartialMap, positions_m: NDArray[np.float64], threshold_db: f
     rx_m = np.add(grid(home), [0.03, 0.02, 0.0])
     rx_m = rx_m[home.state_at(rx_m) == sp.CellState.FREE]
     far = [rx_m[np.linalg.norm(rx_m - tx_m, axis=1) > 0.02] for tx_m in positions_m]
-    return np.array([np.mean(links.gain_db > threshold_db) for links in trace_each(home, list(positions_m), far)])
+    simulation = sp.Simulation(home)
+    links = [simulation.links(*each) for each in zip(positions_m, far, strict=True)]
+    return np.array([np.mean(each.gain_db > threshold_db) for each in links])
 
 
 def grid(partial: sp.PartialMap) -> NDArray[np.float64]:

@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import DIFFRACTION
-from sionna_partial.tracing.trace import trace_each
 
 STATES = {sp.LinkState.OUTAGE: "outage", sp.LinkState.LOS: "LOS", sp.LinkState.NLOS: "NLOS"}
 RX_HEIGHT_M = 1.5
@@ -133,7 +132,8 @@ def trace(
         tx_m.append(tx)
         rx_m.append(rx[kept])
         truth.append(state[kept])
-    links = trace_each(home, tx_m, rx_m, settings=settings, scene_settings=scene_settings)
+    simulation = sp.Simulation(home, settings, scene_settings)
+    links = [simulation.links(*each) for each in zip(tx_m, rx_m, strict=True)]
     found = np.concatenate([each.link_state for each in links])
     return Trial(np.concatenate(truth), found, links, blocked, left_out)
 

@@ -65,10 +65,11 @@ from sionna_partial.simulation.explore import Exploration as Exploration
 from sionna_partial.simulation.explore import explore as explore
 from sionna_partial.simulation.explore import explore_trajectory as explore_trajectory
 from sionna_partial.simulation.homes import make_home as make_home
+from sionna_partial.tracing.gradients import GainGradients as GainGradients
+from sionna_partial.tracing.gradients import gain_gradients as gain_gradients
 from sionna_partial.tracing.links import TracedLinks as TracedLinks
-from sionna_partial.tracing.path_set import GainGradients as GainGradients
-from sionna_partial.tracing.path_set import gain_gradients as gain_gradients
-from sionna_partial.tracing.trace import trace_links as trace_links
+from sionna_partial.tracing.simulation import Simulation as Simulation
+from sionna_partial.tracing.simulation import trace_links as trace_links
 from sionna_partial.training import train as train
 
 __version__: str

@@ -27,7 +27,6 @@ from sionna_partial.coverage_map import (
     with_posterior,
 )
 from sionna_partial.errors import MemoryLimitError, PositionError
-from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
@@ -37,7 +36,7 @@ from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import SHORTEST_M, Tracer, checked_settings, clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m, simulation_of
 
 MAX_RECEIVERS = 2_000_000
 """Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
@@ -161,8 +160,8 @@ def predict_map(
     1.0
     """
     require_choice("receivers", receivers, RECEIVERS)
-    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    trace_settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
+    simulation = simulation_of(scene, trace_settings, scene_settings)
+    partial, trace_settings = simulation.partial, simulation.trace_settings
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     to_be_found = tx is None and measurements is not None
     names, positions_m = (None, np.empty((0, 3))) if to_be_found else transmitter_positions(partial, tx)
@@ -173,11 +172,11 @@ def predict_map(
     given = None if complete and predictor is None else Predictor.load(predictor)
     model = None if complete else given
     if model is not None:
-        _warn_of_other_traces(model, trace_settings, scene_settings)
+        _warn_of_other_traces(model, trace_settings, simulation.scene_settings)
     measured_of_each = measurements_of_each(partial, sources_m, measurements, trace_settings.frequency_hz)
-    provenance = _provenance(partial, model, scene_settings, trace_settings)
+    provenance = _provenance(partial, model, simulation.scene_settings, trace_settings)
     maps = []
-    links = _Links(partial, Tracer(partial, trace_settings, scene_settings), model, at_once)
+    links = _Links(partial, simulation, model, at_once)
     with reporting(progress) as report:
         report(0.0, "building the scene")
         for number, (tx_m, grid, measured) in enumerate(zip(sources_m, grids, measured_of_each, strict=True)):
@@ -300,15 +299,15 @@ class _Links:
     """Links that are traced on the known part of the map and predicted, so many at once."""
 
     partial: PartialMap
-    tracer: Tracer
+    simulation: Simulation
     model: Predictor | None
     at_once: int
 
     def predict(self, tx_m: Floats, rx_m: Floats, report: Progress) -> tuple[LinkFeatures, LinkPrediction]:
         """Trace and predict the links to receivers (N, 3) [m] that are indoors; without a model the trace predicts."""
         context = self.model is not None and self.model.settings.networks != "paper"
-        paths = self.tracer.paths(tx_m, rx_m, report)
-        frequency_hz = self.tracer.settings.frequency_hz
+        paths = self.simulation.blocks(tx_m, rx_m, report)
+        frequency_hz = self.simulation.trace_settings.frequency_hz
         phi = features_of_paths(self.partial, tx_m, rx_m, paths, frequency_hz, context=context)
         return phi, LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
 
@@ -362,7 +361,7 @@ def _predictions(
 
 def _located(links: _Links, measured: Measurements, report: Progress) -> TransmitterPosterior:
     """Find a transmitter from what was measured of it."""
-    measured_at, limit_m = cKDTree(measured.rx), nearest_m(links.tracer.settings.frequency_hz)
+    measured_at, limit_m = cKDTree(measured.rx), nearest_m(links.simulation.trace_settings.frequency_hz)
 
     def allowed(points_m: Floats) -> Bools:
         return clear_of_walls(links.partial, points_m) & (measured_at.query(points_m)[0] >= limit_m)
@@ -379,7 +378,8 @@ def _transmitter_of(links: _Links, where: Floats | TransmitterPosterior, measure
     assimilations = []
     if measured is not None:
         for each_m in tx_m:
-            prior, frequency_hz = links.predict_all(each_m, measured.rx)[0], links.tracer.settings.frequency_hz
+            prior, _ = links.predict_all(each_m, measured.rx)
+            frequency_hz = links.simulation.trace_settings.frequency_hz
             assimilations.append(Assimilation(links.partial, each_m, measured, prior, frequency_hz))
     return _Transmitter(tx_m, weights, assimilations, position_m)
 

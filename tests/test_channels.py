@@ -213,7 +213,7 @@ class TestPerAntenna:
                 import mitsuba as mi
 
                 ends.append(position_m + np.array(array.rotate(wavelength_m, mi.Point3f(*map(float, angles)))).T)
-            between = sp.trace_links(_room(), *ends, trace_settings=links.settings)
+            between = sp.trace_links(_room(), *ends, trace_settings=links.trace_settings)
             for number, path in enumerate(np.flatnonzero(links.path_rx == receiver)):
                 there = links.interactions[path] > 0
                 near = (between.interactions == links.interactions[path]).all(axis=1)

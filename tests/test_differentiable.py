@@ -20,7 +20,7 @@ from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
-from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet
+from sionna_partial.tracing.path_set import PARAMETERS, PathSet
 
 pytestmark = QUIET
 
@@ -297,7 +297,7 @@ TX = np.array([1.1, 1.7, 1.4])
 
 @pytest.fixture(scope="module")
 def paths() -> PathSet:
-    return PathScene(small_room(), settings=sp.TraceSettings(max_depth=1)).paths(TX_M, PILLAR_RX_M)
+    return sp.Simulation(small_room(), sp.TraceSettings(max_depth=1)).paths(TX_M, PILLAR_RX_M)
 
 
 def variables(paths, *names):

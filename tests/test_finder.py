@@ -13,11 +13,10 @@ import sionna_partial as sp
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.tracing import trace
+from sionna_partial.tracing import simulation
 from sionna_partial.tracing.candidates import Wedges
-from sionna_partial.tracing.finder import PlanScene, write_scene_of
+from sionna_partial.tracing.finder import PlanScene, diffracted_as_exact, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.trace import diffracted_as_exact
 
 TX = np.array([1.03, 1.52, 1.4])
 RX = np.array([[1.47, 2.51, 1.7], [4.35, 0.61, 1.2], [3.82, 3.57, 1.3], [2.02, 0.33, 2.2]])
@@ -96,7 +95,7 @@ def test_diffraction_is_on_for_plans_and_off_for_meshes(tmp_path: Path) -> None:
     settings = all_paths(max_depth=2, samples_per_tx=10_000)
     for partial, diffracts in ((_plan(), True), (_as_mesh(_plan(), tmp_path), False)):
         links = sp.trace_links(partial, TX, RX, trace_settings=settings)
-        assert links.settings.diffraction is diffracts
+        assert links.trace_settings.diffraction is diffracts
         assert (8 in links.interactions) is diffracts
 
 
@@ -126,7 +125,7 @@ def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
 def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = all_paths(max_depth=4, samples_per_tx=20_000)
     exact = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
-    monkeypatch.setattr(trace, "engine_fault", lambda: "broken")
+    monkeypatch.setattr(simulation, "engine_fault", lambda: "broken")
     public = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
     np.testing.assert_array_equal(public.link_state, exact.link_state)
     bent = (public.interactions == 8).any(axis=1)

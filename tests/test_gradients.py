@@ -12,7 +12,7 @@ from pillar_room import RX_M, TX_M, small_room
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.tracing.path_set import GainGradients, gain_gradients
+from sionna_partial.tracing.gradients import GainGradients, gain_gradients
 
 SLOPES = (
     *("tx_db_per_m", "relative_permittivity_db", "conductivity_db_per_s_m", "thickness_db_per_m"),
@@ -88,7 +88,7 @@ class TestGainGradients:
         np.testing.assert_array_equal(found.link_state, links.link_state)
         np.testing.assert_allclose(found.gain_db, links.gain_db, rtol=1e-13)
         np.testing.assert_array_equal([*found.tx, *found.rx.ravel()], [*links.tx, *links.rx.ravel()])
-        assert (found.settings, found.scene_settings) == (links.settings, links.scene_settings)
+        assert (found.trace_settings, found.scene_settings) == (links.trace_settings, links.scene_settings)
 
     def test_outage_has_no_slopes(self) -> None:
         state = np.zeros((22, 60), dtype=np.uint8)

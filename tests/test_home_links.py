@@ -14,7 +14,7 @@ from sionna_partial.errors import MapError, PositionError, PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
-from sionna_partial.tracing.trace import trace_links
+from sionna_partial.tracing.simulation import trace_links
 
 SETTINGS = DatasetSettings(
     links_per_home=31, transmitters_per_home=3, stages=(0, 3, 40), trace=TraceSettings(max_depth=2)

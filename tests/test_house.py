@@ -33,8 +33,8 @@ ROOMS = {
     "tracing": (
         *("candidates", "paths", "links", "engine", "slab", "bounds"),
         *("plan.beams", "plan.specular", "plan.diffraction"),
-        *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder", "trace"),
-        "path_set",
+        *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder"),
+        *("path_set", "simulation", "gradients"),
         "antennas",
     ),
     "prediction": (

@@ -19,7 +19,7 @@ from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContex
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings, TraceSettings
 from sionna_partial.simulation.homes import make_home
-from sionna_partial.tracing.trace import trace_links
+from sionna_partial.tracing.simulation import trace_links
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 DEPTH = 4

@@ -14,8 +14,8 @@ from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
-from sionna_partial.tracing import path_set
-from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathParameters, PathScene, PathSet
+from sionna_partial.tracing import path_set, simulation
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathParameters, PathSet
 
 SETTINGS = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1)
 FIELD = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.1)
@@ -89,29 +89,29 @@ def in_order(paths: PathSet, power: NDArray[np.float64], vertices_m: NDArray[np.
 
 
 @pytest.fixture(scope="module")
-def room() -> PathScene:
-    return PathScene(small_room(), settings=SETTINGS)
+def room() -> sp.Simulation:
+    return sp.Simulation(small_room(), trace_settings=SETTINGS)
 
 
 @pytest.fixture(scope="module")
-def paths(room: PathScene) -> PathSet:
+def paths(room: sp.Simulation) -> PathSet:
     return room.paths(TX_M, RX_M)
 
 
 @pytest.fixture(scope="module")
-def several(room: PathScene) -> PathSet:
+def several(room: sp.Simulation) -> PathSet:
     return room.paths(SEVERAL_TX_M, RX_M)
 
 
 @pytest.fixture(scope="module")
 def mesh_paths() -> PathSet:
-    return PathScene(mesh_room(), settings=SETTINGS).paths(MESH_TX_M, MESH_RX_M)
+    return sp.Simulation(mesh_room(), trace_settings=SETTINGS).paths(MESH_TX_M, MESH_RX_M)
 
 
 @pytest.fixture(scope="module")
 def itu_paths() -> PathSet:
     settings = replace(SETTINGS, frequency_hz=5e9)
-    return PathScene(small_room(), settings=settings, scene_settings=CONCRETE_AT_5_GHZ).paths(TX_M, RX_M)
+    return sp.Simulation(small_room(), trace_settings=settings, scene_settings=CONCRETE_AT_5_GHZ).paths(TX_M, RX_M)
 
 
 class TestLinks:
@@ -141,7 +141,7 @@ class TestLinks:
     def test_map_elsewhere(self, paths: PathSet) -> None:
         move = np.array([5e5, 4.5e6, 0.0])
         moved = replace(small_room(), origin_m=(5e5, 4.5e6))
-        there = PathScene(moved, settings=SETTINGS).paths(TX_M + move, RX_M + move)
+        there = sp.Simulation(moved, trace_settings=SETTINGS).paths(TX_M + move, RX_M + move)
         self.assert_same(there.links(), sp.trace_links(moved, TX_M + move, RX_M + move, trace_settings=SETTINGS))
         power, vertices_m = there.at(changed(there, tx_m=[0.01, -0.02, 0.03]))
         expected, expected_m = paths.at(changed(paths, tx_m=[0.01, -0.02, 0.03]))
@@ -153,7 +153,7 @@ class TestLinks:
         state[[0, -1], :] = state[:, [0, 29, -1]] = CellState.WALL
         ends = (1.0, 1.1, 1.5), [(4.5, 0.8, 1.2), (1.7, 0.7, 1.1)]
         partial = sp.PartialMap(state, 0.1)
-        self.assert_same(PathScene(partial).paths(*ends).links(), sp.trace_links(partial, *ends))
+        self.assert_same(sp.Simulation(partial).paths(*ends).links(), sp.trace_links(partial, *ends))
 
 
 class TestSeveralTransmitters:
@@ -161,7 +161,7 @@ class TestSeveralTransmitters:
         links = sp.trace_links(small_room(), SEVERAL_TX_M, RX_M, trace_settings=SETTINGS)
         TestLinks.assert_same(several.links(), links)
 
-    def test_each_moves_as_it_does_alone(self, room: PathScene, several: PathSet) -> None:
+    def test_each_moves_as_it_does_alone(self, room: sp.Simulation, several: PathSet) -> None:
         move = np.array([[4e-3, -3e-3, 5e-3], [0.0, 2e-3, -1e-3]])
         there = changed(several, tx_m=move)
         power, vertices_m = several.at(there)
@@ -176,9 +176,9 @@ class TestSeveralTransmitters:
             for name, each in alone.slopes(here).items():
                 np.testing.assert_allclose(slopes[name][own], each, rtol=1e-3, atol=1e-4 * np.abs(each).max())
 
-    def test_some_receivers_of_each(self, room: PathScene, several: PathSet) -> None:
+    def test_some_receivers_of_each(self, room: sp.Simulation, several: PathSet) -> None:
         """Links are pairs: the first transmitter reaches two receivers, the second one another."""
-        blocks = room.blocks(SEVERAL_TX_M, RX_M, quiet, [np.array([0, 2]), np.array([1])])
+        blocks = room.path_blocks(SEVERAL_TX_M, RX_M, quiet, [np.array([0, 2]), np.array([1])])
         pairs = PathSet.joined(list(blocks))
         assert {*zip(pairs.path_tx.tolist(), pairs.path_rx.tolist(), strict=True)} == {(0, 0), (0, 2), (1, 1)}
         chosen = np.isin(several.path_tx * 3 + several.path_rx, [0, 2, 4])
@@ -202,7 +202,7 @@ class TestAt:
         """Where the new position has the same kinds of paths; here it has."""
         paths = request.getfixturevalue(which)
         there = changed(paths, tx_m=[4e-3, -3e-3, 5e-3])
-        partial = paths._scene.partial
+        partial = paths._simulation.partial
         links = sp.trace_links(partial, there.tx_m, paths.rx_m, trace_settings=SETTINGS)
         assert len(links.a) == len(paths)
         moved = replace(paths.base, tx_m=there.tx_m)
@@ -230,14 +230,14 @@ class TestAt:
     def test_itu_materials_follow_the_frequency(self, itu_paths: PathSet) -> None:
         power, _ = itu_paths.at(changed(itu_paths, frequency_hz=3e9))
         settings = replace(SETTINGS, frequency_hz=8e9)
-        there = PathScene(small_room(), settings=settings, scene_settings=CONCRETE_AT_5_GHZ).paths(TX_M, RX_M)
+        there = sp.Simulation(small_room(), trace_settings=settings, scene_settings=CONCRETE_AT_5_GHZ).paths(TX_M, RX_M)
         np.testing.assert_allclose(power, there.power, rtol=1e-4)
 
     def test_same_bytes_whatever_came_between(self, paths: PathSet) -> None:
         """Dr.Jit replays recorded kernels for other materials, also while another scene is open."""
         there = replace(paths.base, relative_permittivity=np.array([4.0]), conductivity_s_m=np.array([0.3]))
         first = paths.at(there)[0]
-        other = PathScene(FIELD, scene_settings=FLOOR).paths((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
+        other = sp.Simulation(FIELD, scene_settings=FLOOR).paths((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
         other.at(changed(other, conductivity_s_m=0.1))
         paths.at(changed(paths, relative_permittivity=5.0))
         assert paths.at(there)[0].tobytes() == first.tobytes()
@@ -245,7 +245,7 @@ class TestAt:
         np.testing.assert_allclose(paths.at(elsewhere)[0], first, rtol=1e-4, atol=1e-7 * first.max())
 
     def test_materials_each_for_itself(self, mesh_paths: PathSet) -> None:
-        scene = mesh_paths._scene
+        scene = mesh_paths._simulation
         assert len(scene.materials) == 3
         np.testing.assert_allclose(sorted(mesh_paths.base.relative_permittivity), [2.94, 5.24, 6.0], rtol=1e-6)
         alone = [mesh_paths.at(changed(mesh_paths, relative_permittivity=by))[0] for by in np.eye(3)]
@@ -314,7 +314,7 @@ class TestSlopes:
         """The reflection point divides the length as the heights; the power falls with the square of the length."""
         tx, rx = np.array([1.03, 1.92, 1.4]), np.array([3.2, 2.1, 1.1])
         metal = replace(FLOOR, material=sp.Material(1.0, 1e7, 0.1))
-        paths = PathScene(FIELD, scene_settings=metal).paths(tx, rx[None])
+        paths = sp.Simulation(FIELD, scene_settings=metal).paths(tx, rx[None])
         bent, share = int(np.flatnonzero(~paths.is_direct)[0]), tx[2] / (tx[2] + rx[2])
         np.testing.assert_allclose(paths.vertices_m[bent, 0], [*(tx + share * (rx - tx))[:2], 0.0], atol=1e-5)
         power, vertices_m = paths.transmitter_slopes(paths.base)
@@ -344,8 +344,8 @@ class TestSlopes:
             scale = np.abs(apart[name]).max()
             np.testing.assert_allclose(together[name], expected, rtol=1e-4, atol=1e-6 * scale)
 
-    def test_two_runs_give_the_same_bytes(self, room: PathScene, paths: PathSet) -> None:
-        again = PathScene(small_room(), settings=SETTINGS).paths(TX_M, RX_M)
+    def test_two_runs_give_the_same_bytes(self, room: sp.Simulation, paths: PathSet) -> None:
+        again = sp.Simulation(small_room(), trace_settings=SETTINGS).paths(TX_M, RX_M)
         there = changed(paths, tx_m=[1e-3, 0.0, 0.0])
         for one, other in ((again, paths), (paths, paths)):
             assert one.power.tobytes() == other.power.tobytes()
@@ -353,7 +353,7 @@ class TestSlopes:
             assert all(mine[name].tobytes() == theirs[name].tobytes() for name in PARAMETERS)
             assert one.at(there)[0].tobytes() == other.at(there)[0].tobytes()
 
-    def test_blocks_change_nothing(self, room: PathScene, paths: PathSet, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_blocks_change_nothing(self, room: sp.Simulation, paths: PathSet, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(path_set, "PATHS_PER_BLOCK", 17)
         assert len(paths) > 17
         cut, there = room.paths(TX_M, RX_M), changed(paths, tx_m=[1e-3, 0.0, 0.0])
@@ -365,7 +365,7 @@ class TestSlopes:
 
 
 class TestNothingIsLeftBehind:
-    def test_after_a_call(self, room: PathScene, paths: PathSet) -> None:
+    def test_after_a_call(self, room: sp.Simulation, paths: PathSet) -> None:
         before = room.paths(TX_M, RX_M).links().a.tobytes()
         there = changed(paths, tx_m=[0.1, 0.1, 0.1], relative_permittivity=[3.0], frequency_hz=-2e9)
         paths.at(there)
@@ -374,11 +374,11 @@ class TestNothingIsLeftBehind:
         np.testing.assert_array_equal(room.parameters(TX_M).relative_permittivity, paths.base.relative_permittivity)
 
     def test_after_an_itu_material_followed_the_frequency(self, itu_paths: PathSet) -> None:
-        before = itu_paths._scene.paths(TX_M, RX_M).links().a.tobytes()
+        before = itu_paths._simulation.paths(TX_M, RX_M).links().a.tobytes()
         itu_paths.slopes(changed(itu_paths, frequency_hz=3e9, conductivity_s_m=[0.5]))
-        assert itu_paths._scene.paths(TX_M, RX_M).links().a.tobytes() == before
+        assert itu_paths._simulation.paths(TX_M, RX_M).links().a.tobytes() == before
 
-    def test_after_an_error(self, room: PathScene, paths: PathSet) -> None:
+    def test_after_an_error(self, room: sp.Simulation, paths: PathSet) -> None:
         """Sionna RT refuses a negative conductivity when the permittivity has been changed."""
         before = room.paths(TX_M, RX_M).links().a.tobytes()
         there = changed(paths, relative_permittivity=[3.0], conductivity_s_m=[-1.0], frequency_hz=-2e9)
@@ -388,7 +388,7 @@ class TestNothingIsLeftBehind:
         assert room.paths(TX_M, RX_M).links().a.tobytes() == before
         assert all(np.isfinite(each).all() for each in paths.slopes(paths.base).values())
 
-    def test_what_was_given_may_change(self, room: PathScene) -> None:
+    def test_what_was_given_may_change(self, room: sp.Simulation) -> None:
         tx, rx = TX_M.copy(), RX_M.copy()
         paths = room.paths(tx, rx)
         tx += 1.0
@@ -402,7 +402,7 @@ class TestNothingThere:
         ("rx", "scene_settings"), [([], FLOOR), (np.zeros((0, 3)), NOTHING)], ids=["with a floor", "with nothing"]
     )
     def test_no_receivers(self, rx: ArrayLike, scene_settings: sp.SceneSettings) -> None:
-        paths = PathScene(FIELD, scene_settings=scene_settings).paths((1.0, 1.0, 1.5), rx)
+        paths = sp.Simulation(FIELD, scene_settings=scene_settings).paths((1.0, 1.0, 1.5), rx)
         assert (len(paths), paths.rx_m.shape) == (0, (0, 3))
         power, vertices_m = paths.at(paths.base)
         slopes, of_vertices = paths.transmitter_slopes(paths.base)
@@ -414,7 +414,7 @@ class TestNothingThere:
     def test_no_paths(self) -> None:
         state = np.zeros((22, 60), dtype=np.uint8)
         state[[0, -1], :] = state[:, [0, 29, -1]] = CellState.WALL
-        paths = PathScene(sp.PartialMap(state, 0.1)).paths((1.0, 1.1, 1.5), [(4.5, 0.8, 1.2)])
+        paths = sp.Simulation(sp.PartialMap(state, 0.1)).paths((1.0, 1.1, 1.5), [(4.5, 0.8, 1.2)])
         assert len(paths) == 0
         assert paths.links().gain_db.tolist() == [-150.0]
         assert {name: each.shape for name, each in paths.slopes(paths.base).items()} == {
@@ -422,7 +422,7 @@ class TestNothingThere:
         }  # fmt: skip
 
     def test_no_materials(self) -> None:
-        scene = PathScene(FIELD, scene_settings=NOTHING)
+        scene = sp.Simulation(FIELD, scene_settings=NOTHING)
         paths = scene.paths((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
         assert scene.materials == ()
         assert (paths.base.relative_permittivity.shape, paths.is_direct.tolist()) == ((0,), [True])
@@ -432,7 +432,7 @@ class TestNothingThere:
         together = paths.slopes(paths.base, together=True)
         assert [together[name].tolist() for name in MATERIAL_PARAMETERS] == [[[0.0]]] * 3
 
-    def test_progress(self, room: PathScene) -> None:
+    def test_progress(self, room: sp.Simulation) -> None:
         calls: list[tuple[float, str]] = []
         room.paths(TX_M, RX_M, progress=lambda share, message: calls.append((share, message)))
         fractions = [share for share, _ in calls]
@@ -443,10 +443,10 @@ class TestNothingThere:
 
 class TestErrors:
     def test_broken_contract(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(path_set, "engine_fault", lambda: "sionna-rt 3.0 is not of the release 2.2")
+        monkeypatch.setattr(simulation, "engine_fault", lambda: "sionna-rt 3.0 is not of the release 2.2")
         message = r'Gradients need the fast engine, and .* 2.2: run pip install "sionna-rt=='
         with pytest.raises(BackendError, match=message):
-            PathScene(FIELD)
+            sp.Simulation(FIELD).paths((1.0, 1.0, 1.5), [])
 
     def test_frequency_that_a_material_does_not_cover(self, itu_paths: PathSet) -> None:
         there = replace(itu_paths.base, frequency_hz=np.array(5e8))

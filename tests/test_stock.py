@@ -13,9 +13,9 @@ from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SHAPES, build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.engine import SceneSolver, load_sionna
+from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene
+from sionna_partial.tracing.finder import listed_before, stock_paths
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.trace import listed_before, stock_paths
 
 NOWHERE = np.zeros((0, 3))
 
@@ -30,7 +30,7 @@ def _write(partial: PartialMap, folder: Path, settings: SceneSettings | None = N
 
 
 def _solve(xml: Path, settings: TraceSettings, tx: NDArray[np.float64], rx: NDArray[np.float64]) -> SolvedPaths:
-    return join_paths(list(stock_paths(xml, settings, tx, rx)), settings.max_depth)
+    return join_paths(list(stock_paths(open_scene(xml, settings.frequency_hz), settings, tx, rx)), settings.max_depth)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ class TestStockPaths:
         state[:, 20] = CellState.WALL
         xml = _write(PartialMap(state, 0.1), tmp_path)
         settings = TraceSettings(max_depth=depth, samples_per_tx=1000)
-        (paths,) = stock_paths(xml, settings, np.array([1.0, 1.0, 1.5]), np.array([[3.0, 1.0, 1.5]]))
+        paths = _solve(xml, settings, np.array([1.0, 1.0, 1.5]), np.array([[3.0, 1.0, 1.5]]))
         assert paths.interactions.shape == (0, max(1, depth))
         assert paths.vertices_m.shape == (0, max(1, depth), 3)
 
@@ -133,7 +133,7 @@ class TestStockPaths:
         monkeypatch.setattr(load_sionna(), "PathSolver", fail)
         message = r"^Sionna RT 2\.\S+ cannot solve the paths \(RuntimeError\('out of memory'\)\): lower samples_per_tx"
         with pytest.raises(BackendError, match=message):
-            list(stock_paths(room_xml, TraceSettings(), TX, RX))
+            list(stock_paths(open_scene(room_xml, 28e9), TraceSettings(), TX, RX))
 
 
 class TestListedBefore:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.tracing.trace import clear_of_walls
+from sionna_partial.tracing.simulation import clear_of_walls
 
 OFFSETS_M = (0.0, -37.31, 1234.5, 1e7)
 

@@ -19,9 +19,11 @@ from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.tracing import engine
 from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.tracing.gradients import gain_gradients
 from sionna_partial.tracing.links import TracedLinks
-from sionna_partial.tracing.trace import InvalidLinks, trace_each, trace_links
+from sionna_partial.tracing.simulation import InvalidLinks, Simulation, trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 all_paths = functools.partial(TraceSettings, power_tolerance_db=0.0)
@@ -372,16 +374,45 @@ def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: Parti
     assert np.mean(recalled) > 0.999
 
 
-class TestTraceEach:
-    def test_equals_separate_traces(self) -> None:
-        partial, rng = _half_seen_room(), np.random.default_rng(0)
-        tx = [np.array([1.0, 1.5, 1.5]), np.array([2.0, 3.0, 1.2])]
-        rx = [np.column_stack([rng.uniform(0.5, 2.5, (n, 2)), np.full(n, 1.4)]) for n in (7, 0)]
-        for links, place, receivers in zip(trace_each(partial, tx, rx), tx, rx, strict=True):
-            alone = trace_links(partial, place, receivers)
-            for name in ("tx", "rx", "link_state", "gain_db", "path_rx", "delay_s", "a", "vertices_m", "interactions"):
-                np.testing.assert_array_equal(getattr(links, name), getattr(alone, name))
-            assert links.settings == alone.settings
+class TestSimulation:
+    def test_a_second_call_loads_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Whatever was traced before, links are those of a trace of their own, with either polarisation."""
+        partial, rng, opened = _half_seen_room(), np.random.default_rng(0), []
+        rx = [np.column_stack([rng.uniform(0.5, 2.5, (n, 2)), np.full(n, 1.4)]) for n in (7, 0, 3)]
+        tx = np.array([[1.0, 1.5, 1.5], [2.0, 3.0, 1.2], [2.1, 3.0, 1.2]])
+        alone = [trace_links(partial, *each) for each in zip(tx, rx, strict=True)]
+        load = engine.open_scene
+        monkeypatch.setattr(engine, "open_scene", lambda *each: opened.append(each) or load(*each))
+        simulation = Simulation(partial)
+        for polarisations in (2, 1):
+            for expected, *ends in zip(alone, tx, rx, strict=True):
+                links = simulation.links(*ends, polarisations=polarisations)
+                assert links.transfer.shape[1:] == (polarisations, polarisations)
+                for name in ("tx", "rx", "link_state", "gain_db", "path_rx", "delay_s", "a", "vertices_m"):
+                    np.testing.assert_array_equal(getattr(links, name), getattr(expected, name))
+                assert links.trace_settings == expected.trace_settings
+        assert len(opened) == 1
+
+    @pytest.mark.parametrize("settings", [all_paths(max_depth=1, samples_per_tx=2000, diffuse_reflection=True)])
+    def test_rays_are_shot_in_the_same_scene(self, settings: TraceSettings) -> None:
+        ends = (1.0, 1.5, 1.5), [(2.0, 3.0, 1.4), (2.3, 1.0, 1.4)]
+        simulation = Simulation(_half_seen_room(), settings)
+        for links in (simulation.links(*ends), trace_links(simulation, *ends)):
+            np.testing.assert_array_equal(links.a, trace_links(_half_seen_room(), *ends, trace_settings=settings).a)
+        with pytest.raises(SettingsError, match="diffuse_reflection = True is not allowed: paths that are found by"):
+            simulation.paths(*ends)
+
+    def test_it_stands_for_a_map(self) -> None:
+        simulation = Simulation(_half_seen_room(), all_paths(max_depth=1))
+        ends = (1.0, 1.5, 1.5), [(2.0, 3.0, 1.4)]
+        for call in (trace_links, gain_gradients):
+            here, there = call(simulation, *ends), call(_half_seen_room(), *ends, trace_settings=all_paths(max_depth=1))
+            np.testing.assert_array_equal(here.gain_db, there.gain_db)
+        for name in ("trace_settings", "scene_settings"):
+            with pytest.raises(SettingsError, match=f"^{name} = .*: the Simulation that was given has its own"):
+                trace_links(simulation, *ends, **{name: getattr(simulation, name)})
+        with pytest.raises(SettingsError, match="polarisations = 3 is not allowed: give 1 or 2"):
+            simulation.links(*ends, polarisations=3)
 
 
 class TestPathsOnDisk:
@@ -472,7 +503,7 @@ class TestTables:
         units = {"delay_s": "s", "vertices_m": "m", "gain_db": "dB", "arrival_rad": "rad"}
         assert {name: table[name].units for name in units} == units
         assert table.attrs["frequency_hz"] == 28e9
-        assert json.loads(table.attrs["settings"])["max_depth"] == 6
+        assert json.loads(table.attrs["trace_settings"])["max_depth"] == 6
         assert trace_links(_room(), self.TX[0], self.RX[:2]).to_xarray().gain_db.dims == ("rx",)
 
     def test_rows_of_links(self, links: TracedLinks) -> None:

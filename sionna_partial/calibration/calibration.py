@@ -32,13 +32,12 @@ from sionna_partial.calibration.measured_building import (
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Pictured
-from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.tracing.simulation import simulation_of
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
-from sionna_partial.tracing.trace import checked_settings
 
 DETERMINED = 0.35
 """Largest standard deviation of a parameter that counts as determined, as a fraction of that of the prior."""
@@ -79,7 +78,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
         `weight` (K,), which sums to 1.
     scene : PartialMap
         The map with the calibrated materials, for `predict_map`.
-    settings : TraceSettings
+    trace_settings : TraceSettings
 
     Examples
     --------
@@ -109,7 +108,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
     materials: tuple[Material, ...]
     posteriors: tuple[Posterior, ...]
     scene: PartialMap
-    settings: TraceSettings
+    trace_settings: TraceSettings
 
     def reflection_loss_db(
         self, angle_deg: ArrayLike, polarisation: Polarisation = "te", *, which: int = 0
@@ -130,7 +129,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
         loss_db, std_db : float64 arrays of the angle's shape
         """
         angle, material, posterior = np.asarray(angle_deg, float), self.materials[which], self.posteriors[which]
-        rest = material.thickness_m, self.settings.frequency_hz
+        rest = material.thickness_m, self.trace_settings.frequency_hz
         best = reflection_loss_db(material.relative_permittivity, material.conductivity_s_m, *rest, angle, polarisation)
         others = reflection_loss_db(
             posterior.permittivity, posterior.conductivity_s_m, *rest, angle[..., None], polarisation
@@ -155,7 +154,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
             "rmse_db": rmse_db,
             "start": [asdict(material) for material in self.start],
             "materials": [asdict(material) for material in self.materials],
-            "frequency_hz": self.settings.frequency_hz,
+            "frequency_hz": self.trace_settings.frequency_hz,
         }
 
 
@@ -225,9 +224,9 @@ def calibrate_materials(
     >>> abs(found.permittivity - 2.94) < 2.0 * found.permittivity_std
     True
     """
-    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
     require(start is None or isinstance(start, Material), "start", start, "give a Material, or None for the scene's.")
-    settings, scene_settings = checked_settings(partial, trace_settings, scene_settings)
+    simulation = simulation_of(scene, trace_settings, scene_settings)
+    partial, settings, scene_settings = simulation.partial, simulation.trace_settings, simulation.scene_settings
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
     measured.require_transmitters()
@@ -273,7 +272,7 @@ def calibrate_materials(
         materials=materials,
         posteriors=tuple(fit.posteriors),
         scene=building.with_materials(materials),
-        settings=settings,
+        trace_settings=settings,
     )
 
 

@@ -15,9 +15,9 @@ from sionna_partial.prediction.features import SEEN_M, path_unobserved_m
 from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import itu_constants
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathScene, PathSet
+from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathSet
+from sionna_partial.tracing.simulation import Simulation, nearest_m
 from sionna_partial.tracing.slab import VACUUM_F_M
-from sionna_partial.tracing.trace import nearest_m
 
 FEWEST_LINKS = 10
 """Smallest number of usable measured links."""
@@ -110,25 +110,25 @@ class MeasuredBuilding:
         return replace(self.partial, mesh=replace(mesh, materials=named))
 
     def paths(
-        self, measured: Measurements, settings: TraceSettings, scene_settings: SceneSettings, report: Progress
+        self, measured: Measurements, trace_settings: TraceSettings, scene_settings: SceneSettings, report: Progress
     ) -> "LinkPaths":
         """Find the paths of the measured links, and keep those that may have some power.
 
         They are traced from those ends of which there are fewer. Sionna RT's diffraction is not reciprocal.
         """
         reflecting = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in self.start.values()]
-        settings = replace(settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
-        scene = PathScene(self.with_materials(reflecting), settings=settings, scene_settings=scene_settings)
-        if not set(self.start) <= set(scene.materials):
+        every = replace(trace_settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
+        simulation = Simulation(self.with_materials(reflecting), every, scene_settings)
+        if not set(self.start) <= set(simulation.materials):
             raise MeasurementError(f"the map has no walls, floor or ceiling {_NO_MATERIAL}")
         tx, rx = measured.tx, measured.rx
         if len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0)):
             tx, rx = rx, tx
         tx_m, index = np.unique(tx, axis=0, return_inverse=True)
         links = [np.flatnonzero(index.ravel() == number) for number in range(len(tx_m))]
-        nothing = PathSet(scene, tx_m, rx, [])
+        nothing = PathSet(simulation, tx_m, rx, [])
         kept, new = nothing, [nothing]
-        columns = np.array([scene.materials.index(name) for name in self.start], dtype=int)
+        columns = np.array([simulation.materials.index(name) for name in self.start], dtype=int)
 
         def link_paths(paths: PathSet) -> LinkPaths:
             return LinkPaths(paths, columns, paths.path_rx.astype(np.int64))
@@ -137,7 +137,7 @@ class MeasuredBuilding:
             paths = PathSet.joined(new)
             return PathSet.joined([kept, paths.kept(link_paths(paths).strong())])
 
-        for block in scene.blocks(tx_m, rx, part_of(report, 0.02, 0.3), links):
+        for block in simulation.path_blocks(tx_m, rx, part_of(report, 0.02, 0.3), links):
             new.append(block)
             if sum(map(len, new)) > PATHS_PER_BLOCK:
                 kept, new = strong(), [nothing]

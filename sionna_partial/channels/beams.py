@@ -13,7 +13,7 @@ from sionna_partial.checks import real_array, require, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB
 from sionna_partial.errors import SettingsError
 from sionna_partial.tracing.antennas import Antennas
-from sionna_partial.tracing.trace import path_gain_db
+from sionna_partial.tracing.links import path_gain_db
 
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import TracedLinks

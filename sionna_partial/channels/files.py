@@ -181,7 +181,7 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
     paths = np.diff(arrays.first).reshape(-1, receivers)
     return xr.Dataset(
         {"a": (every, da.stack(of_tx[0])), "delay_s": (delays, da.stack(of_tx[1])), "paths": (("tx", "rx"), paths)},
-        attrs={"frequency_hz": each.settings.frequency_hz},
+        attrs={"frequency_hz": each.trace_settings.frequency_hz},
     ).assign(tx_m=(("tx", "axis"), each.tx.reshape(-1, 3)), rx_m=(("rx", "axis"), each.rx))
 
 

@@ -24,8 +24,8 @@ from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.antennas import directions
-from sionna_partial.tracing.links import TracedLinks
-from sionna_partial.tracing.trace import path_gain_db, trace_links
+from sionna_partial.tracing.links import TracedLinks, path_gain_db
+from sionna_partial.tracing.simulation import trace_links
 
 ANALOGUES_OF_STATE = 3_000
 """Number of links with LOS, and of links without, whose paths are kept."""
@@ -59,7 +59,7 @@ def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -
     """Trace links between transmitters (T, 3) and receivers (N, 3) [m] on a partial map and in its home."""
     known, true = (trace_links(each, tx_m, rx_m, progress=False) for each in (partial, home))
     ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
-    geometry = LinkGeometry.of(partial, *ends, known.settings.frequency_hz)
+    geometry = LinkGeometry.of(partial, *ends, known.trace_settings.frequency_hz)
     link, true_link = known.path_link, true.path_link
     same = _same(known, link, true, true_link)
     state = true.link_state.ravel()

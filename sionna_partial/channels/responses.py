@@ -64,7 +64,7 @@ class ArrayPaths:
             paths.transfer.shape,
             "these paths were traced for one polarisation; trace the links with trace_links.",
         )
-        frequency_hz = paths.settings.frequency_hz
+        frequency_hz = paths.trace_settings.frequency_hz
         tx_count, rx_count = len(paths.tx.reshape(-1, 3)), len(paths.rx)
         tx = Antennas.of("tx", tx_array, tx_orientation_rad, count=tx_count, frequency_hz=frequency_hz)
         rx = Antennas.of("rx", rx_array, rx_orientation_rad, count=rx_count, frequency_hz=frequency_hz)
@@ -129,12 +129,12 @@ class ArrayPaths:
 
     def _carrier(self, delay_s: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
         """Return exp(-j 2 pi f delay); with delays of single precision it is rounded as in Sionna RT."""
-        per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.paths.settings.frequency_hz)
+        per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.paths.trace_settings.frequency_hz)
         return phasors(per_second * delay_s)
 
     def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
         """Gains of paths from pattern to pattern (P, K_rx, K_tx), and phases at each position of both arrays."""
-        radians = 2.0 * np.pi * self.paths.settings.frequency_hz / SPEED_OF_LIGHT_M_S
+        radians = 2.0 * np.pi * self.paths.trace_settings.frequency_hz / SPEED_OF_LIGHT_M_S
         at_rx, at_tx = (phasors(radians * each) for each in self._advances_m(rows))
         return self._gains(rows), at_rx, at_tx
 
@@ -309,7 +309,7 @@ def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = M
     arrays = ArrayPaths.of(paths, **options)
     remedy = "give frequencies relative to the carrier [Hz], such as those of subcarriers: (F,) numbers."
     offsets_hz = real_array("frequencies_hz", frequencies_hz, SettingsError, remedy).astype(np.float64)
-    carrier_hz = paths.settings.frequency_hz
+    carrier_hz = paths.trace_settings.frequency_hz
     inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
     require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")
 
@@ -375,7 +375,7 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
     tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
     positions = {"tx_m": (("link", "axis"), tx_m[tx], metre), "rx_m": (("link", "axis"), each.rx[rx], metre)}
     attributes = {
-        **{"frequency_hz": each.settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
+        **{"frequency_hz": each.trace_settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
         **{"synthetic_array": int(arrays.synthetic_array), "normalize_delays": int(arrays.normalize_delays)},
     }
     coordinates = {"tx": ("link", tx), "rx": ("link", rx), "axis": ["x", "y", "z"]}

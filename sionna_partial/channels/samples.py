@@ -25,9 +25,9 @@ from sionna_partial.prediction.features import SEEN_M, link_features, traced_uno
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.links import TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths, path_order
-from sionna_partial.tracing.trace import path_gain_db, trace_links
+from sionna_partial.tracing.simulation import trace_links
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -257,7 +257,7 @@ class _Draws:
         self.traced, self._seed, self._rx_count = traced, seed, len(rx_m)
         self._link = traced.path_link
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
-        self._geometry = LinkGeometry.of(partial, *ends, traced.settings.frequency_hz)
+        self._geometry = LinkGeometry.of(partial, *ends, traced.trace_settings.frequency_hz)
         probabilities, _, stds_db = prediction.by_state
         certain = (probabilities.max(axis=0) == 1.0) & ((probabilities > 0.0) * stds_db == 0.0).all(axis=0)
         self._certain_paths, self._uncertain = np.flatnonzero(certain[self._link]), np.flatnonzero(~certain)

@@ -100,7 +100,7 @@ def channels(
     with opt.reporting_to(out.parent, "loading Sionna RT") as report:
         from sionna_partial.channels.files import checked_target
         from sionna_partial.tracing.antennas import planar_array
-        from sionna_partial.tracing.trace import valid_links
+        from sionna_partial.tracing.simulation import valid_links
 
         checked_target(out, layout)
         arrays = [

@@ -15,7 +15,7 @@ from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings
 from sionna_partial.simulation.explore import explore_trajectory
-from sionna_partial.tracing.trace import trace_each
+from sionna_partial.tracing.simulation import Simulation
 
 NEAREST_M = 0.1
 """Shortest distance of transmitter and receiver [m]."""
@@ -178,7 +178,9 @@ def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -
     """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
-    links = trace_each(home, positions.tx_m, indoors, settings=settings.trace, scene_settings=settings.scene)
+    simulation = Simulation(home, settings.trace, settings.scene)
+    ends = zip(positions.tx_m, indoors, strict=True)
+    links = [simulation.links(*each, polarisations=1, progress=False) for each in ends]
     where = np.concatenate(inside)
     link_state = np.full(len(where), LinkState.OUTAGE, dtype=np.uint8)
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
@@ -194,7 +196,8 @@ def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSe
         if index and partial == maps[index - 1]:
             features.append(features[-1])
             continue
-        tx_m, rx_m = positions.tx_m, positions.rx_m
-        links = trace_each(partial, tx_m, rx_m, settings=settings.trace, scene_settings=settings.scene)
+        simulation = Simulation(partial, settings.trace, settings.scene)
+        ends = zip(positions.tx_m, positions.rx_m, strict=True)
+        links = [simulation.links(*each, polarisations=1, progress=False) for each in ends]
         features.append(LinkFeatures.concatenate([link_features(partial, each, windows=False) for each in links]))
     return features

@@ -33,7 +33,6 @@ from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
-from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, link_features
 from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
@@ -58,7 +57,9 @@ from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
-from sionna_partial.tracing.path_set import PARAMETERS, PathScene, PathSet, one_transmitter
+from sionna_partial.tracing.gradients import one_transmitter
+from sionna_partial.tracing.path_set import PARAMETERS, PathSet
+from sionna_partial.tracing.simulation import Simulation, simulation_of
 
 WINDOW_STEP_M = CELLS_M[0] / 2
 """How far from the transmitter further windows are drawn [m]."""
@@ -105,7 +106,7 @@ class DifferentiableScene:
 
     Parameters
     ----------
-    scene : PartialMap or path
+    scene : PartialMap, path or Simulation
         What is known of the building.
     predictor : None, "map", "paper", path or Predictor
         None is the shipped default. On a complete map it is not used.
@@ -137,21 +138,22 @@ class DifferentiableScene:
 
     def __init__(
         self,
-        scene: PartialMap | str | Path,
+        scene: PartialMap | str | Path | Simulation,
         *,
         predictor: Predictor | str | Path | None = None,
         trace_settings: TraceSettings | None = None,
         scene_settings: SceneSettings | None = None,
     ) -> None:
-        self.partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-        self.paths = PathScene(self.partial, settings=trace_settings, scene_settings=scene_settings)
+        self.simulation = simulation_of(scene, trace_settings, scene_settings)
+        self.simulation.require_exact()
+        self.partial = self.simulation.partial
         self.predictor = Predictor.load(predictor)
         self.networks = parts(self.predictor.model)
 
     @property
     def materials(self) -> tuple[str, ...]:
         """Names of the M radio materials, in the order of the arguments of `DifferentiableLinks`."""
-        return self.paths.materials
+        return self.simulation.materials
 
     @property
     def weights(self) -> list[Any]:
@@ -178,7 +180,7 @@ class DifferentiableScene:
         PositionError
             As `trace_links`, or for several transmitters.
         """
-        return DifferentiableLinks(self, self.paths.paths(one_transmitter(tx), rx, progress=progress))
+        return DifferentiableLinks(self, self.simulation.paths(one_transmitter(tx), rx, progress=progress))
 
     @cached_property
     def smooth_unknown(self) -> SmoothLengths:

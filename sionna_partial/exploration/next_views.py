@@ -47,7 +47,7 @@ from sionna_partial.simulation.robot import (
     find_frontiers,
     wide_frontiers,
 )
-from sionna_partial.tracing.trace import clear_of_walls
+from sionna_partial.tracing.simulation import clear_of_walls
 
 GOALS = ("coverage", "state", "area")
 """What is to become known; the first is the default."""

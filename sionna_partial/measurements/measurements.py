@@ -15,7 +15,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
 from sionna_partial.files import read_columns
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.tracing.trace import clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
 
 LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
 """Gains beyond these are in another unit, or of another sign [dB]. Noise may take an outage below the floor."""

@@ -13,7 +13,7 @@ from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
-from sionna_partial.tracing.trace import clear_of_walls
+from sionna_partial.tracing.simulation import clear_of_walls
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
 """Least distance of a transmitter from known walls [m], and the largest cells in which it is kept [m]."""

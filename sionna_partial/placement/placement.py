@@ -21,7 +21,7 @@ from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.progress import reporting
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
-from sionna_partial.tracing.trace import Tracer, checked_settings, nearest_m
+from sionna_partial.tracing.simulation import Simulation, nearest_m, simulation_of
 
 RECEIVERS = 120
 """Largest number of receivers during the search; the final positions are compared at all receivers."""
@@ -213,18 +213,18 @@ def place_transmitter(
         provenance={
             "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
             "predictor_sha256": "" if model is None else model.fingerprint,
-            "scene_settings": asdict(search.tracer.scene_settings),
-            "trace_settings": asdict(search.tracer.settings),
+            "scene_settings": asdict(search.simulation.scene_settings),
+            "trace_settings": asdict(search.simulation.trace_settings),
         },
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search for transmitters needs: settings, tracer, predictor (None on a complete map) and area."""
+    """What a search for transmitters needs: settings, simulation, predictor (None on a complete map) and area."""
 
     settings: PlacementSettings
-    tracer: Tracer
+    simulation: Simulation
     model: Predictor | None
     area: PlacementArea
 
@@ -238,19 +238,19 @@ class Search:
         trace_settings: TraceSettings | None,
     ) -> "Search":
         """Check the settings against a map."""
-        tracer = Tracer(partial, *checked_settings(partial, trace_settings, scene_settings))
+        simulation = simulation_of(partial, trace_settings, scene_settings)
         for name in ("tx_height_m", "rx_height_m"):
             require_height(partial, name, getattr(settings, name))
         model = None if partial.is_complete else Predictor.load(predictor)
         area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
-        return cls(settings, tracer, model, area)
+        return cls(settings, simulation, model, area)
 
     def starts(self, area: PlacementArea, count: int) -> Floats:
         """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
         positions_m, range_m = area.positions(self.settings.seed), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
             loss = 10.0 ** (-self.settings.threshold_db / 20.0)
-            range_m = SPEED_OF_LIGHT_M_S / self.tracer.settings.frequency_hz / (4.0 * math.pi) * loss
+            range_m = SPEED_OF_LIGHT_M_S / self.simulation.trace_settings.frequency_hz / (4.0 * math.pi) * loss
         seen = area.visibility(positions_m, range_m)
         scores = np.array([placement_score(values, area.weight, self.settings) for values in seen])
         fraction = area.weight / area.weight.sum()
@@ -264,11 +264,12 @@ class Search:
 
     def links(self, positions_m: Floats, area: PlacementArea) -> tuple[LinkPrediction, Bools]:
         """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
-        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(self.tracer.settings.frequency_hz)
+        frequency_hz = self.simulation.trace_settings.frequency_hz
+        far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
         features = []
         for tx_m, kept in zip(positions_m, far, strict=True):
-            paths = self.tracer.paths(tx_m, area.rx_m[kept], no_progress)
-            links = area.partial, tx_m, area.rx_m[kept], paths, self.tracer.settings.frequency_hz
+            paths = self.simulation.blocks(tx_m, area.rx_m[kept], no_progress)
+            links = area.partial, tx_m, area.rx_m[kept], paths, frequency_hz
             features.append(features_of_paths(*links, context=self.model is not None))
         phi = LinkFeatures.concatenate(features)
         found = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)

@@ -90,7 +90,7 @@ def _draw_reflection(axis: Axes, calibration: MaterialCalibration, which: int) -
     start, found = calibration.start[which], calibration.materials[which]
     loss_db, std_db = calibration.reflection_loss_db(ANGLES_DEG, which=which)
     slab = (start.relative_permittivity, start.conductivity_s_m, start.thickness_m)
-    before_db = reflection_loss_db(*slab, calibration.settings.frequency_hz, ANGLES_DEG)
+    before_db = reflection_loss_db(*slab, calibration.trace_settings.frequency_hz, ANGLES_DEG)
     axis.fill_between(ANGLES_DEG, loss_db - 2.0 * std_db, loss_db + 2.0 * std_db, color=BLUE, alpha=0.2, linewidth=0)
     axis.plot(ANGLES_DEG, before_db, color=RED, label=f"start: {_words(start)}", **_LINE)
     axis.plot(ANGLES_DEG, loss_db, color=BLUE, label=f"calibrated: {_words(found)}", **_LINE)

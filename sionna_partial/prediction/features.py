@@ -27,9 +27,8 @@ from sionna_partial.prediction.unobserved import (
     walled_lengths_m,
 )
 from sionna_partial.prediction.windows import draw_windows, transmitters
-from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.trace import link_summary, path_gain_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
@@ -467,7 +466,7 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
         raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")
     paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx)
     paths.add(links)
-    frequency_hz = links.settings.frequency_hz
+    frequency_hz = links.trace_settings.frequency_hz
     phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz, windows=windows)
     return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
@@ -483,16 +482,16 @@ def features_of_paths(
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
-    `blocks` are all paths between them, from `Tracer.paths`. The paper's predictor needs no context.
+    `blocks` are all paths between them, from `Simulation.blocks`. The paper's predictor needs no context.
     """
-    power, is_direct = np.zeros(len(rx_m)), np.zeros(len(rx_m), dtype=bool)
+    sums = LinkSums(1, len(rx_m))
     indirect = IndirectPaths(partial, tx_m[None], rx_m)
     for paths in blocks:
-        np.add.at(power, paths.path_rx, np.abs(paths.a) ** 2)
-        is_direct[paths.path_rx[paths.is_direct]] = True
+        sums.add(paths)
         if context:
             indirect.add(paths)
-    return _features(indirect, *link_summary(power, is_direct), frequency_hz, context=context)
+    link_state, gain_db = sums.states_and_gains()
+    return _features(indirect, link_state[0], gain_db[0], frequency_hz, context=context)
 
 
 def _features(

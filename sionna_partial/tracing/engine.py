@@ -87,9 +87,15 @@ def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> 
     rt = load_sionna()
     scene = rt.load_scene(str(scene_xml), merge_shapes=False)
     scene.frequency = frequency_hz
-    polarization = "V" if polarisations == 1 else "VH"
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+    set_antennas(scene, polarisations)
     return scene
+
+
+def set_antennas(scene: Any, polarisations: int) -> None:
+    """Give a scene isotropic antennas: vertical, or V and H for 2 polarisations."""
+    array = load_sionna().PlanarArray
+    polarization = "V" if polarisations == 1 else "VH"
+    scene.tx_array = scene.rx_array = array(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
 
 
 class _IncoherentScene:
@@ -133,26 +139,25 @@ class _Verification:
         return buffer
 
     def evaluate(
-        self, scene: Any, buffer: Any, source: Any, targets: Any, samples_per_tx: int, diffraction: bool
+        self, scene: Any, buffer: Any, source: Any, targets: Any, field: tuple[int, Any], diffraction: bool
     ) -> Any:
-        """Return a buffer of verified candidates with their coefficients."""
+        """Return verified candidates with their coefficients, for a number of samples and patterns of antennas."""
         import drjit as dr
         import mitsuba as mi
 
         still = dr.zeros(mi.Point3f, dr.width(source)), dr.zeros(mi.Point3f, dr.width(targets))
         dr.make_opaque(*still)
-        patterns = scene.tx_array.antenna_pattern.patterns
         return self._field_calculator(
             wavelength=scene.wavelength,
             paths=buffer,
-            samples_per_src=samples_per_tx,
+            samples_per_src=field[0],
             diffraction=diffraction,
             src_positions=source,
             tgt_positions=targets,
             src_orientations=still[0],
             tgt_orientations=still[1],
-            src_antenna_patterns=patterns,
-            tgt_antenna_patterns=patterns,
+            src_antenna_patterns=field[1],
+            tgt_antenna_patterns=field[1],
         )
 
 
@@ -224,18 +229,16 @@ class HeldPaths:
 class SceneSolver:
     """Verifies candidates in one exported scene.
 
-    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none. Transfer
-    matrices of paths are for 1 or 2 polarisations.
+    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none. Antennas
+    are vertically polarised, but for those of `polarised`.
     """
 
-    def __init__(
-        self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings, polarisations: int = 1
-    ) -> None:
+    def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
         load_sionna()
         from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
 
-        self._settings = settings
-        self._scene = open_scene(scene_xml, settings.frequency_hz, polarisations)
+        self._scene = open_scene(scene_xml, settings.frequency_hz)
+        self._field = settings.samples_per_tx, self._scene.tx_array.antenna_pattern.patterns
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
         self.shapes = [shape.mi_mesh for shape in objects]
         faces = [mesh.face_count() for mesh in self.shapes]
@@ -248,6 +251,13 @@ class SceneSolver:
         primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
         self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
         self._symbolic, self._evaluated = _Verification("symbolic"), _Verification("evaluated")
+
+    def polarised(self, polarisations: int) -> "SceneSolver":
+        """Return the same solver of the same scene with transfer matrices of 1 or 2 polarisations."""
+        solver = copy(self)
+        set_antennas(self._scene, polarisations)
+        solver._field = self._field[0], self._scene.tx_array.antenna_pattern.patterns
+        return solver
 
     @property
     def materials(self) -> dict[str, Floats]:
@@ -272,7 +282,7 @@ class SceneSolver:
             return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
         ends, diffraction = (_points(tx_m[None]), _points(rx_m)), candidates.wedges is not None
         buffer = self._symbolic.verify(self._scene, self._buffer(candidates), *ends, diffraction)
-        buffer = self._symbolic.evaluate(self._scene, buffer, *ends, self._settings.samples_per_tx, diffraction)
+        buffer = self._symbolic.evaluate(self._scene, buffer, *ends, self._field, diffraction)
         return _read_buffer(buffer, tx_m, rx_m)
 
     def moved(
@@ -347,7 +357,7 @@ class SceneSolver:
         """Squared magnitude of the coefficients of verified paths."""
         import drjit as dr
 
-        buffer = verification.evaluate(self._scene, buffer, *ends, self._settings.samples_per_tx, diffraction)
+        buffer = verification.evaluate(self._scene, buffer, *ends, self._field, diffraction)
         a = buffer.a[0][0]
         return dr.select(buffer.valid, dr.square(a.real) + dr.square(a.imag), 0.0)
 

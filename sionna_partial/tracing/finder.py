@@ -3,24 +3,28 @@
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import Progress
+from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_mesh_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
 from sionna_partial.tracing.candidates import Candidates, Wedges
-from sionna_partial.tracing.engine import SceneSolver
+from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, set_antennas
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.sequences import shoot_rays
-from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
+from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION, SolvedPaths
+from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
 CANDIDATES_AT_ONCE = 100_000
@@ -29,12 +33,17 @@ CANDIDATES_AT_ONCE = 100_000
 _Blocks = Iterator[tuple[Candidates, float, str]]
 """Candidates, the fraction of them that is listed with these, and what is being done."""
 
+Found = tuple[Candidates | None, SolvedPaths]
+"""Paths in scene coordinates, and the candidates that they were, one for one; None where rays found them."""
 
-class FoundPaths(NamedTuple):
-    """Candidates that are paths, and these paths, in scene coordinates."""
+TABLE_SIZE = 3_000_000
+"""Entries of the hash table, at least: more lose fewer paths where refraction makes many, and take more memory."""
 
-    candidates: Candidates
-    paths: SolvedPaths
+SAME_POINT_M = 0.03
+"""Paths of the same interactions at points closer than this are one path [m]."""
+
+SAME_EDGE_M = 1e-3
+"""Distance from an edge within which a diffraction is at that edge [m]."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +56,7 @@ class PlanScene:
     geometry: SceneGeometry
     wedges: Wedges
 
-    def paths(
-        self, solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
-    ) -> Iterator[FoundPaths]:
+    def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths between a transmitter (3,) and receivers (N, 3) that are strong enough to matter."""
         kinds = self._kinds(Room.of(self.geometry, tx_m, rx_m))
         ends = (0.0, 1.0) if len(kinds) == 1 else (0.0, 0.2, 1.0)
@@ -78,12 +85,10 @@ class MeshScene:
     xml: Path
     shapes: tuple[str, ...]
     settings: TraceSettings
-    vertices_m: NDArray[np.float64]
+    vertices_m: Floats
     triangles: NDArray[np.int64]
 
-    def paths(
-        self, solver: SceneSolver, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64], report: Progress
-    ) -> Iterator[FoundPaths]:
+    def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths likewise, by the sequences of planes that rays meet."""
         depth = self.settings.max_depth
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, self.settings.samples_per_tx, depth)
@@ -94,6 +99,35 @@ class MeshScene:
             return ((*block, "verifying reflections") for block in kind.blocks(strengths))
 
         return _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
+
+
+@dataclass(frozen=True)
+class ExactFinder:
+    """Finds paths by verifying candidates."""
+
+    written: PlanScene | MeshScene
+    solver: SceneSolver
+
+    def paths(self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress) -> Iterator[Found]:
+        """Find the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m]."""
+        return self.written.paths(self.solver.polarised(polarisations), tx_m, rx_m, report)
+
+
+class RayFinder:
+    """Finds most paths, of any kind, by Sionna RT's public path solver."""
+
+    def __init__(self, written: PlanScene | MeshScene) -> None:
+        self._written, self._scene = written, open_scene(written.xml, written.settings.frequency_hz)
+
+    def paths(self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress) -> Iterator[Found]:
+        """Find the paths likewise."""
+        settings = self._written.settings
+        set_antennas(self._scene, polarisations)
+        for number, paths in enumerate(stock_paths(self._scene, settings, tx_m, rx_m), start=1):
+            report(number / len(rx_m), f"shooting rays to {len(rx_m)} receivers")
+            if isinstance(self._written, PlanScene):
+                paths = paths.take(diffracted_as_exact(self._written.wedges, paths, settings.diffraction_walls))
+            yield None, paths
 
 
 def write_scene_of(
@@ -117,11 +151,11 @@ def write_scene_of(
 def _strong_paths(
     solver: SceneSolver,
     listed: Callable[[Strengths], _Blocks],
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
+    tx_m: Floats,
+    rx_m: Floats,
     settings: TraceSettings,
     report: Progress,
-) -> Iterator[FoundPaths]:
+) -> Iterator[Found]:
     """Verify the candidates that are strong enough to matter.
 
     First the bounds of all candidates are added up. Those that a link can do without, if its strongest candidates are
@@ -145,20 +179,20 @@ def _strong_paths(
         if not more.any():
             return
         strengths = bounds._replace(first=done, last=np.where(more, needed, 0), power=bounds.power[:0])
-        for found in _verified(solver, listed(strengths), tx_m, rx_m, part_of(report, low, high)):
-            indirect = ~found.paths.is_direct
-            np.add.at(power, found.paths.path_rx[indirect], np.abs(found.paths.a[indirect]) ** 2)
-            yield found
+        for candidates, paths in _verified(solver, listed(strengths), tx_m, rx_m, part_of(report, low, high)):
+            indirect = ~paths.is_direct
+            np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
+            yield candidates, paths
         done, expected = needed, power
 
 
 def _verified(
     solver: SceneSolver,
     blocks: _Blocks,
-    tx_m: NDArray[np.float64],
-    rx_m: NDArray[np.float64],
+    tx_m: Floats,
+    rx_m: Floats,
     report: Progress,
-) -> Iterator[FoundPaths]:
+) -> Iterator[Found]:
     """Verify candidates, many blocks of one kind at once."""
     waiting: list[Candidates] = []
     doing = ""
@@ -170,8 +204,119 @@ def _verified(
                 part = together.rows(np.arange(start, min(start + CANDIDATES_AT_ONCE, len(together.rx))))
                 paths, rows = solver.verify(part, tx_m, rx_m)
                 report(fraction, doing)
-                yield FoundPaths(part.rows(rows), paths)
+                yield part.rows(rows), paths
             waiting = []
         if candidates is not None and len(candidates.rx):
             waiting.append(candidates)
             doing = message
+
+
+def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats) -> Iterator[SolvedPaths]:
+    """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
+
+    `scene` comes from `open_scene`; positions and paths are in its coordinates. Most paths are found, not all: the more
+    rays, the more. Sionna RT counts the sequences of surfaces that rays meet in a hash table which all receivers of a
+    call share, where a collision drops a path: each receiver has a call of its own, and its paths do not depend on the
+    others. Sionna RT 2.2 takes paths that are reflected after a diffraction, and have fewer than `max_depth`
+    interactions, for longer than they are, and some dB too weak. Raises a BackendError if LLVM or Sionna RT cannot be
+    used.
+    """
+    if len(rx_m) == 0:
+        return
+    rt = load_sionna()
+    try:
+        receiver = rt.Receiver("rx", position=_point(rx_m[0]))
+        for device in (rt.Transmitter("tx", position=_point(tx_m)), receiver):
+            scene.remove(device.name)
+            scene.add(device)
+        solver = rt.PathSolver(deterministic=True)
+        for index, position_m in enumerate(rx_m):
+            receiver.position = _point(position_m)
+            yield _read_paths(solver(scene, **_options(settings)), max(1, settings.max_depth), index, tx_m, rx_m)
+    except Exception as error:
+        raise BackendError(
+            f"Sionna RT {metadata.version('sionna-rt')} cannot solve the paths ({error!r}): lower samples_per_tx if "
+            "memory ran out, or run pip install sionna-partial again."
+        ) from error
+
+
+def _point(position_m: Floats) -> Any:
+    """Position as an array on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
+    import mitsuba as mi
+
+    return mi.Point3f(*(mi.Float([float(value)]) for value in position_m))
+
+
+def _options(settings: TraceSettings) -> dict[str, Any]:
+    """Arguments of Sionna RT's path solver."""
+    diffraction, rays = settings.diffraction is True, settings.samples_per_tx
+    every_ray = 1 + rays * settings.max_depth if settings.diffuse_reflection else 0
+    return {
+        "max_depth": settings.max_depth,
+        "max_num_paths_per_src": max(TABLE_SIZE, every_ray),
+        "samples_per_src": rays,
+        "los": True,
+        "specular_reflection": True,
+        "diffuse_reflection": settings.diffuse_reflection,
+        "refraction": settings.refraction,
+        "diffraction": diffraction,
+        "edge_diffraction": diffraction,
+        "seed": settings.seed,
+    }
+
+
+def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) -> SolvedPaths:
+    """Copy the valid paths of one receiver out of Dr.Jit, each once."""
+    real, imaginary = (np.transpose(part.numpy()[0, :, 0], (2, 0, 1)) for part in found.a)
+    transfer = real + 1j * imaginary
+    valid = np.flatnonzero(found.valid.numpy().ravel() & (transfer[:, 0, 0] != 0.0))
+    interactions = found.interactions.numpy().reshape(depth, -1)[:, valid].T.astype(np.uint8)
+    vertices_m = np.moveaxis(found.vertices.numpy().reshape(depth, -1, 3)[:, valid], 0, 1)
+    kept = ~listed_before(interactions, vertices_m)
+    return SolvedPaths.of_vertices(
+        path_rx=np.full(kept.sum(), index, np.int32),
+        transfer=transfer[valid][kept].astype(np.complex128),
+        delay_s=found.tau.numpy().ravel()[valid].astype(np.float64)[kept],
+        interactions=interactions[kept],
+        vertices_m=vertices_m[kept],
+        tx_m=tx_m,
+        rx_m=rx_m,
+    )
+
+
+def listed_before(interactions: States, vertices_m: NDArray[np.floating[Any]]) -> Bools:
+    """Find the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
+
+    Sionna RT identifies sequences by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
+    a diffuse reflection are samples of a rough surface, however close, and never repeats.
+    """
+    repeated = np.zeros(len(interactions), dtype=bool)
+    exact = np.flatnonzero((interactions != DIFFUSE).all(axis=1))
+    points = np.where(interactions[exact, :, None] > 0, vertices_m[exact], 0.0)
+    tree = cKDTree(points.reshape(len(exact), 3 * interactions.shape[1]))
+    pairs = tree.query_pairs(SAME_POINT_M, p=np.inf, output_type="ndarray")
+    first, second = exact[pairs].T
+    repeated[second[(interactions[first] == interactions[second]).all(axis=1)]] = True
+    return repeated
+
+
+def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> Bools:
+    """Whether each path (P,) is diffracted as exact candidates are, if it is at all.
+
+    Sionna RT's rays are diffracted at the rims of floor and ceiling and at junctions of walls as well, and with any
+    number of reflections around it.
+    """
+    diffracted = (paths.interactions == DIFFRACTION).any(axis=1)
+    kept = ~diffracted
+    if diffracted.any() and len(wedges.edge_m):
+        which = (paths.interactions == DIFFRACTION).argmax(axis=1)
+        x, y, z = paths.vertices_m[np.arange(len(diffracted)), which][diffracted].T
+        beside = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))[0] < SAME_EDGE_M
+        reflected = paths.interactions[diffracted] == REFLECTION
+        height_m = paths.vertices_m[diffracted, :, 2]
+        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m - SAME_EDGE_M)
+        before = np.arange(reflected.shape[1]) < which[diffracted, None]
+        few = reflected.sum(axis=1) <= MAX_REFLECTIONS
+        few &= ((at_walls & before).sum(axis=1) <= walls_a_side) & ((at_walls & ~before).sum(axis=1) <= walls_a_side)
+        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
+    return kept

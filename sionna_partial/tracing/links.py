@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import require_choice
-from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
 from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.paths import SolvedPaths
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -46,7 +47,7 @@ class TracedLinks(Shown):
         Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
     vertices_m : (P, D, 3) float64 array
         Points of interaction [m]; NaN where there is none.
-    settings : TraceSettings
+    trace_settings : TraceSettings
         With `diffraction` True or False.
     scene_settings : SceneSettings
         With the map's material, if it has one.
@@ -73,7 +74,7 @@ class TracedLinks(Shown):
     arrival_rad: Floats
     interactions: NDArray[np.uint8]
     vertices_m: Floats
-    settings: TraceSettings
+    trace_settings: TraceSettings
     scene_settings: SceneSettings
 
     @property
@@ -300,9 +301,9 @@ class TracedLinks(Shown):
                 for name in names
             },
             coords=axes,
-            attrs={"frequency_hz": self.settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB},
+            attrs={"frequency_hz": self.trace_settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB},
         )
-        for name in ("settings", "scene_settings"):
+        for name in ("trace_settings", "scene_settings"):
             table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
         return table
 
@@ -417,3 +418,30 @@ _VARIABLES = {
     "interactions": _variable("Sionna RT's InteractionType in order from the transmitter, 0 for none"),
     "vertices_m": _variable("points of interaction", "m"),
 }
+
+
+class LinkSums:
+    """The power of links (T, N), and whether each is in sight, added up over their paths, some at a time."""
+
+    def __init__(self, transmitters: int, receivers: int) -> None:
+        self._shape = transmitters, receivers
+        self.power, self._is_direct = np.zeros(transmitters * receivers), np.zeros(transmitters * receivers, dtype=bool)
+
+    def add(self, paths: SolvedPaths) -> None:
+        """Add some of the paths."""
+        link = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx
+        np.add.at(self.power, link, paths.power)
+        self._is_direct[link[paths.is_direct]] = True
+
+    def states_and_gains(self) -> tuple[States, Floats]:
+        """Return link state and path gain [dB] (T, N)."""
+        gain_db = path_gain_db(self.power)
+        link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
+        link_state[self._is_direct] = LinkState.LOS
+        return link_state.reshape(self._shape), gain_db.reshape(self._shape)
+
+
+def path_gain_db(power: Floats) -> Floats:
+    """Omnidirectional path gain [dB], at least -150, of links whose paths have |a|^2 in sum (paper, eq. 5)."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)

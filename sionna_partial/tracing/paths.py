@@ -37,6 +37,12 @@ class SolvedPaths:
         return self.transfer[:, 0, 0]
 
     @property
+    def power(self) -> Floats:
+        """Squared magnitude |a|^2 of each path (P,)."""
+        power: Floats = np.abs(self.a) ** 2
+        return power
+
+    @property
     def is_direct(self) -> Bools:
         """Whether each path (P,) is the line of sight."""
         return (self.interactions == 0).all(axis=1)

@@ -1,0 +1,478 @@
+"""Simulation: the paths from transmitters to receivers in a map, found by Sionna RT."""
+
+import itertools
+import logging
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.checks import Progress, no_progress, require, require_choice, settings_or_default
+from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
+from sionna_partial.files import atomic_files, temporary_folder
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap, position_array
+from sionna_partial.progress import part_of, reporting
+from sionna_partial.scene.scene import scene_settings_of
+from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
+from sionna_partial.tracing.finder import ExactFinder, Found, RayFinder, write_scene_of
+from sionna_partial.tracing.links import LinkSums, TracedLinks
+from sionna_partial.tracing.path_set import PathParameters, PathSet
+from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
+
+InvalidLinks = Literal["raise", "nan"]
+"""What becomes of links that cannot be traced."""
+
+_log = logging.getLogger(__name__)
+
+SHORTEST_M = 0.011
+"""Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
+
+RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 6_000, 50_000
+"""Number of receivers whose paths are found together, which bounds the memory. A mesh has fewer paths, and costs rays
+each time."""
+
+SAMPLE = 100
+"""Number of receivers from which the number of all paths is estimated."""
+
+
+class Simulation:
+    """The paths of any links in one map, found by Sionna RT: the forward model.
+
+    It loads the scene when the first paths are asked for, and keeps it, and all that Dr.Jit compiles for it, for later
+    calls: a second call takes a part of the time of the first. What takes a map and traces takes a simulation, too.
+
+    Parameters
+    ----------
+    scene : PartialMap or path
+        What is known of the building; unknown space is free.
+    trace_settings : TraceSettings, optional
+    scene_settings : SceneSettings, optional
+
+    Attributes
+    ----------
+    partial : PartialMap
+    trace_settings : TraceSettings
+        With defaults in place of None, as `scene_settings`.
+    scene_settings : SceneSettings
+
+    Raises
+    ------
+    MapError
+        If the map cannot be read.
+    SettingsError
+        For a frequency that a material does not cover, or settings of another kind.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import sionna_partial as sp
+    >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
+    >>> simulation = sp.Simulation(field, scene_settings=sp.SceneSettings(floor_extent="none"))
+    >>> [simulation.links((1.0, 1.0, 1.5), [(x, 1.0, 1.5)]).gain_db.item() for x in (3.0, 5.0)]
+    [-67.4, -73.4]
+    """
+
+    def __init__(
+        self,
+        scene: PartialMap | str | Path,
+        trace_settings: TraceSettings | None = None,
+        scene_settings: SceneSettings | None = None,
+    ) -> None:
+        self.partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+        self.trace_settings, self.scene_settings = checked_settings(self.partial, trace_settings, scene_settings)
+        self._origin_m = np.array([*self.partial.origin_m, 0.0])
+
+    def links(
+        self,
+        tx: ArrayLike,
+        rx: ArrayLike,
+        *,
+        polarisations: Literal[1, 2] = 2,
+        folder: str | Path | None = None,
+        memory_gb: float = MEMORY_GB,
+        invalid: InvalidLinks = "raise",
+        progress: Progress | bool | None = None,
+    ) -> TracedLinks:
+        """Trace every path from one or more transmitters to N receivers: see `trace_links`.
+
+        Parameters
+        ----------
+        tx : (3,) or (T, 3) array-like
+            Transmitter positions [m].
+        rx : (N, 3) array-like
+            Receiver positions [m]; N may be 0.
+        polarisations : {2, 1}
+            1 traces vertical polarisation alone, which takes a quarter of the memory for `TracedLinks.transfer`.
+        folder, memory_gb, invalid, progress
+            As of `trace_links`.
+
+        Returns
+        -------
+        TracedLinks
+        """
+        require_choice("invalid", invalid, get_args(InvalidLinks))
+        require(polarisations in (1, 2), "polarisations", polarisations, "give 1 or 2.")
+        if invalid == "nan":
+            tx_m, rx_m, valid = valid_links(self.partial, tx, rx, self.trace_settings.frequency_hz)
+        else:
+            tx_m, rx_m = checked_positions(self.partial, tx, rx, self.trace_settings.frequency_hz)
+            valid = np.ones((len(tx_m), len(rx_m)), dtype=bool)
+        ends: dict[str, Any] = {"tx": tx_m.reshape(np.shape(tx)), "rx": rx_m}
+        room = max(1, self.trace_settings.max_depth), polarisations
+        settings: dict[str, Any] = {"trace_settings": self.trace_settings, "scene_settings": self.scene_settings}
+        with reporting(progress) as report:
+            report(0.0, "building the scene")
+            self._require_memory(tx_m, rx_m, None if folder is not None else memory_gb, valid, path_bytes(*room))
+            part = part_of(report, 0.1, 1.0)
+            if folder is None:
+                columns = PathColumns(*room)
+                ends |= self._fill(columns, tx_m, rx_m, valid, part, polarisations)
+                return TracedLinks(**_shaped(ends), **vars(columns.paths()), **settings)
+            with atomic_files(folder) as files:
+                paths = PathFiles(room[0], files, polarisations)
+                ends |= self._fill(paths, tx_m, rx_m, valid, part, polarisations)
+                paths.close()
+                for name, values in _shaped(ends).items():
+                    np.save(files / f"{name}.npy", values)
+        names = [field.name for field in fields(TracedLinks) if field.name not in settings]
+        stored: dict[str, Any] = {name: np.load(Path(folder) / f"{name}.npy", mmap_mode="r") for name in names}
+        return TracedLinks(**stored, **settings)
+
+    def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> PathSet:
+        """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], which can be differentiated.
+
+        Returns
+        -------
+        PathSet
+
+        Raises
+        ------
+        PositionError
+            As `trace_links`.
+        SettingsError
+            For paths that only rays find.
+        BackendError
+            If LLVM or Sionna RT cannot be used, or Sionna RT is another than the fast engine was made for.
+        """
+        tx_m, rx_m = checked_positions(self.partial, tx, rx, self.trace_settings.frequency_hz)
+        tx_m, rx_m = tx_m.reshape(np.shape(tx)).copy(), rx_m.copy()
+        with reporting(progress) as report:
+            found = PathSet.joined([PathSet(self, tx_m, rx_m, []), *self.path_blocks(tx_m, rx_m, report)])
+            report(1.0, "traced")
+        return found
+
+    def blocks(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
+        """Find all paths from a transmitter (3,) to receivers (N, 3) that have been checked, some at a time."""
+        for group in self._groups(tx_m[None], rx_m, [np.arange(len(rx_m))], report):
+            yield from (paths for _, paths in group)
+        report(1.0, "traced")
+
+    def path_blocks(
+        self, tx_m: Floats, rx_m: Floats, report: Progress, rx_of_tx: Iterable[Indices] | None = None
+    ) -> Iterator[PathSet]:
+        """Find the paths of `paths` some at a time, for positions that have been checked.
+
+        `rx_of_tx` selects the receivers of each transmitter, in place of all of them.
+        """
+        sources_m = tx_m.reshape(-1, 3)
+        chosen = [np.arange(len(rx_m))] * len(sources_m) if rx_of_tx is None else rx_of_tx
+        for group in self._groups(sources_m, rx_m, chosen, report):
+            for candidates, paths in group:
+                if candidates is not None:
+                    yield PathSet(self, tx_m, rx_m, [(replace(candidates, rx=paths.path_rx), paths)])
+
+    @property
+    def solver(self) -> SceneSolver:
+        """The solver of candidates in scene coordinates; raises what `require_exact` does."""
+        self.require_exact()
+        assert isinstance(self._finder, ExactFinder)
+        return self._finder.solver
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the M radio materials, in the order of `PathParameters`."""
+        return tuple(self.solver.materials)
+
+    def parameters(self, tx_m: ArrayLike) -> PathParameters:
+        """Return those of the scene, with transmitters (3,) or (T, 3) [m]."""
+        permittivity, conductivity_s_m, thickness_m = np.reshape([*self.solver.materials.values()], (-1, 3)).T
+        return PathParameters(
+            tx_m=np.array(tx_m, dtype=np.float64),
+            relative_permittivity=permittivity,
+            conductivity_s_m=conductivity_s_m,
+            thickness_m=thickness_m,
+            frequency_hz=np.array(self.trace_settings.frequency_hz),
+        )
+
+    def require_frequency(self, frequency_hz: float) -> None:
+        """Raise a SettingsError unless all materials cover a frequency [Hz]."""
+        settings = replace(self.trace_settings, frequency_hz=float(frequency_hz))
+        checked_settings(self.partial, settings, self.scene_settings)
+
+    def require_exact(self) -> None:
+        """Raise a SettingsError for paths that only rays find, and a BackendError where they must find all."""
+        for name in self._only_by_rays:
+            remedy = "paths that are found by shooting rays have no gradients: give False"
+            require(False, name, True, f"{remedy}, and trace_links for the gain alone.")
+        if engine_fault():
+            raise BackendError(f"Gradients need the fast engine, and {engine_fault()}: {REMEDY}")
+
+    def in_scene(self, points_m: Floats) -> Floats:
+        """Return points (..., 3) [m] of the world in coordinates of the scene, whose origin the map's corner is."""
+        return points_m - self._origin_m
+
+    def in_world(self, points_m: Floats) -> Floats:
+        """Return points of the scene in coordinates of the world."""
+        return points_m + self._origin_m
+
+    @property
+    def _only_by_rays(self) -> list[str]:
+        """Settings that ask for paths which only rays find."""
+        names = "refraction", "diffuse_reflection", *(() if self.partial.mesh is None else ("diffraction",))
+        return [name for name in names if getattr(self.trace_settings, name)]
+
+    @cached_property
+    def _finder(self) -> ExactFinder | RayFinder:
+        """What finds the paths, with the scene in memory; a warning is logged where only rays do."""
+        if self._only_by_rays:
+            names = [f"{name} on a mesh" if name == "diffraction" else name for name in self._only_by_rays]
+            message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
+            _log.warning(message, " and ".join(names).replace("_", " "), self.trace_settings.samples_per_tx)
+        with temporary_folder() as folder:
+            scene = write_scene_of(self.partial, folder, self.trace_settings, self.scene_settings)
+            if self._only_by_rays or engine_fault():
+                return RayFinder(scene)
+            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, self.trace_settings))
+
+    def _groups(
+        self, tx_m: Floats, rx_m: Floats, rx_of_tx: Iterable[Indices], report: Progress, polarisations: int = 1
+    ) -> Iterator[Iterator[Found]]:
+        """Find the paths from transmitters (T, 3) to some receivers each, for so many receivers at once as fit."""
+        at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
+        groups = [
+            (tx, chosen[start : start + at_once].astype(np.int32))
+            for tx, chosen in enumerate(rx_of_tx)
+            for start in range(0, len(chosen), at_once)
+        ]
+        for number, (tx, chosen) in enumerate(groups):
+            part = part_of(report, number / len(groups), (number + 1) / len(groups))
+            yield self._group(tx, chosen, tx_m[tx], rx_m[chosen], part, polarisations)
+
+    def _group(
+        self, tx: int, chosen: NDArray[np.int32], tx_m: Floats, rx_m: Floats, report: Progress, polarisations: int
+    ) -> Iterator[Found]:
+        ends = self.in_scene(tx_m), self.in_scene(rx_m)
+        for candidates, paths in self._finder.paths(*ends, polarisations, report):
+            if len(paths.a):
+                world = replace(paths, vertices_m=self.in_world(paths.vertices_m))
+                yield candidates, world.between(tx, chosen)
+
+    def _fill(
+        self,
+        columns: PathColumns | PathFiles,
+        tx_m: Floats,
+        rx_m: Floats,
+        valid: Bools,
+        report: Progress,
+        polarisations: int,
+    ) -> dict[str, Any]:
+        """Trace the links of a mask (T, N) into columns of paths; return their states and gains [dB]."""
+        sums = LinkSums(*valid.shape)
+        for group in self._groups(tx_m, rx_m, map(np.flatnonzero, valid), report, polarisations):
+            parts = [paths for _, paths in group]
+            columns.append(parts)
+            for paths in parts:
+                sums.add(paths)
+        report(1.0, "traced")
+        link_state, gain_db = sums.states_and_gains()
+        link_state[~valid], gain_db[~valid] = NO_RECEIVER, np.nan
+        return {"link_state": link_state, "gain_db": gain_db}
+
+    def _require_memory(
+        self, tx_m: Floats, rx_m: Floats, memory_gb: float | None, valid: Bools, bytes_each: int
+    ) -> None:
+        """Log how much memory the paths of a large job take, estimated from some of its receivers.
+
+        Raises a MemoryLimitError if that is more than `memory_gb`.
+        """
+        if valid.sum() <= RECEIVERS_OF_PLAN:
+            return
+        source = int(valid.sum(axis=1).argmax())
+        all_m = rx_m[valid[source]]
+        some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
+        found = sum(len(paths.a) for paths in self.blocks(tx_m[source], some, no_progress))
+        count = round(found / len(some) * valid.sum())
+        size_gb = 2 * count * bytes_each / 1e9
+        _log.info("about %d paths, which take %.1f GB", count, size_gb)
+        if memory_gb is not None and size_gb > memory_gb:
+            raise MemoryLimitError(
+                f"memory_gb = {memory_gb:g} is too little for about {count:,} paths, which take {size_gb:.1f} GB: give "
+                "a folder for the paths, fewer receivers, or more memory_gb."
+            )
+
+
+def _shaped(ends: dict[str, Any]) -> dict[str, Any]:
+    """Give what belongs to links (T, N) the shape (N,) if there is one transmitter (3,)."""
+    shape = (*ends["tx"].shape[:-1], len(ends["rx"]))
+    return {name: each if name in ("tx", "rx") else each.reshape(shape) for name, each in ends.items()}
+
+
+def simulation_of(
+    scene: "PartialMap | str | Path | Simulation",
+    trace_settings: TraceSettings | None = None,
+    scene_settings: SceneSettings | None = None,
+) -> Simulation:
+    """Return a simulation as it is, or make one of a map; a simulation has its settings."""
+    if not isinstance(scene, Simulation):
+        return Simulation(scene, trace_settings, scene_settings)
+    for name, value in (("trace_settings", trace_settings), ("scene_settings", scene_settings)):
+        require(value is None, name, value, "the Simulation that was given has its own: leave it out.")
+    return scene
+
+
+def trace_links(
+    scene: "PartialMap | str | Path | Simulation",
+    tx: ArrayLike,
+    rx: ArrayLike,
+    *,
+    trace_settings: TraceSettings | None = None,
+    scene_settings: SceneSettings | None = None,
+    folder: str | Path | None = None,
+    memory_gb: float = MEMORY_GB,
+    invalid: InvalidLinks = "raise",
+    progress: Progress | bool | None = None,
+) -> TracedLinks:
+    """Trace every path from one or more transmitters to N receivers with Sionna RT.
+
+    On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge of the walls
+    (corners, door jambs) and at most two reflections around it are complete, but for legs of 1 cm or less, which Sionna
+    RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays determine
+    the sequences of planes; line of sight and nearly all specular reflections are found. With refraction, diffuse
+    reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver shoots rays instead, receiver by
+    receiver, which is slow and finds most paths, not all. It also does with another release of Sionna RT than 2.2. The
+    answer for a receiver does not depend on the other receivers.
+
+    Parameters
+    ----------
+    scene : PartialMap, path or Simulation
+        What is known of the building; unknown space is free (paper, Section III-B). A simulation stays warm.
+    tx : (3,) or (T, 3) array-like
+        Transmitter positions [m].
+    rx : (N, 3) array-like
+        Receiver positions [m]; N may be 0.
+    trace_settings : TraceSettings, optional
+    scene_settings : SceneSettings, optional
+    folder : path, optional
+        Where the paths are written while they are traced, an `.npy` file for each array. The arrays of the result are
+        then read from there when they are needed, and `memory_gb` does not limit them.
+    memory_gb : float
+        How much memory the paths may take [GB]. Their size is estimated first, from some of the receivers.
+    invalid : {"raise", "nan"}
+        What becomes of links whose receiver can stand nowhere (it is not finite, outside the map, in a wall, not
+        between floor and ceiling) or is at the transmitter: an error, or a link without paths, of link state 255 and
+        gain NaN.
+    progress : bool or callable, optional
+        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
+        terminals and notebooks after 2 s.
+
+    Returns
+    -------
+    TracedLinks
+
+    Raises
+    ------
+    MemoryLimitError
+        If the paths would take more than `memory_gb`.
+    PositionError
+        For a transmitter or receiver that is not finite, outside the map or inside a wall, or a receiver within 1.1 cm
+        of a transmitter (at low frequencies, where Friis' formula is above 0 dB); with "nan" for a transmitter only.
+    SettingsError
+        For a frequency that a material does not cover, settings of another kind, or another value of `invalid`.
+    BackendError
+        If LLVM or Sionna RT cannot be used.
+    OutputError
+        If no temporary file can be written.
+
+    Examples
+    --------
+    In free space, the gain at a distance of 2 m is 20 log10(wavelength / (4 pi 2 m)), at 28 GHz:
+
+    >>> import numpy as np
+    >>> import sionna_partial as sp
+    >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
+    >>> open_air = sp.SceneSettings(floor_extent="none")
+    >>> links = sp.trace_links(field, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)], scene_settings=open_air)
+    >>> links.gain_db.round(2).tolist()
+    [-67.41]
+    """
+    simulation = simulation_of(scene, trace_settings, scene_settings)
+    return simulation.links(tx, rx, folder=folder, memory_gb=memory_gb, invalid=invalid, progress=progress)
+
+
+def checked_settings(
+    partial: PartialMap, trace_settings: TraceSettings | None, scene_settings: SceneSettings | None
+) -> tuple[TraceSettings, SceneSettings]:
+    """Put defaults in place of None, and the map's material in place of the settings'.
+
+    Raises a SettingsError unless all materials cover the frequency.
+    """
+    settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
+    scene_settings = scene_settings_of(partial, scene_settings)
+    default = scene_settings.material
+    for material in {default} if partial.mesh is None else partial.mesh.used_materials(default):
+        material.require_frequency(settings.frequency_hz)
+    if settings.diffraction is None:
+        settings = replace(settings, diffraction=partial.mesh is None)
+    return settings, scene_settings
+
+
+def nearest_m(frequency_hz: float) -> float:
+    """Shortest distance of a link [m]: Sionna RT takes none of 1 cm, and Friis' formula is above 0 dB nearer by."""
+    return max(SHORTEST_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi))
+
+
+def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
+    """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
+    clear: Bools = partial.state_at(points_m) != CellState.WALL
+    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
+        clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
+    return clear
+
+
+def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats]:
+    """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
+    tx_m, rx_m = partial.require_positions("tx", tx), _receivers(rx)
+    partial.require_positions("rx", rx_m)
+    tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
+    for source_m in tx_m:
+        distance_m = np.linalg.norm(rx_m - source_m, axis=1)
+        if distance_m.min(initial=math.inf) < limit_m:
+            index = int(distance_m.argmin())
+            raise PositionError(
+                f"rx[{index}] = {tuple(rx_m[index].tolist())} is {distance_m[index]:.3g} m from the transmitter, where "
+                f"the path gain has no meaning: leave out receivers nearer than {limit_m:.3g} m."
+            )
+    return tx_m, rx_m
+
+
+def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats, Bools]:
+    """Return transmitters (T, 3) and receivers (N, 3) [m], and whether `checked_positions` takes each link (T, N)."""
+    tx_m, rx_m = partial.require_positions("tx", tx).reshape(-1, 3), _receivers(rx)
+    far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
+    return tx_m, rx_m, far & partial.radios_can_stand(rx_m)
+
+
+def _receivers(rx: ArrayLike) -> Floats:
+    with suppress(ValueError):  # nested lists of unequal lengths have no size
+        rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
+    return position_array("rx", rx).reshape(-1, 3)
