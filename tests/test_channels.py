@@ -109,7 +109,7 @@ class TestTransfer:
     def test_paths_of_rays(self) -> None:
         """Sionna RT's public solver gives the same matrices."""
         exact = links_of(1)
-        settings = replace(exact.settings, refraction=True, samples_per_tx=20_000)
+        settings = replace(exact.trace_settings, refraction=True, samples_per_tx=20_000)
         shot = sp.trace_links(_room(), TX, RX, trace_settings=settings)
         found = 0
         for path in range(len(exact.a)):
@@ -123,7 +123,12 @@ class TestTransfer:
 
     def test_paths_on_disk(self, several: sp.TracedLinks, tmp_path: Path) -> None:
         stored = sp.trace_links(
-            _room(), several.tx, several.rx, trace_settings=several.settings, invalid="nan", folder=tmp_path / "paths"
+            _room(),
+            several.tx,
+            several.rx,
+            trace_settings=several.trace_settings,
+            invalid="nan",
+            folder=tmp_path / "paths",
         )
         assert isinstance(stored.transfer, np.memmap)
         for synthetic_array in (True, False):

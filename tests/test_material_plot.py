@@ -32,7 +32,7 @@ def calibration(
         materials=materials,
         posteriors=(open_now,) * len(materials),
         scene=sp.PartialMap(np.zeros((2, 2), dtype=np.uint8), 0.1),
-        settings=sp.TraceSettings(),
+        trace_settings=sp.TraceSettings(),
     )
 
 

@@ -24,4 +24,4 @@ def made_links(tx: ArrayLike, rx: ArrayLike, **columns: Any) -> TracedLinks:
         "interactions": np.zeros((count, 1), dtype=np.uint8),
         "vertices_m": np.full((count, 1, 3), np.nan),
     }
-    return TracedLinks(tx=tx, rx=rx, settings=TraceSettings(), scene_settings=SceneSettings(), **usual | columns)
+    return TracedLinks(tx=tx, rx=rx, trace_settings=TraceSettings(), scene_settings=SceneSettings(), **usual | columns)
