@@ -1,7 +1,11 @@
 """Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and what can be asked of one."""
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from typing import Any
 
@@ -14,15 +18,20 @@ from sionna_partial.checks import number_of, real_array, require, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
 WALL_PARTS = 6
 """`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
+
+MAX_RECEIVERS = 2_000_000
+"""Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
 
 TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
 """Positions [m] along the dimension "tx" of the maps of several transmitters."""
@@ -83,6 +92,93 @@ class Receivers:
     cell_state: States
     valid: Bools
     rx_m: Floats
+
+
+def grid_receivers(
+    partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
+) -> Receivers:
+    """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
+    require_height(partial, "rx_height_m", rx_height_m)
+    x_m, y_m = _grid_axes(partial, spacing_m)
+    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
+    limit_m = nearest_m(frequency_hz)
+    cell_state = partial.state_at(points)
+    far = np.ones(cell_state.shape, dtype=bool)
+    for each_m in tx_m:
+        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
+    valid = far & clear_of_walls(partial, points)
+    if not far.any() and limit_m > SHORTEST_M:
+        raise PositionError(
+            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
+            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
+        )
+    if not valid.any():
+        raise PositionError(
+            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
+            f"spacing_m = {spacing_m:g}, give a smaller one."
+        )
+    return Receivers(x_m, y_m, cell_state, valid, points[valid])
+
+
+def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
+    """Return the x (nx,) and y (ny,) of all cell centres that lie on the map [m]."""
+    low = partial.resolution_m / 10
+    require_number("spacing_m", spacing_m, low, 1e6)
+    x0, y0, x1, y1 = partial.bounds_m
+    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
+    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
+    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
+    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
+    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
+    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
+    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
+    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
+
+
+def link_columns(
+    phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
+) -> dict[str, NDArray[Any]]:
+    """Values (N,) of each variable that depends on the links."""
+    if anywhere:
+        prediction = prediction.anywhere(p_indoor)
+    columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
+        "p_indoor": p_indoor,
+        "partial_gain_db": phi.gain_db,
+        "unobserved_distance_m": phi.unobserved_distance_m,
+        "distance_m": phi.distance_m,
+    }
+    columns = {name: values.astype(np.float32) for name, values in columns.items()}
+    return columns | {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
+
+
+def provenance(simulation: Simulation, model: Predictor | None) -> dict[str, Any]:
+    """Global attributes on where the numbers come from; without a model the trace predicts.
+
+    No time of day: equal input gives equal files.
+    """
+    partial, trace_settings = simulation.partial, simulation.trace_settings
+    versions = {}
+    for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    source = ", ".join(f"{package} {number}" for package, number in versions.items())
+    return {
+        "Conventions": "CF-1.11",
+        "title": "Predicted radio coverage of a partially observed environment",
+        "source": source,
+        "history": "sionna_partial.predict_map",
+        "references": "Yin et al., Wireless Channel Prediction in Partially Observed Environments",
+        "frequency_hz": float(trace_settings.frequency_hz),
+        "gain_floor_db": GAIN_FLOOR_DB,
+        "map_resolution_m": partial.resolution_m,
+        "map_wall_height_m": partial.wall_height_m,
+        "map_observed_fraction": partial.observed_fraction,
+        "map_complete": int(model is None),
+        "scene_settings": json.dumps(asdict(simulation.scene_settings), sort_keys=True),
+        "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
+        "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
+        "predictor_sha256": "" if model is None else model.fingerprint,
+    }
 
 
 def coverage_map(

@@ -42,11 +42,11 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
+    "coverage": ("coverage_map", "link_model", "coverage", "network"),
     "channels": (
         *("responses", "beams", "files"),
         *("joint", "path_model", "path_training", "samples"),
     ),
-    "coverage": ("coverage_map", "coverage", "network"),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),

@@ -19,7 +19,7 @@ from sionna_partial.checks import Progress, require_number, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MemoryLimitError
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import SEEN_M, link_features, traced_unobserved_m
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
@@ -27,7 +27,7 @@ from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.links import TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths, path_order
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -152,7 +152,7 @@ class ChannelSamples(Shown):
 
 
 def sample_channels(
-    scene: PartialMap | str | Path,
+    scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike,
     rx: ArrayLike,
     n: int = 100,
@@ -217,7 +217,7 @@ def sample_channels(
     require_whole("n", n, 1, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    model = link_model_of(scene, predictor, trace_settings, scene_settings)
     size_gb = n * np.size(tx) / 3 * np.size(rx) / 3 * _DRAW_BYTES / 1e9
     if size_gb > memory_gb:
         raise MemoryLimitError(
@@ -226,22 +226,12 @@ def sample_channels(
         )
     with reporting(progress) as report:
         report(0.0, "tracing")
-        traced = trace_links(
-            partial,
-            tx,
-            rx,
-            trace_settings=trace_settings,
-            scene_settings=scene_settings,
-            memory_gb=memory_gb,
-            progress=False,
-        )
-        phi = link_features(partial, traced).flat()
-        if phi.context is not None and phi.context.complete.all():
-            prediction = LinkPrediction.of_trace(phi)
-        else:
-            prediction = Predictor.load(predictor).predict(phi)
+        traced = model.simulation.links(tx, rx, memory_gb=memory_gb, progress=False)
+        phi = link_features(model.partial, traced).flat()
+        assert phi.context is not None
+        prediction = model.predict_features(phi, phi.context.complete)
         report(0.5, "drawing")
-        draws = _Draws(partial, traced, prediction, n, seed)
+        draws = _Draws(model.partial, traced, prediction, n, seed)
         report(1.0, "done")
     shape = (n, *traced.gain_db.shape)
     return ChannelSamples(draws.state.reshape(shape), draws.gain_db.reshape(shape), memory_gb, draws)

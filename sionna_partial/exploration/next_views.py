@@ -25,12 +25,11 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage import POSITIONS, predict_map, transmitter_positions
 from sionna_partial.coverage_map import TX_COORDINATES, probability_above
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.link_model import POSITIONS, LinkModel, link_model_of, transmitter_positions
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
@@ -47,7 +46,7 @@ from sionna_partial.simulation.robot import (
     find_frontiers,
     wide_frontiers,
 )
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.simulation import Simulation, clear_of_walls
 
 GOALS = ("coverage", "state", "area")
 """What is to become known; the first is the default."""
@@ -188,7 +187,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
 
 
 def next_views(
-    scene: PartialMap | str | Path,
+    scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike | None = None,
     measurements: Any = None,
     goal: str = GOALS[0],
@@ -249,7 +248,8 @@ def next_views(
     >>> len(views), views[0].gain_per_m >= views[1].gain_per_m
     (3, True)
     """
-    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
+    model = link_model_of(scene)
+    partial = model.partial
     require_choice("goal", goal, GOALS)
     require_whole("count", count, 1, MOST_VIEWS)
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
@@ -258,10 +258,10 @@ def next_views(
     measured = None if measurements is None else measurements_of(measurements)
     of = None if goal == "state" else threshold_db
     if goal != "area" and tx is None and measured is not None and not measured.tx_known.any():
-        tx_m, uncertainty = _located(partial, measured, of)
+        tx_m, uncertainty = _located(model, measured, of)
     else:
         tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measured)
-        uncertainty = _uncertainty(partial, tx_m, measured, of)
+        uncertainty = _uncertainty(model, tx_m, measured, of)
     none = np.zeros(partial.shape, dtype=bool)
     radius = ROBOT_RADII_M[0] / partial.resolution_m
     frontiers = wide_frontiers(
@@ -286,7 +286,7 @@ def coverage_choice(
             return 0
         partial = replace(home, state=robot.seen.copy(), origin_m=origin_m, interior_cells=None)
         tx_m = _transmitters(partial, tx, None)
-        gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(partial, tx_m, None, None), sensor)
+        gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(LinkModel(partial), tx_m, None, None), sensor)
         return int(np.argmax(np.array(gains) / [robot.steps_to(each) + LOOK_M / FORWARD_M for each in frontiers]))
 
     return choose
@@ -375,26 +375,26 @@ def _possible_m(partial: PartialMap) -> Floats:
 
 
 def _uncertainty(
-    partial: PartialMap, tx_m: Floats, measured: Measurements | None, threshold_db: float | None
+    model: LinkModel, tx_m: Floats, measured: Measurements | None, threshold_db: float | None
 ) -> xr.DataArray:
     """Predict the uncertainty of links of given transmitters on (tx, y, x) [bit]."""
-    spacing_m = _spacing_m(partial)
+    spacing_m = _spacing_m(model.partial)
     if not len(tx_m):
         none = xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))
         return _described(none, spacing_m)
     near = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
     used = measured if near or len(tx_m) == 1 else None
-    coverage = predict_map(partial, tx_m, spacing_m=spacing_m, measurements=used, progress=False)
+    coverage = model.coverage(tx_m, spacing_m=spacing_m, measurements=used, progress=False)
     return _described(_entropy(coverage, threshold_db).drop_vars(("tx", *TX_COORDINATES)), spacing_m)
 
 
-def _located(partial: PartialMap, measured: Measurements, threshold_db: float | None) -> tuple[Floats, xr.DataArray]:
+def _located(model: LinkModel, measured: Measurements, threshold_db: float | None) -> tuple[Floats, xr.DataArray]:
     """Return some positions (T, 3) [m] where the transmitter may be, and the contribution of each to the uncertainty.
 
     That is the uncertainty of the coverage averaged over all positions, weighted by the posterior of each.
     """
-    spacing_m = _spacing_m(partial)
-    coverage = predict_map(partial, None, spacing_m=spacing_m, measurements=measured, progress=False)
+    spacing_m = _spacing_m(model.partial)
+    coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=False)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
     posterior = TransmitterPosterior(x_m, y_m, float(coverage.attrs["transmitter_m"][2]), probability)
     tx_m, weights = posterior.draw(POSITIONS)

@@ -10,18 +10,17 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Progress, no_progress
+from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.placement.area import PlacementArea, placement_area
-from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.progress import reporting
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
-from sionna_partial.tracing.simulation import Simulation, nearest_m, simulation_of
+from sionna_partial.tracing.simulation import Simulation, nearest_m
 
 RECEIVERS = 120
 """Largest number of receivers during the search; the final positions are compared at all receivers."""
@@ -124,7 +123,7 @@ class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement")
 
 
 def place_transmitter(
-    scene: PartialMap | str | Path,
+    scene: PartialMap | str | Path | Simulation | LinkModel,
     *,
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
@@ -144,7 +143,7 @@ def place_transmitter(
 
     Parameters
     ----------
-    scene : PartialMap or path
+    scene : PartialMap, path, Simulation or LinkModel
         The map, or whatever `load_map` reads.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
@@ -183,9 +182,8 @@ def place_transmitter(
     True
     """
     settings = PlacementSettings(**options)
-    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
-    area, model = search.area, search.model
+    search = Search.on(link_model_of(scene, predictor, trace_settings, scene_settings), settings)
+    area, simulation, model = search.area, search.model.simulation, search.model.predictor_of_map
     some = area.thinned(RECEIVERS)
     with reporting(progress) as report:
         report(0.0, "comparing positions")
@@ -208,49 +206,43 @@ def place_transmitter(
         weight=area.weight,
         values=values[best],
         spacing_m=area.spacing_m,
-        partial=partial,
+        partial=area.partial,
         settings=settings,
         provenance={
             "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
             "predictor_sha256": "" if model is None else model.fingerprint,
-            "scene_settings": asdict(search.simulation.scene_settings),
-            "trace_settings": asdict(search.simulation.trace_settings),
+            "scene_settings": asdict(simulation.scene_settings),
+            "trace_settings": asdict(simulation.trace_settings),
         },
     )
 
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search for transmitters needs: settings, simulation, predictor (None on a complete map) and area."""
+    """What a search for transmitters needs: settings, link model and area."""
 
     settings: PlacementSettings
-    simulation: Simulation
-    model: Predictor | None
+    model: LinkModel
     area: PlacementArea
 
     @classmethod
     def on(
         cls,
-        partial: PartialMap,
+        model: LinkModel,
         settings: PlacementSettings,
-        predictor: Predictor | str | Path | None,
-        scene_settings: SceneSettings | None,
-        trace_settings: TraceSettings | None,
     ) -> "Search":
         """Check the settings against a map."""
-        simulation = simulation_of(partial, trace_settings, scene_settings)
         for name in ("tx_height_m", "rx_height_m"):
-            require_height(partial, name, getattr(settings, name))
-        model = None if partial.is_complete else Predictor.load(predictor)
-        area = placement_area(partial, float(settings.tx_height_m), float(settings.rx_height_m), model)
-        return cls(settings, simulation, model, area)
+            require_height(model.partial, name, getattr(settings, name))
+        heights_m = float(settings.tx_height_m), float(settings.rx_height_m)
+        return cls(settings, model, placement_area(model.partial, *heights_m, model.predictor_of_map))
 
     def starts(self, area: PlacementArea, count: int) -> Floats:
         """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
         positions_m, range_m = area.positions(self.settings.seed), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
             loss = 10.0 ** (-self.settings.threshold_db / 20.0)
-            range_m = SPEED_OF_LIGHT_M_S / self.simulation.trace_settings.frequency_hz / (4.0 * math.pi) * loss
+            range_m = SPEED_OF_LIGHT_M_S / self.model.simulation.trace_settings.frequency_hz / (4.0 * math.pi) * loss
         seen = area.visibility(positions_m, range_m)
         scores = np.array([placement_score(values, area.weight, self.settings) for values in seen])
         fraction = area.weight / area.weight.sum()
@@ -264,15 +256,10 @@ class Search:
 
     def links(self, positions_m: Floats, area: PlacementArea) -> tuple[LinkPrediction, Bools]:
         """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
-        frequency_hz = self.simulation.trace_settings.frequency_hz
+        frequency_hz = self.model.simulation.trace_settings.frequency_hz
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
-        features = []
-        for tx_m, kept in zip(positions_m, far, strict=True):
-            paths = self.simulation.blocks(tx_m, area.rx_m[kept], no_progress)
-            links = area.partial, tx_m, area.rx_m[kept], paths, frequency_hz
-            features.append(features_of_paths(*links, context=self.model is not None))
-        phi = LinkFeatures.concatenate(features)
-        found = LinkPrediction.of_trace(phi) if self.model is None else self.model.predict(phi)
+        ends_m = [(tx_m, area.rx_m[kept]) for tx_m, kept in zip(positions_m, far, strict=True)]
+        _, found, _ = self.model.predict_each(ends_m)
         columns = {}
         for column in fields(LinkPrediction):
             columns[column.name] = np.full(far.shape, OUTAGE[column.name])

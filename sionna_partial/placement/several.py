@@ -13,13 +13,14 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Progress, require, require_whole
 from sionna_partial.display import Pictured
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import PlacementArea
 from sionna_partial.placement.placement import RECEIVERS, Search
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.progress import reporting
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.tracing.simulation import Simulation
 
 MOST_TRANSMITTERS = 16
 
@@ -78,7 +79,7 @@ class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placeme
 
 
 def place_transmitters(
-    scene: PartialMap | str | Path,
+    scene: PartialMap | str | Path | Simulation | LinkModel,
     count: int = 2,
     *,
     rx: ArrayLike | None = None,
@@ -96,7 +97,7 @@ def place_transmitters(
 
     Parameters
     ----------
-    scene : PartialMap or path
+    scene : PartialMap, path, Simulation or LinkModel
         The map, or whatever `load_map` reads.
     count : int
         Number of transmitters K, up to 16.
@@ -128,9 +129,8 @@ def place_transmitters(
     require_whole("count", count, 1, MOST_TRANSMITTERS)
     settings = PlacementSettings(**options)
     require(settings.objective == "coverage", "objective", settings.objective, "several are placed for 'coverage'.")
-    partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-    search = Search.on(partial, settings, predictor, scene_settings, trace_settings)
-    area = search.area
+    search = Search.on(link_model_of(scene, predictor, trace_settings, scene_settings), settings)
+    area, partial = search.area, search.model.partial
     if rx is not None:
         rx_m = partial.require_positions("rx", rx).reshape(-1, 3)
         area = replace(area, rx_m=rx_m, weight=np.ones(len(rx_m)))
