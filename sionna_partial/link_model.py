@@ -31,7 +31,7 @@ from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of_each
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -115,8 +115,10 @@ class LinkModel:
         scene_settings: SceneSettings | None = None,
     ) -> None:
         self.simulation = simulation_of(scene, trace_settings, scene_settings)
-        self._scene_settings = scene_settings
-        self._given = None if predictor is None else Predictor.load(predictor)
+        self._settings = trace_settings, scene_settings
+        if isinstance(scene, Simulation):
+            self._settings = scene.trace_settings, scene.scene_settings
+        self._given = None if predictor is None else warm_predictor(predictor)
 
     @property
     def partial(self) -> PartialMap:
@@ -126,7 +128,7 @@ class LinkModel:
     @cached_property
     def predictor(self) -> Predictor:
         """The predictor, which is read when it is first needed."""
-        model = Predictor.load() if self._given is None else self._given
+        model = warm_predictor(None) if self._given is None else self._given
         _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
 
@@ -141,8 +143,7 @@ class LinkModel:
         The predictor and what is compiled are kept. Predictions are those of a new `LinkModel` of the map.
         """
         if partial != self.partial:
-            settings = self.simulation.trace_settings
-            self.simulation = Simulation(partial, settings, self._scene_settings)
+            self.simulation = Simulation(partial, *self._settings)
 
     def predict(self, tx: ArrayLike, rx: ArrayLike) -> LinkPrediction:
         """Trace and predict links.

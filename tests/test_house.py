@@ -42,11 +42,12 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "predictor"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
-    "coverage": ("coverage_map", "link_model", "coverage", "network"),
+    "coverage": ("coverage_map", "link_model", "coverage"),
     "channels": (
         *("responses", "beams", "files"),
         *("joint", "path_model", "path_training", "samples"),
     ),
+    "networks": ("network",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
@@ -64,7 +65,7 @@ ROOMS = {
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "training", "results", "command"}
+FILES = {"foundations", "coverage", "networks", "training", "results", "command"}
 """Rooms whose modules are files of the package itself."""
 
 MODULES = tuple(

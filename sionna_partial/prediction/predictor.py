@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
@@ -447,7 +448,7 @@ class Predictor(Shown):
             raise PredictorError(
                 f"name_or_path = {name!r} is not a path: give {known}, or the path of a {SUFFIX} file."
             )
-        path = PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
+        path = predictor_path(name)
         if path.suffix != SUFFIX:
             raise PredictorError(f"path = '{path}' is no predictor: give {known}, or the path of a {SUFFIX} file.")
         model, archive, card = read_files(path)
@@ -461,6 +462,32 @@ class Predictor(Shown):
                 f"path = '{card_path}' is damaged ({error!r}): copy it again, or train anew."
             ) from error
         return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
+
+
+def warm_predictor(name_or_path: Predictor | str | PathLike[str] | None) -> Predictor:
+    """Return `Predictor.load`, which reads files of the same name, size and date once in a process.
+
+    Its weights belong to all who load it so: they must not be changed.
+    """
+    if not isinstance(name_or_path, (str, PathLike, type(None))):
+        return Predictor.load(name_or_path)
+    path, name = predictor_path(name_or_path), None if name_or_path is None else str(name_or_path)
+    try:
+        files = [each.stat() for each in (path, path.with_suffix(".json"))]
+    except (OSError, ValueError):
+        return Predictor.load(name_or_path)
+    return _read_once(name, path.absolute(), *((each.st_ino, each.st_size, each.st_mtime_ns) for each in files))
+
+
+@lru_cache(maxsize=4)
+def _read_once(name: str | None, *identity: object) -> Predictor:
+    return Predictor.load(name)
+
+
+def predictor_path(name_or_path: str | PathLike[str] | None) -> Path:
+    """Return the file of a predictor by its shipped name or path; None is the default."""
+    name = SHIPPED[0] if name_or_path is None else name_or_path
+    return PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
 
 
 def _require_windows(features: LinkFeatures) -> None:
