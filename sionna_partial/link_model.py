@@ -47,6 +47,9 @@ are predicted together [bytes]; `benchmarks/scale.py` measures it."""
 _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 """Number of receivers that are predicted together."""
 
+KEPT_BLOCKS = 8
+"""Number of blocks of links that a link model keeps: 20 MB in all."""
+
 LARGE_OFFSET_DB = 15.0
 """Offset of measurements from which on they are no path gains, but powers [dB]."""
 
@@ -88,6 +91,8 @@ class LinkModel:
     ----------
     simulation : Simulation
         The trace, with `partial`, `trace_settings` and `scene_settings`.
+    asked : None, str, path or Predictor
+        The argument `predictor`.
 
     Raises
     ------
@@ -118,7 +123,10 @@ class LinkModel:
         self._settings = trace_settings, scene_settings
         if isinstance(scene, Simulation):
             self._settings = scene.trace_settings, scene.scene_settings
-        self._given = None if predictor is None else warm_predictor(predictor)
+        self.asked = predictor
+        self._latest: dict[tuple[bytes, bytes], PredictedLinks] = {}
+        if predictor is not None:
+            warm_predictor(predictor)
 
     @property
     def partial(self) -> PartialMap:
@@ -128,7 +136,7 @@ class LinkModel:
     @cached_property
     def predictor(self) -> Predictor:
         """The predictor, which is read when it is first needed."""
-        model = warm_predictor(None) if self._given is None else self._given
+        model = warm_predictor(self.asked)
         _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
 
@@ -144,6 +152,7 @@ class LinkModel:
         """
         if partial != self.partial:
             self.simulation = Simulation(partial, *self._settings)
+            self._latest.clear()
 
     def predict(self, tx: ArrayLike, rx: ArrayLike) -> LinkPrediction:
         """Trace and predict links.
@@ -198,7 +207,15 @@ class LinkModel:
         return trace if complete.all() else self.predictor.predict(phi).where(complete, trace)
 
     def links(self, tx_m: Floats, rx_m: Floats, report: Progress = no_progress) -> PredictedLinks:
-        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked."""
+        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept."""
+        key = tx_m.tobytes(), rx_m.tobytes()
+        if key not in self._latest:
+            self._latest[key] = self._new_links(tx_m, rx_m, report)
+            for oldest in [*self._latest][:-KEPT_BLOCKS]:
+                del self._latest[oldest]
+        return self._latest[key]
+
+    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress) -> PredictedLinks:
         phi, prediction, complete = self.predict_each([(tx_m, rx_m)], report)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         free = self.partial.state_at(rx_m) == CellState.FREE

@@ -32,11 +32,12 @@ from sionna_partial.calibration.measured_building import (
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Pictured
+from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.simulation import simulation_of
+from sionna_partial.tracing.simulation import Simulation, simulation_of
 from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 
 DETERMINED = 0.35
@@ -159,7 +160,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
 
 
 def calibrate_materials(
-    scene: PartialMap | str | Path,
+    scene: PartialMap | str | Path | Simulation | LinkModel,
     measurements: Any,
     *,
     start: Material | None = None,
@@ -182,7 +183,7 @@ def calibrate_materials(
 
     Parameters
     ----------
-    scene : PartialMap or path
+    scene : PartialMap, path, Simulation or LinkModel
         What is known of the building.
     measurements : Measurements, mapping, data frame, Dataset or path of a CSV
         With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB] (see `measurements_of`).

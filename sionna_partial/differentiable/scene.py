@@ -33,6 +33,7 @@ from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
+from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, link_features
 from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
@@ -59,7 +60,7 @@ from sionna_partial.prediction.windows import CELLS_M, map_windows
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.gradients import one_transmitter
 from sionna_partial.tracing.path_set import PARAMETERS, PathSet
-from sionna_partial.tracing.simulation import Simulation, simulation_of
+from sionna_partial.tracing.simulation import Simulation
 
 WINDOW_STEP_M = CELLS_M[0] / 2
 """How far from the transmitter further windows are drawn [m]."""
@@ -106,8 +107,8 @@ class DifferentiableScene:
 
     Parameters
     ----------
-    scene : PartialMap, path or Simulation
-        What is known of the building.
+    scene : PartialMap, path, Simulation or LinkModel
+        What is known of the building. The predictor of a link model is loaded anew, so that its weights may change.
     predictor : None, "map", "paper", path or Predictor
         None is the shipped default. On a complete map it is not used.
     trace_settings : TraceSettings, optional
@@ -138,16 +139,17 @@ class DifferentiableScene:
 
     def __init__(
         self,
-        scene: PartialMap | str | Path | Simulation,
+        scene: PartialMap | str | Path | Simulation | LinkModel,
         *,
         predictor: Predictor | str | Path | None = None,
         trace_settings: TraceSettings | None = None,
         scene_settings: SceneSettings | None = None,
     ) -> None:
-        self.simulation = simulation_of(scene, trace_settings, scene_settings)
+        model = link_model_of(scene, predictor, trace_settings, scene_settings)
+        self.simulation = model.simulation
         self.simulation.require_exact()
         self.partial = self.simulation.partial
-        self.predictor = Predictor.load(predictor)
+        self.predictor = Predictor.load(model.asked)
         self.networks = parts(self.predictor.model)
 
     @property

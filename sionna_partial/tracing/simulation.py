@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -327,21 +327,28 @@ def _shaped(ends: dict[str, Any]) -> dict[str, Any]:
     return {name: each if name in ("tx", "rx") else each.reshape(shape) for name, each in ends.items()}
 
 
+class Simulated(Protocol):
+    """What has a simulation, such as a LinkModel."""
+
+    simulation: Simulation
+
+
 def simulation_of(
-    scene: "PartialMap | str | Path | Simulation",
+    scene: "PartialMap | str | Path | Simulation | Simulated",
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
 ) -> Simulation:
     """Return a simulation as it is, or make one of a map; a simulation has its settings."""
-    if not isinstance(scene, Simulation):
-        return Simulation(scene, trace_settings, scene_settings)
+    simulation: Any = getattr(scene, "simulation", scene)
+    if not isinstance(simulation, Simulation):
+        return Simulation(simulation, trace_settings, scene_settings)
     for name, value in (("trace_settings", trace_settings), ("scene_settings", scene_settings)):
         require(value is None, name, value, "the Simulation that was given has its own: leave it out.")
-    return scene
+    return simulation
 
 
 def trace_links(
-    scene: "PartialMap | str | Path | Simulation",
+    scene: "PartialMap | str | Path | Simulation | Simulated",
     tx: ArrayLike,
     rx: ArrayLike,
     *,
@@ -364,7 +371,7 @@ def trace_links(
 
     Parameters
     ----------
-    scene : PartialMap, path or Simulation
+    scene : PartialMap, path, Simulation or LinkModel
         What is known of the building; unknown space is free (paper, Section III-B). A simulation stays warm.
     tx : (3,) or (T, 3) array-like
         Transmitter positions [m].

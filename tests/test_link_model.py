@@ -1,0 +1,100 @@
+"""LinkModel: one way from a map to a prediction, the same warm as new."""
+
+import numpy as np
+import pytest
+import xarray as xr
+from predictor_links import QUIET
+
+import sionna_partial as sp
+from sionna_partial.prediction import predictor as predictors
+
+pytestmark = QUIET
+
+TX, RX = (2.05, 2.05, 1.5), [(2.6, 2.4, 1.5), (3.05, 2.05, 1.2)]
+
+
+@pytest.fixture(scope="module")
+def maps():
+    """A home as a robot sees it after 30 and 60 steps."""
+    return sp.explore(sp.make_home(7), steps=(30, 60), seed=0)
+
+
+@pytest.fixture(scope="module")
+def tx(maps):
+    """A position in a cell that is free on both maps."""
+    cells = np.argwhere((maps[0].state == sp.CellState.FREE) & (maps[1].state == sp.CellState.FREE))
+    row, column = cells[len(cells) // 2]
+    x, y = maps[0].origin_m + (np.array([column, row]) + 0.5) * maps[0].resolution_m
+    return float(x), float(y), 1.5
+
+
+def half_open(cell):
+    """A room of 6 x 6 m in walls, the last row of its cells of one kind, and a row of unknown cells beyond the wall."""
+    state = np.pad(np.zeros((60, 60), dtype=np.uint8), 1, constant_values=sp.CellState.WALL)
+    state[60, 1:61] = cell
+    return sp.PartialMap(np.pad(state, ((0, 20), (0, 0)), constant_values=sp.CellState.UNKNOWN), 0.1)
+
+
+def test_updated_as_new_to_the_byte(maps, tx):
+    model = sp.LinkModel(maps[0])
+    first = model.coverage(tx, spacing_m=0.5)
+    xr.testing.assert_identical(first, sp.predict_map(maps[0], tx, spacing_m=0.5))
+    for partial in (maps[1], maps[0]):
+        model.update(partial)
+        fresh = sp.LinkModel(partial).coverage(tx, spacing_m=0.5)
+        for warm in (model.coverage(tx, spacing_m=0.5), sp.predict_map(model, tx, spacing_m=0.5)):
+            xr.testing.assert_identical(warm, fresh)
+
+
+def test_coverage_is_predict(maps, tx):
+    model = sp.LinkModel(maps[0], "paper")
+    coverage = model.coverage(tx, spacing_m=1.0)
+    y, x = np.nonzero(coverage["valid"].to_numpy())
+    rx = np.column_stack([coverage.x[x], coverage.y[y], np.full(len(x), 1.5)])
+    prediction = model.predict([tx, tx], rx)
+    assert prediction.p_los.shape == (2, len(rx))
+    assert len(model.features(tx, rx)) == len(rx)
+    expected = coverage["gain_mean_db"].to_numpy()[y, x]
+    np.testing.assert_array_equal(prediction.gain_mean_db[1].astype(np.float32), expected)
+
+
+@pytest.mark.parametrize("predictor", ["map", "paper"])
+def test_complete_is_decided_per_link(predictor):
+    """Links between unknown cells are uncertain, in whatever order transmitters come; others are as traced."""
+    partial = half_open(sp.CellState.FREE)
+    model, beyond = sp.LinkModel(partial, predictor), (3.0, 7.0, 1.5)
+    rx = [(1.0, 1.0, 1.5), (2.0, 7.5, 1.5)]
+    for order in ([TX, beyond], [beyond, TX]):
+        std_db = dict(zip(order, model.predict(order, rx).gain_std_db, strict=True))
+        assert std_db[TX].tolist() == [0.0, 0.0]
+        assert std_db[beyond][0] == 0.0 < std_db[beyond][1]
+
+
+def test_is_taken_in_place_of_a_map():
+    model = sp.LinkModel(half_open(sp.CellState.UNKNOWN))
+    assert sp.sample_channels(model, TX, RX, n=4).gain_db.shape == (4, 2)
+    assert sp.trace_links(model, TX, RX).gain_db.shape == (2,)
+    assert sp.place_transmitter(model).partial is model.partial
+    assert sp.next_views(model, goal="area").partial is model.partial
+    gain_db = sp.DifferentiableScene(model).links(TX, RX)().gain_mean_db
+    assert gain_db.numpy() == pytest.approx(model.predict(TX, RX).gain_mean_db, abs=1e-6)
+
+
+@pytest.mark.parametrize("setting", ["predictor", "trace_settings", "scene_settings"])
+def test_has_its_own_settings(setting):
+    values = {"predictor": "paper", "trace_settings": sp.TraceSettings(), "scene_settings": sp.SceneSettings()}
+    with pytest.raises(sp.SionnaPartialError, match=f"{setting} = .*has its own: leave it out"):
+        sp.predict_map(sp.LinkModel(half_open(sp.CellState.FREE)), TX, **{setting: values[setting]})
+
+
+def test_a_predictor_is_read_once(tmp_path, monkeypatch):
+    read = []
+    path = tmp_path / "own.keras"
+    sp.Predictor.load("paper").save(path)
+    read_files = predictors.read_files
+    monkeypatch.setattr(predictors, "read_files", lambda path: read.append(path) or read_files(path))
+    for _ in range(2):
+        sp.LinkModel(half_open(sp.CellState.UNKNOWN), path).predict(TX, RX)
+    assert read == [path]
+    sp.Predictor.load("map").save(path)
+    assert sp.LinkModel(half_open(sp.CellState.UNKNOWN), path).predictor.reads_maps
