@@ -36,7 +36,7 @@ gain_db = traced.gain_db[of_link, np.arange(LINKS)] + 3.0 * rng.standard_normal(
 measurements = {"tx": tx[of_link], "rx": rx, "gain_db": gain_db}
 result = sp.calibrate_materials(home, measurements, start=sp.Material(thickness_m=THICKNESS_M))
 print(f"permittivity {result.permittivity:.2f} +- {result.permittivity_std:.2f}")
-print(f"conductivity {result.conductivity:.3f} +- {result.conductivity_std:.3f} S/m")
+print(f"conductivity {result.conductivity_s_m:.3f} +- {result.conductivity_std_s_m:.3f} S/m")
 print(f"cannot be determined: {', '.join(result.undetermined) or 'nothing'}")
 
 # %%

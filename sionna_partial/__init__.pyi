@@ -34,6 +34,7 @@ from sionna_partial.maps.mesh.points import map_from_points as map_from_points
 from sionna_partial.maps.partial_map import PartialMap as PartialMap
 from sionna_partial.measurements.assimilation import Assimilation as Assimilation
 from sionna_partial.measurements.measurements import Measurements as Measurements
+from sionna_partial.measurements.measurements import load_measurements as load_measurements
 from sionna_partial.measurements.recordings import measurements_from_bag as measurements_from_bag
 from sionna_partial.measurements.recordings import poses_from_bag as poses_from_bag
 from sionna_partial.network import network_map as network_map

@@ -44,6 +44,9 @@ _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a rece
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
 """Attributes that are needed beside the position of the transmitter, and what they are above."""
 
+_RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0), "std": (0.0, 1e3), "m": (0.0, 1e15)}
+"""Values of probabilities, gains, standard deviations and lengths; reflections may take near links past 0 dB."""
+
 _PLOT = "plots.coverage_plot:plot_coverage"
 
 
@@ -259,7 +262,32 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
     position_m = real_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
     known = position_m.shape == (3,) and bool(np.isfinite(position_m).all())
     require(known, "coverage.transmitter_m", coverage.attrs["transmitter_m"], remedy)
+    _require_values(coverage)
     return coverage
+
+
+def _require_values(coverage: xr.Dataset) -> None:
+    """Raise a SettingsError for a grid or values that no coverage map has."""
+    for name in ("x", "y"):
+        steps_m = np.diff(np.asarray(coverage[name], dtype=np.float64))
+        regular = bool((np.abs(steps_m - coverage.attrs["spacing_m"]) < 1e-3 * coverage.attrs["spacing_m"]).all())
+        remedy = f"its step is spacing_m, ascending, as after coverage.sortby('{name}')."
+        require(regular and bool(np.isfinite(coverage[name]).all()), f"coverage.{name}", steps_m, remedy)
+    valid = coverage["valid"].to_numpy() == 1
+    for name, attributes in ATTRIBUTES.items():
+        values = coverage[name].to_numpy()
+        if "flag_values" in attributes:
+            good, remedy = np.isin(values, attributes["flag_values"]), f"it is one of {[*attributes['flag_values']]}."
+        elif "units" in attributes:
+            low, high = _RANGES["std" if "_std_" in name else attributes["units"]]
+            good = ~valid | ((values >= low) & (values <= high))
+            remedy = f"it lies between {low:g} and {high:g} where a receiver can stand."
+        else:
+            continue
+        require(bool(good.all()), f"coverage.{name}", values[~good][:1], remedy)
+    total = sum(coverage[name].to_numpy()[valid] for name in ("p_los", "p_nlos", "p_outage"))
+    wrong = np.abs(total - 1.0) > 1e-3
+    require(not wrong.any(), "p_los + p_nlos + p_outage", total[wrong][:1], "probabilities of coverage sum to 1.")
 
 
 def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:

@@ -7,7 +7,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -88,9 +88,9 @@ def read_bytes(
 
 
 def read_columns(
-    path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Collection[str], remedy: str
+    path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Mapping[str, str], remedy: str
 ) -> dict[str, list[float]]:
-    """Return those columns of a CSV with a header that have one of the names, or raise an `error`."""
+    """Return columns of a CSV by name, or raise an `error`; `names` has a name for each header, in lower case."""
     given = f"{field} = '{path}'"
     try:
         text = read_bytes(path, field, error, MAX_CSV_BYTES, "leave lines out.").decode("utf-8-sig")
@@ -108,16 +108,19 @@ def read_columns(
         raise error(f"{given}, line {rows.line_num} cannot be read ({cause}): {remedy}") from cause
 
 
-def _columns(given: str, rows: Any, error: type[SionnaPartialError], names: Collection[str]) -> dict[str, list[float]]:
+def _columns(
+    given: str, rows: Any, error: type[SionnaPartialError], names: Mapping[str, str]
+) -> dict[str, list[float]]:
     header = [name.strip() for name in next(rows, [])]
     commas = "separate columns by commas, and write decimal points."
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
         raise error(f"{given} has the header {header[0][:80]!r}: {commas}")
-    found: dict[str, list[float]] = {name: [] for name in header if name in names}
-    columns = [(column, name) for column, name in enumerate(header) if name in found]
-    if len(columns) > len(found):
-        twice = next(name for name in found if header.count(name) > 1)
-        raise error(f"{given} has {header.count(twice)} columns {twice}: keep one of them.")
+    columns = [(column, names[name.lower()]) for column, name in enumerate(header) if name.lower() in names]
+    found: dict[str, list[float]] = {name: [] for _, name in columns}
+    for name in found:
+        same = [header[column] for column, other in columns if other == name]
+        if len(same) > 1:
+            raise error(f"{given} has {len(same)} columns of {name} ({', '.join(same)}): keep one of them.")
     for row in rows:
         if len(row) > len(header):
             raise error(f"{given}, line {rows.line_num} has {len(row)} cells for {len(header)} columns: {commas}")

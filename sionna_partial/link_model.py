@@ -53,6 +53,9 @@ KEPT_BLOCKS = 8
 LARGE_OFFSET_DB = 15.0
 """Offset of measurements from which on they are no path gains, but powers [dB]."""
 
+UNSURE = 0.05
+"""Least probability of either, that powers or that path gains were measured, with which a warning is logged."""
+
 POSITIONS = 8
 """Number of positions of an unknown transmitter over which coverage is averaged."""
 
@@ -384,15 +387,21 @@ def _transmitter_of(
 ) -> _Transmitter:
     """Assimilate the measurements for a position (3,) [m], or for several that are drawn from a posterior."""
     if isinstance(where, TransmitterPosterior):
-        (tx_m, weights), position_m = where.draw(POSITIONS), where.position_m
+        (tx_m, weights, p_powers), position_m = where.draw(POSITIONS), where.position_m
+        p_any = float(weights @ [each or 0.0 for each in p_powers])
+        if min(p_any, 1.0 - p_any) > UNSURE:
+            message = (
+                "with probability %.2f powers were measured and no path gains: give gains if their offset is known"
+            )
+            _log.warning(message, p_any)
     else:
-        tx_m, weights, position_m = where[None], np.ones(1), where
+        tx_m, weights, p_powers, position_m = where[None], np.ones(1), [None], where
     assimilations = []
     if measured is not None:
-        for each_m in tx_m:
+        for each_m, each_p in zip(tx_m, p_powers, strict=True):
             prior, _ = _prior(model, each_m, measured.rx, at_once)
             frequency_hz = model.simulation.trace_settings.frequency_hz
-            assimilations.append(Assimilation(model.partial, each_m, measured, prior, frequency_hz))
+            assimilations.append(Assimilation(model.partial, each_m, measured, prior, frequency_hz, each_p))
     return _Transmitter(tx_m, weights, assimilations, position_m)
 
 

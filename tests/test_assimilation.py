@@ -125,6 +125,21 @@ def test_what_measurements_have_in_common_is_an_offset():
     assert np.abs(other + shifted.offset_db - gains_db - 60.0).max() < 4.0
 
 
+def test_one_deep_value_is_no_offset():
+    deep = told(LEFT[:1], np.array([-120.0]), p_outage=0.05)
+    assert abs(deep.offset_db) < 5.0
+    after = deep.update(LEFT[:1], prior(1, p_outage=0.05))
+    assert after.gain_mean_db[0] < -112.0
+
+
+def test_tiny_standard_deviations_give_gains_that_links_have():
+    twice = np.concatenate([LEFT[:2], LEFT[:2] + np.array([0.02, 0.0, 0.0])])
+    sure = told(twice, np.array([-60.0, -90.0, -90.0, -60.0]), std_db=1e-9)
+    after = sure.update(LEFT, prior(30))
+    for name in ("gain_mean_db", "gain_nlos_mean_db", "gain_los_mean_db"):
+        assert (np.abs(getattr(after, name) + 75.0) <= 75.0).all()
+
+
 def test_powers_say_how_deep_shadows_are():
     """Predicted shadows are twice as deep as those that a real radio met."""
     free_db = -61.4 - 20.0 * np.log10(np.linalg.norm(LEFT - UNSEEN, axis=1))

@@ -83,9 +83,23 @@ class TestHiddenMaterial:
 
     def test_parameters_within_their_spread(self, result: sp.MaterialCalibration) -> None:
         assert abs(result.permittivity - 4.4) <= 2.5 * result.permittivity_std
-        assert abs(result.conductivity - 2.0) <= 2.5 * result.conductivity_std
+        assert abs(result.conductivity_s_m - 2.0) <= 2.5 * result.conductivity_std_s_m
         assert 0.0 < result.permittivity_std < 1.0
         assert result.noise_db == pytest.approx(1.0, abs=0.3)
+
+    def test_an_offset_of_powers_is_subtracted(
+        self, result: sp.MaterialCalibration, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        powers = measured()
+        powers["gain_db"] = powers["gain_db"] - 30.0
+        with caplog.at_level(logging.WARNING):
+            found = calibrate(powers)
+        assert "30." in caplog.text or "29." in caplog.text
+        assert found.offset_db == pytest.approx(-30.0, abs=1.5)
+        assert result.offset_db == 0.0
+        loss_db, std_db = found.reflection_loss_db(ANGLES_DEG)
+        hidden_db = reflection_loss_db(4.4, 2.0, THIN_M, 28e9, ANGLES_DEG)
+        assert (np.abs(loss_db - hidden_db) <= np.maximum(1.0, 2.5 * std_db)).all()
 
     def test_links_fit_better(self, result: sp.MaterialCalibration) -> None:
         rmse = result.record()["rmse_db"]
@@ -98,7 +112,7 @@ class TestHiddenMaterial:
 
     def test_scene_predicts_with_it(self, result: sp.MaterialCalibration) -> None:
         assert result.scene == replace(FLAT, material=result.materials[0])
-        assert result.materials[0] == sp.Material(result.permittivity, result.conductivity, THIN_M)
+        assert result.materials[0] == sp.Material(result.permittivity, result.conductivity_s_m, THIN_M)
         links = sp.trace_links(result.scene, TX[0], places()[1][::2], trace_settings=SETTINGS)
         np.testing.assert_allclose(links.gain_db, result.gain_after_db[::2], atol=0.3)
 
@@ -135,7 +149,7 @@ class TestWhatCannotBeDetermined:
             re.search(r"cannot determine the conductivity: its 95 % interval is [\d.]+ to [\d.]+ S/m", text)
             for text in caplog.messages
         )
-        assert found.conductivity_std > 0.2
+        assert found.conductivity_std_s_m > 0.2
 
     @pytest.mark.parametrize(
         ("cell", "message"),
@@ -194,7 +208,7 @@ def test_materials_of_a_mesh() -> None:
     gain_db = sp.trace_links(partial, tx[0], rx, trace_settings=SETTINGS).gain_db
     blank = replace(partial, mesh=replace(mesh, materials=(None, unused, None)), material=START)
     found = sp.calibrate_materials(blank, {"tx": tx, "rx": rx, "gain_db": gain_db}, trace_settings=SETTINGS)
-    assert found.permittivity.shape == found.conductivity_std.shape == (2,)
+    assert found.permittivity.shape == found.conductivity_std_s_m.shape == (2,)
     assert found.permittivity[0] == pytest.approx(6.0, abs=1.5)
     assert found.record()["rmse_db"]["after"] < found.record()["rmse_db"]["before"]
     assert found.scene.mesh is not None

@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, probability_above
+from sionna_partial.coverage_map import ATTRIBUTES, probability_above
 from sionna_partial.export import save_coverage
 from sionna_partial.plots.style import STATE_COLOURS
 
@@ -150,8 +150,10 @@ def test_thirty_thousand_values_take_less_than_5_mb(columns, name, request, tmp_
     large = small.isel({axis: index % small.sizes[axis] for axis, index in cells.items()})
     large = large.assign_coords({axis: 0.25 * index for axis, index in cells.items()})
     large["valid"][:] = 1
-    for layer in (*DISTRIBUTION, *COMPONENTS, "unobserved_distance_m"):
-        large[layer][:] = rng.random(large["p_los"].shape)
+    for name, attributes in ATTRIBUTES.items():
+        if "units" in attributes:
+            large[name][:] = rng.random(large["p_los"].shape)
+    large["p_nlos"][:], large["p_outage"][:] = 0.0, 1.0 - large["p_los"]
     save_coverage(large, tmp_path / "coverage.html")
     assert large["p_los"].size == 30_000
     assert (tmp_path / "coverage.html").stat().st_size < 5e6

@@ -59,7 +59,7 @@ def test_calibrate(place: Path, tmp_path: Path) -> None:
     numbers = json.loads((out / "calibration.json").read_text())
     calibrated = sp.load_map(out)
     assert calibrated == sp.load_map(out / "calibrated.npz")
-    assert calibrated.material == sp.Material(numbers["permittivity"], numbers["conductivity"], 0.01)
+    assert calibrated.material == sp.Material(numbers["permittivity"], numbers["conductivity_s_m"], 0.01)
     assert numbers["rmse_db"]["after"] < numbers["rmse_db"]["before"]
     assert numbers["start"][0]["relative_permittivity"] == 2.94
     assert (out / "calibration.png").stat().st_size > 10_000

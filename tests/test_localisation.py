@@ -68,10 +68,14 @@ class TestCoverage:
         figure = sp.plot_coverage(coverage, layers=("link_state",))
         assert "transmitter, 90 %" in [text.get_text() for text in figure.legends[0].get_texts()]
 
-    def test_powers_are_located_too(self):
-        power_db = table()["gain_db"] + 31.0
-        found = sp.predict_map(HOUSE, measurements=table(gain_db=power_db), **OPTIONS)
+    @pytest.mark.parametrize("offset_db", [-40.0, 31.0])
+    def test_powers_are_located_too(self, offset_db, caplog):
+        power_db = table()["gain_db"] + offset_db
+        with caplog.at_level(logging.WARNING):
+            found = sp.predict_map(HOUSE, measurements=table(gain_db=power_db), **OPTIONS)
         assert np.linalg.norm(found.attrs["transmitter_m"] - TX) < 1.5
+        warned = "powers were measured and no path gains" in caplog.text
+        assert warned or abs(found.attrs["measured_offset_db"] - offset_db) < 10.0
 
     def test_its_height_may_be_known(self):
         found = sp.predict_map(HOUSE, measurements=table(tx=[np.nan, np.nan, 2.0]), **OPTIONS)
@@ -141,7 +145,7 @@ class TestPosterior:
         assert self.POSTERIOR.std_m == pytest.approx(np.sqrt(0.05 * 4 + 0.28 * 26 + 0.02 * 25))
 
     def test_draws_represent_it(self):
-        positions_m, weights = self.POSTERIOR.draw(10)
+        positions_m, weights, _ = self.POSTERIOR.draw(10)
         assert positions_m[:, :2].tolist() == [[0.0, 0.0], [2.0, 0.0], [1.0, 5.0]]
         assert weights.tolist() == [0.1, 0.6, 0.3]
 

@@ -17,12 +17,13 @@ def calibration(
     gain_db = np.linspace(-120.0, -60.0, 20)
     return sp.MaterialCalibration(
         permittivity=5.24,
-        conductivity=0.6,
+        conductivity_s_m=0.6,
         permittivity_std=0.25,
-        conductivity_std=0.1,
+        conductivity_std_s_m=0.1,
         undetermined=undetermined,
         loss=np.array([3.0, 2.5, 2.4]),
         noise_db=2.9,
+        offset_db=0.0,
         used=np.arange(20) > 1,
         left_out={"measured outage": 2},
         gain_db=gain_db,

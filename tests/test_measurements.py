@@ -2,12 +2,14 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import xarray as xr
 from numpy.typing import NDArray
 
+import sionna_partial as sp
 from sionna_partial.errors import MeasurementError
 from sionna_partial.measurements.measurements import Measurements, measurements_of, merged
 
@@ -129,12 +131,12 @@ class TestMeasurements:
             ({"gain_db": [-70.0, -np.inf, -80.0]}, "gain_db[1] = -inf is not allowed: give finite numbers, or leave"),
             ({"gain_db": [70.0, 80.0, 90.0]}, "gain_db[0] = 70 (and 2 more) is not allowed: path gains are negative;"),
             ({"gain_db": [-70.0, -80.0, -201.0]}, "gain_db[2] = -201 is not allowed: give dB, not below -200;"),
-            ({"gain_db": "loud"}, "gain_db is not an array of numbers ("),
+            ({"gain_db": "loud"}, "gain_db = 'loud' is not numeric: give"),
             ({"tx": TX[:2]}, "tx has shape (2, 3) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
             ({"rx": RX[:, :2]}, "rx has shape (3, 2) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
             ({"rx": [[1.0, 2.0, 3.0], [1.0, np.nan, 3.0], [0, 0, 1]]}, "rx[1, 1] = nan is not allowed: give finite"),
-            ({"tx": [[1.0, 2.0, 3.0], [1.0, 3.0], [0, 0, 1]]}, "tx is not an array of numbers ("),
-            ({"tx": Frame({"tx": [(1, 2, 3), (1, 2), (0, 0, 1)]})["tx"]}, "tx is not an array of numbers ("),
+            ({"tx": [[1.0, 2.0, 3.0], [1.0, 3.0], [0, 0, 1]]}, "is not numeric: give finite numbers"),
+            ({"tx": Frame({"tx": [(1, 2, 3), (1, 2), (0, 0, 1)]})["tx"]}, "is not numeric: give finite numbers"),
         ],
     )
     def test_what_is_unusable(self, changes: dict[str, object], message: str) -> None:
@@ -172,7 +174,7 @@ class TestWhatIsMissing:
     @pytest.mark.parametrize(
         ("text", "message"),
         [
-            (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", "' has 2 columns gain_db: keep one of them."),
+            (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", "' has 2 columns of gain_db (gain_db, gain_db): keep"),
             (f"{HEADER}\n1,2,1.5,3,4,1.5,-7", "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be"),
             (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
             ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
@@ -195,3 +197,44 @@ class TestWhatIsMissing:
         (tmp_path / "map.npz").write_bytes(b"PK\x03\x04\xff\xfe")
         with pytest.raises(MeasurementError, match=r"map\.npz' cannot be read"):
             measurements_of(tmp_path / "map.npz")
+
+
+@pytest.mark.parametrize(
+    "gains_db",
+    [
+        np.ma.masked_array([-70.0, -20.0], mask=[False, True]),
+        np.array([-70.0 + 1j, -60.0]),
+        np.array([-70, -60], dtype="timedelta64[s]"),
+        ["-70", "-60"],
+        np.array(["-70", "-60"], dtype=object),
+    ],
+    ids=["masked", "complex", "seconds", "texts", "objects"],
+)
+def test_only_real_numbers_are_gains(gains_db: Any) -> None:
+    with pytest.raises(MeasurementError, match=r"gain_db (has masked values|has dtype|= .* is not numeric)"):
+        sp.Measurements((1.0, 1.0, 1.5), [(2.0, 1.0, 1.5), (3.0, 1.0, 1.5)], gains_db)
+
+
+class TestSurveys:
+    def test_headers_of_apps(self, tmp_path: Path) -> None:
+        path = tmp_path / "survey.csv"
+        path.write_text("X,Y,RSSI,ssid\n3.0,2.0,-52,home\n5.0,4.0,-61,home\n")
+        measured = sp.load_measurements(path, tx=(1.0, 2.0, 2.0), tx_power_dbm=20.0)
+        assert measured.rx.tolist() == [[3.0, 2.0, 1.5], [5.0, 4.0, 1.5]]
+        assert measured.gain_db.tolist() == [-72.0, -81.0]
+        assert not sp.load_measurements(path).tx_known.any()
+
+    def test_columns_of_ones_own(self, tmp_path: Path) -> None:
+        path = tmp_path / "survey.csv"
+        path.write_text("east,north,level,x\n3.0,2.0,-52,0\n")
+        own = {"rx_x": "east", "rx_y": "north", "gain_db": "level"}
+        assert sp.load_measurements(path, columns=own).rx.tolist() == [[3.0, 2.0, 1.5]]
+        with pytest.raises(MeasurementError, match="has no column 'up'"):
+            sp.load_measurements(path, columns=own | {"rx_z": "up"})
+        with pytest.raises(MeasurementError, match="give a header for some of tx_x"):
+            sp.load_measurements(path, columns={"rssi": "level"})
+
+    def test_two_columns_of_one_name(self, tmp_path: Path) -> None:
+        (tmp_path / "survey.csv").write_text("rx_x,rx_y,x,gain_db\n3.0,2.0,1,-52\n")
+        with pytest.raises(MeasurementError, match=r"2 columns of rx_x \(rx_x, x\): keep one"):
+            sp.load_measurements(tmp_path / "survey.csv")

@@ -46,6 +46,14 @@ DETERMINED = 0.35
 _log = logging.getLogger(__name__)
 
 
+LEAST_OFFSET_DB, FEWEST_DIRECT = 6.0, 3
+"""Median error of links in line of sight that no material explains [dB], and number of them that show it."""
+
+_NUMBERS = (
+    *("permittivity", "permittivity_std", "conductivity_s_m", "conductivity_std_s_m", "loss", "noise_db", "offset_db"),
+)
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
@@ -55,9 +63,9 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
 
     Parameters
     ----------
-    permittivity, conductivity : float or (M,) float64 array
+    permittivity, conductivity_s_m : float or (M,) float64 array
         Real relative permittivity, and conductivity [S/m]. They do not depend on the frequency.
-    permittivity_std, conductivity_std : float or (M,) float64 array
+    permittivity_std, conductivity_std_s_m : float or (M,) float64 array
         Their standard deviations about these values, given the measurements.
     undetermined : tuple of str
         Parameters that the measurements hardly determine: "permittivity", "conductivity", or
@@ -66,12 +74,16 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
         Negative logarithm of the posterior density for each link, at the start and after each step.
     noise_db : float
         Standard deviation of the measurements' noise [dB], as found.
+    offset_db : float
+        What links in line of sight were measured above their gains [dB], if that is so much that it cannot be the
+        material: of transmit power and antennas, subtracted from all. Else 0.
     used : (N,) bool array
         Which of the measured links were used.
     left_out : dict of str to int
         How many were not, by reason.
     gain_db, gain_before_db, gain_after_db : (N,) float64 arrays
-        Gain of the measured links: as measured, and as traced with the start's and with the calibrated materials [dB].
+        Gain of the measured links: as measured, less the offset, and as traced with the start's and with the
+        calibrated materials [dB].
     start, materials : tuple of M Material
         Where the search began, and where it ended.
     posteriors : tuple of M Posterior
@@ -94,12 +106,13 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
     """
 
     permittivity: Any
-    conductivity: Any
+    conductivity_s_m: Any
     permittivity_std: Any
-    conductivity_std: Any
+    conductivity_std_s_m: Any
     undetermined: tuple[str, ...]
     loss: Floats
     noise_db: float
+    offset_db: float
     used: Bools
     left_out: dict[str, int]
     gain_db: Floats
@@ -139,10 +152,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
 
     def record(self) -> dict[str, Any]:
         """Return the result as plain data, without the map and the gains of single links."""
-        plain = {
-            name: np.asarray(getattr(self, name)).tolist()
-            for name in ("permittivity", "permittivity_std", "conductivity", "conductivity_std", "loss", "noise_db")
-        }
+        plain = {name: np.asarray(getattr(self, name)).tolist() for name in _NUMBERS}
         rmse_db = {
             when: float(np.sqrt(np.mean((gain_db - self.gain_db)[self.used] ** 2)))
             for when, gain_db in (("before", self.gain_before_db), ("after", self.gain_after_db))
@@ -239,8 +249,9 @@ def calibrate_materials(
         paths = building.paths(links, settings, scene_settings, report)
         used, left_out = usable_links(partial, paths, links, np.bincount(link))
         weight = 1.0 if partial.is_complete else INCOMPLETE_WEIGHT
-        target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used], weight)
         begin = tuple(building.start.values())
+        target = MaterialTarget(paths.of_links(used), links.gain_db[used], variance[used], weight)
+        target.has_offset = _has_offset(target, begin)
         fit = _fit(target, begin, settings.frequency_hz, report)
         report(1.0, "done")
     materials = tuple(
@@ -251,6 +262,10 @@ def calibrate_materials(
         np.maximum(link_gains_db(paths.power(*each.values), paths.link, len(links)), GAIN_FLOOR_DB)[link]
         for each in (fit.steps[0], fit.point)
     ]
+    offset_db = target.offset_db(target.paths.power(*fit.point.values)) if target.has_offset else 0.0
+    if target.has_offset:
+        message = "links in line of sight were measured %.1f dB %s their path gains: subtracted from all as an offset"
+        _log.warning(message, abs(offset_db), "above" if offset_db > 0.0 else "below")
     undetermined = _undetermined(begin, fit)
     for message in undetermined.values():
         _log.warning("%s", message)
@@ -258,15 +273,16 @@ def calibrate_materials(
     numbers = [float(each[0]) if partial.mesh is None or len(materials) == 1 else each for each in values]
     return MaterialCalibration(
         permittivity=numbers[0],
-        conductivity=numbers[1],
+        conductivity_s_m=numbers[1],
         permittivity_std=numbers[2],
-        conductivity_std=numbers[3],
+        conductivity_std_s_m=numbers[3],
         undetermined=tuple(undetermined),
         loss=np.minimum.accumulate([each.loss for each in fit.steps]) / used.sum(),
         noise_db=fit.point.errors.noise_db,
+        offset_db=offset_db,
         used=used[link],
         left_out=left_out,
-        gain_db=measured.gain_db,
+        gain_db=measured.gain_db - offset_db,
         gain_before_db=gains_db[0],
         gain_after_db=gains_db[1],
         start=begin,
@@ -285,6 +301,16 @@ class _Fit:
     point: Point
     posteriors: list[Posterior]
     deviations: Floats
+
+
+def _has_offset(target: MaterialTarget, start: Sequence[Material]) -> bool:
+    """Whether links in line of sight are off by more than reflections can change their gains."""
+    if target.is_direct.sum() < FEWEST_DIRECT:
+        message = "%d links in line of sight do not show an offset of all measured gains: calibrate with path gains"
+        _log.warning(message, target.is_direct.sum())
+        return False
+    values = np.transpose([[each.relative_permittivity, each.conductivity_s_m] for each in start])
+    return abs(target.offset_db(target.paths.power(*values))) >= LEAST_OFFSET_DB
 
 
 def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float, report: Progress) -> _Fit:

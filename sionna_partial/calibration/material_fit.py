@@ -214,7 +214,12 @@ class Posterior(Shown):
 
 
 class MaterialTarget:
-    """How well materials explain measured gains (N,) [dB] of links that all have a path; weight is the likelihood's."""
+    """How well materials explain measured gains (N,) [dB] of links that all have a path; weight is the likelihood's.
+
+    With `has_offset` all gains have an unknown offset, which links in line of sight show.
+    """
+
+    has_offset = False
 
     def __init__(self, paths: LinkPaths, gain_db: Floats, variance: Floats, weight: float = 1.0) -> None:
         self.paths, self.gain_db, self.variance, self.weight = paths, gain_db, variance, weight
@@ -223,9 +228,17 @@ class MaterialTarget:
 
     def at(self, values: Floats) -> Point:
         """Evaluate materials (2, M)."""
-        error_db = self.gain_db - self.gains_db(self.paths.power(*values))
+        error_db = self.errors_db(self.paths.power(*values))
         errors, loss = fit_errors(error_db, self.is_direct, self.variance)
         return Point(values, self.weight * loss + prior_loss(values), errors)
+
+    def offset_db(self, power: Floats) -> float:
+        """Return by how much links in line of sight were measured above their gains [dB], in the median."""
+        return float(np.median((self.gain_db - self.gains_db(power))[self.is_direct]))
+
+    def errors_db(self, power: Floats) -> Floats:
+        """Measured gains less those from the power of the paths (P,), without the offset (N,) [dB]."""
+        return self.gain_db - self.gains_db(power) - (self.offset_db(power) if self.has_offset else 0.0)
 
     def gains_db(self, power: Floats) -> Floats:
         """Gains (N,) [dB] from the power of the paths (P,)."""
@@ -239,7 +252,7 @@ class MaterialTarget:
         of_links = np.stack([np.bincount(link, weights=column, minlength=count) for column in slopes.T], axis=1)
         scale = (point.values - LOSSLESS).ravel()
         jacobian: Floats = of_links * (10.0 / math.log(10.0) * scale / total[:, None])
-        error_db = self.gain_db - np.maximum(10.0 * np.log10(total), LOWEST_GAIN_DB)
+        error_db = self.errors_db(power)
         _, first, second = point.errors.curve(error_db, self.is_direct, self.variance)
         information = np.broadcast_to(PRIOR_SPREAD**-2.0, point.values.shape)
         prior_slope = (information * (point.logs - np.log(PRIOR_MEDIAN))).ravel()

@@ -154,7 +154,7 @@ def _table(result: "sp.MaterialCalibration") -> str:
     lines = []
     for which, (found, start) in enumerate(zip(result.materials, result.start, strict=True)):
         own = "" if len(result.materials) == 1 else f"[{which}]"
-        stds = [float(std[which] if own else std) for std in (result.permittivity_std, result.conductivity_std)]
+        stds = [float(std[which] if own else std) for std in (result.permittivity_std, result.conductivity_std_s_m)]
         rows = (
             ("permittivity", found.relative_permittivity, stds[0], "", start.relative_permittivity),
             ("conductivity", found.conductivity_s_m, stds[1], " S/m", start.conductivity_s_m),

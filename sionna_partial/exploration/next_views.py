@@ -397,7 +397,7 @@ def _located(model: LinkModel, measured: Measurements, threshold_db: float | Non
     coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=False)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
     posterior = TransmitterPosterior(x_m, y_m, float(coverage.attrs["transmitter_m"][2]), probability)
-    tx_m, weights = posterior.draw(POSITIONS)
+    tx_m, weights, _ = posterior.draw(POSITIONS)
     relative = xr.DataArray(weights * len(weights), dims="tx")
     return tx_m, _described(relative * _entropy(coverage, threshold_db), spacing_m)
 

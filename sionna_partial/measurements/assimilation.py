@@ -43,14 +43,13 @@ NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 1
 deviation of its logarithm [dB]."""
 
 
+P_POWERS, UNSEEN_P_POWERS = 0.01, 0.0001
+"""Prior probability that powers were measured and no path gains, where the transmitter is in a cell that was seen, and
+where it is not: what all measurements have in common may then be a wall that was not seen, too."""
+
+
 class Kind(NamedTuple):
     """What measurements may be."""
-
-    chance: float
-    """How likely it is before anything was measured, where the transmitter is in a cell that was seen."""
-
-    unseen_chance: float
-    """The same where it is not: what all measurements have in common may then be a wall that was not seen, too."""
 
     offset_db: float
     """Standard deviation of an offset that all have in common [dB]."""
@@ -64,8 +63,12 @@ class Kind(NamedTuple):
     trace_std_db: float
     """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
 
+    deepest: float
+    """Where it is decided what was measured, residuals below minus this count as this: walls that were not seen make
+    single links deeper without bound [1]."""
 
-KINDS = (Kind(0.99, 0.9999, 2.0, (1.0, 0.0), 0.8, 1.0), Kind(0.01, 0.0001, 40.0, (0.5, 0.2), 4.0, 3.0))
+
+KINDS = (Kind(2.0, (1.0, 0.0), 0.8, 1.0, 3.0), Kind(40.0, (0.5, 0.2), 4.0, 3.0, math.inf))
 """Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
 
 MOST_POINTS = 500
@@ -74,6 +77,7 @@ MOST_POINTS = 500
 _SWEEPS, _DAMPING = 8, 0.5
 _REACHES = 5.0
 _LEAST_TOLD = 1e-6
+_LEAST_P = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +150,8 @@ class Assimilation:
     prior : LinkPrediction
         Of these links, without the measurements.
     frequency_hz : float
+    p_powers : float, optional
+        Prior probability that powers were measured, with an unknown offset, and no path gains.
 
     Raises
     ------
@@ -184,11 +190,14 @@ class Assimilation:
         measured: Measurements,
         prior: LinkPrediction,
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
+        p_powers: float | None = None,
     ) -> None:
         require_map("partial", partial)
         require_type("measured", measured, Measurements, "give sp.Measurements(...).")
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the measured links.")
         require_number("frequency_hz", frequency_hz, *FREQUENCIES_HZ)
+        if p_powers is not None:
+            require_number("p_powers", p_powers, 0.0, 1.0)
         if not 0 < len(measured) == len(prior.p_los):
             raise MeasurementError(
                 f"prior has {len(prior.p_los)} links, and measured {len(measured)}: give the same links, at least one."
@@ -214,16 +223,19 @@ class Assimilation:
         if std_db is not None:
             noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
         best = -math.inf
-        for kind in KINDS:
-            chance = kind.chance if self._tx_seen else kind.unseen_chance
+        if p_powers is None:
+            p_powers = P_POWERS if self._tx_seen else UNSEEN_P_POWERS
+        p_powers = min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P)
+        for kind, p_kind in zip(KINDS, (1.0 - p_powers, p_powers), strict=True):
             scale_db = averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
             factor, spread = kind.shadow
             residual = averaged(above_db - (factor - 1.0) * below_db) / scale_db
             common = np.stack([np.full(len(first), kind.offset_db), spread * averaged(below_db)]) / scale_db
             covariance = _positive(self._correlation(rx_m[first], kind.seen_reach_m)) + common.T @ common
             for noise, noise_db in noises.items():
-                log_chance = math.log(chance) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
-                log_chance += _log_evidence(covariance, residual, noise_db / scale_db, heard)
+                log_chance = math.log(p_kind) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
+                believed = np.maximum(residual, -kind.deepest)
+                log_chance += _log_evidence(covariance, believed, noise_db / scale_db, heard)
                 log_chance -= np.log(scale_db[heard]).sum()
                 if log_chance > best:
                     best, chosen = log_chance, (kind, common, covariance, residual, noise_db, scale_db)
@@ -274,7 +286,7 @@ class Assimilation:
             logs = np.log(probabilities) - 0.5 * np.log(total) - 0.5 * (gain_db - means_db) ** 2 / total
         weights = np.exp(logs - logs.max(axis=0))
         pull = np.where(np.arange(3)[:, None] == LinkState.OUTAGE, 0.0, variance / total)
-        means_db = np.maximum(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB)
+        means_db = np.clip(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB, 0.0)
         stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, variance * (1.0 - pull)), 0.0))
         return prior.where(touched, LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db))
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -35,8 +35,9 @@ transmitters of procedural homes, those included that no place hears."""
 TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
 
-OFFSETS_DB, OFFSET_CHANCE, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 0.01, 40.0
-"""Offsets that powers may have in common, how likely such an offset is, and its standard deviation [dB]."""
+OFFSETS_DB, P_POWERS, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 0.8, 40.0
+"""Offsets that powers may have in common [dB], the prior probability that they are powers and no path gains, and the
+standard deviation of the offset [dB]."""
 
 OUTDOOR = 1e-6
 """Weight of positions that are outdoors for certain."""
@@ -47,12 +48,16 @@ REGION = 0.9
 
 @dataclass(frozen=True, eq=False)
 class TransmitterPosterior:
-    """Probability (ny, nx) of each cell of a grid, whose centres are at x (nx,) and y (ny,) [m], at one height [m]."""
+    """Probability (ny, nx) of each cell of a grid, whose centres are at x (nx,) and y (ny,) [m], at one height [m].
+
+    `p_powers` (ny, nx) is the probability, given each cell, that powers were measured, with an offset, and no gains.
+    """
 
     x_m: Floats
     y_m: Floats
     height_m: float
     probability: Floats
+    p_powers: Floats | None = None
 
     @property
     def points_m(self) -> Floats:
@@ -74,12 +79,13 @@ class TransmitterPosterior:
         square = ((self.points_m - self.position_m) ** 2).sum(axis=1)
         return float(np.sqrt(square @ self.probability.ravel()))
 
-    def draw(self, count: int) -> tuple[Floats, Floats]:
-        """Return positions (K, 3) [m], drawn systematically, and their weights (K,)."""
+    def draw(self, count: int) -> tuple[Floats, Floats, list[float | None]]:
+        """Return positions (K, 3) [m], drawn systematically, their weights (K,), and P(powers) given each."""
         weights = self.probability.ravel()
         drawn = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + 0.5) / count)
         chosen, times = np.unique(drawn, return_counts=True)
-        return self.points_m[chosen], times / count
+        p_powers = [None] * len(chosen) if self.p_powers is None else self.p_powers.ravel()[chosen].tolist()
+        return self.points_m[chosen], times / count, p_powers
 
 
 def likely_region(probability: Floats) -> Bools:
@@ -117,9 +123,12 @@ def locate_transmitter(
         log_chance += _log_likelihood(prediction, some.take(np.array([index])))
     walks_m = Walks(partial, some.rx, 10.0 * REACH_M).lengths_m(some.rx)
     log_chance *= len(some) / np.exp(-walks_m / REACH_M).sum()
-    log_chance = logsumexp(log_chance + _log_offset_chance()[:, None], axis=0) + np.log(np.maximum(p_indoor, OUTDOOR))
-    posterior.probability.ravel()[possible] = np.exp(log_chance - logsumexp(log_chance))
-    return posterior
+    log_chance += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
+    joint = np.exp(log_chance - logsumexp(log_chance))
+    posterior.probability.ravel()[possible] = joint.sum(axis=0)
+    p_powers = np.zeros(posterior.probability.shape)
+    p_powers.ravel()[possible] = joint[OFFSETS_DB != 0.0].sum(axis=0) / np.maximum(joint.sum(axis=0), 1e-300)
+    return replace(posterior, p_powers=p_powers)
 
 
 def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
@@ -155,7 +164,7 @@ def _log_likelihood(prediction: LinkPrediction, measured: Measurements) -> Float
     return np.logaddexp(math.log1p(-CHANCE_OF_ANYTHING) + expected, math.log(CHANCE_OF_ANYTHING * anything))
 
 
-def _log_offset_chance() -> Floats:
-    """Log-probability of each offset: almost surely none."""
-    chance = np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2)
-    return np.log(OFFSET_CHANCE * chance / chance.sum() + (1.0 - OFFSET_CHANCE) * (OFFSETS_DB == 0.0))
+def _log_offset_prior() -> Floats:
+    """Log-probability of each offset."""
+    weight = np.where(OFFSETS_DB == 0.0, 0.0, np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2))
+    return np.log(P_POWERS * weight / weight.sum() + (1.0 - P_POWERS) * (OFFSETS_DB == 0.0))

@@ -3,13 +3,14 @@
 import logging
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.checks import number_of, real_array, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
@@ -26,8 +27,8 @@ OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 SAME_M, MOST_LINKS = 0.01, 3000
 """Links whose ends lie in the same cubes are one link [m]; number of links that are evaluated at most."""
 
-HIGHEST_STD_DB = 30.0
-"""Largest standard deviation of a gain [dB]."""
+LEAST_STD_DB, HIGHEST_STD_DB = 0.1, 30.0
+"""What smaller standard deviations of a gain count as, and the largest [dB]."""
 
 FEW_REPEATS = 10
 """Number of repetitions from which their scatter is believed rather than not."""
@@ -41,6 +42,12 @@ MOST_MEASUREMENTS = 20_000
 _log = logging.getLogger(__name__)
 
 _CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
+_OTHER_HEADERS = {
+    **{f"{axis}{unit}": f"rx_{axis}" for axis in "xyz" for unit in ("", "_m")},
+    **dict.fromkeys(("rssi", "rssi_dbm", "rsrp", "rsrp_dbm", "power_dbm"), "gain_db"),
+}
+"""What survey apps call the position of the receiver, and the received power."""
+
 _STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
 _GIVE = (
     "give a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV with the columns "
@@ -62,7 +69,8 @@ class Measurements(Shown):
     gain_db : (N,) float64 array
         Omnidirectional path gain [dB], negative. -150 is an outage.
     std_db : (N,) float64 array, optional
-        Standard deviation of each gain [dB], one number for all; estimated where it is needed and not given.
+        Standard deviation of each gain [dB], one number for all, 0.1 at least; estimated where it is needed and not
+        given.
     sensitivity_db : float
         Of the receiver [dB]: gains at or below it are known to be no higher than that.
 
@@ -102,7 +110,7 @@ class Measurements(Shown):
             if std_db.shape not in ((), gain_db.shape):
                 raise MeasurementError(f"std_db has shape {std_db.shape}: give one for all links, or one for each.")
             _require((std_db > 0.0) & (std_db <= HIGHEST_STD_DB), "std_db", std_db, _STD_REMEDY)
-            object.__setattr__(self, "std_db", np.broadcast_to(std_db, gain_db.shape).copy())
+            object.__setattr__(self, "std_db", np.maximum(np.broadcast_to(std_db, gain_db.shape), LEAST_STD_DB))
         sensitivity_db = _numbers("sensitivity_db", self.sensitivity_db)
         if sensitivity_db.shape != () or not GAIN_FLOOR_DB <= sensitivity_db <= HIGHEST_DB:
             remedy = f"give one path gain of {GAIN_FLOOR_DB:g} to {HIGHEST_DB:g} dB."
@@ -163,7 +171,7 @@ def measurements_of(source: Any) -> Measurements:
     given = f"measurements of type {type(source).__name__}"
     if isinstance(source, str | os.PathLike):
         given = f"measurements '{source}'"
-        source = read_columns(source, "measurements", MeasurementError, _CSV_COLUMNS, _GIVE)
+        source = _read(source)
     gain_db = _field(source, "gain_db")
     if gain_db is None:
         raise MeasurementError(f"gain_db is missing from {given}: {_GIVE}")
@@ -175,6 +183,67 @@ def measurements_of(source: Any) -> Measurements:
         _field(source, "std_db"),
         GAIN_FLOOR_DB if sensitivity_db is None else sensitivity_db,
     )
+
+
+def load_measurements(
+    path: str | os.PathLike[str],
+    *,
+    columns: Mapping[str, str] | None = None,
+    tx: ArrayLike | None = None,
+    tx_power_dbm: float = 0.0,
+) -> Measurements:
+    r"""Read measurements from a CSV with a header, as a survey app writes it.
+
+    Parameters
+    ----------
+    path : path-like
+        Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], gain_db, std_db [dB]; x, y, z count as the receiver's,
+        and rssi, rsrp or power_dbm as gain_db. Heights that are missing are 1.5 m.
+    columns : mapping, optional
+        Headers of the file for names of these columns, as ``{"rx_x": "east", "gain_db": "level"}``.
+    tx : (3,) array-like, optional
+        Position of the transmitter of all links [m], in place of its columns.
+    tx_power_dbm : float
+        What a receiver would report without path loss [dBm], to be subtracted from received powers. If it is not known,
+        leave it out: `predict_map` and `calibrate_materials` estimate a common offset.
+
+    Returns
+    -------
+    Measurements
+
+    Raises
+    ------
+    MeasurementError
+        If the file cannot be read, for a column that it lacks, or values that are no measurements.
+
+    Examples
+    --------
+    >>> import pathlib, sionna_partial as sp
+    >>> size = pathlib.Path("survey.csv").write_text("x,y,rssi\n3.0,2.0,-52\n5.0,4.0,-61\n")
+    >>> sp.load_measurements("survey.csv", tx=(1.0, 2.0, 1.5), tx_power_dbm=20.0).gain_db.tolist()
+    [-72.0, -81.0]
+    """
+    power_dbm = number_of(tx_power_dbm)
+    if not math.isfinite(power_dbm):
+        raise MeasurementError(f"tx_power_dbm = {shown(tx_power_dbm)} is not allowed: give a number of dBm.")
+    table = {name: np.array(values) for name, values in _read(path, columns).items()}
+    if "gain_db" in table:
+        table["gain_db"] = table["gain_db"] - power_dbm
+    return measurements_of(table if tx is None else table | {"tx": tx})
+
+
+def _read(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> dict[str, list[float]]:
+    """Read the columns of a CSV, by our names."""
+    names = {name: name for name in _CSV_COLUMNS} | _OTHER_HEADERS
+    for name, header in (columns or {}).items():
+        if name not in _CSV_COLUMNS or not isinstance(header, str):
+            raise MeasurementError(f"columns = {shown(columns)}: give a header for some of {', '.join(_CSV_COLUMNS)}.")
+        names = {key: value for key, value in names.items() if value != name} | {header.strip().lower(): name}
+    table = read_columns(path, "measurements", MeasurementError, names, _GIVE)
+    missing = [header for name, header in (columns or {}).items() if name not in table]
+    if missing:
+        raise MeasurementError(f"measurements '{path}' has no column {missing[0]!r}: check columns.")
+    return table
 
 
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
@@ -233,11 +302,8 @@ def _ends(source: Any, name: str) -> Any:
 
 def _numbers(name: str, values: ArrayLike, *, known: bool = True) -> NDArray[np.float64]:
     """Return finite numbers, and NaN where they need not be known, as a new array, or raise a MeasurementError."""
-    try:
-        array = np.asarray(values)
-        array = np.array(np.stack(list(array)) if array.dtype == object and array.size else array, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise MeasurementError(f"{name} is not an array of numbers ({error}): give finite numbers.") from error
+    cells = list(np.asarray(values)) if getattr(values, "dtype", None) == np.dtype("O") else values
+    array = real_array(name, cells, MeasurementError, "give finite numbers.").astype(np.float64)
     good = np.isfinite(array) | (np.isnan(array) & (not known))
     _require(good, name, array, "give finite numbers, or leave the link out.")
     return array
