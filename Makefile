@@ -18,7 +18,7 @@ demo: $(READY) ## Predict a half-explored demo home, and compare with the truth 
 	@$(BIN)/sionna-partial demo --out demo-output
 
 test: lint ## Check style and types, and run the tests
-	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2
+	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2 --dist loadfile
 
 docs: $(READY) ## Build the site, with its notebooks and examples run (build/docs/index.html)
 	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs

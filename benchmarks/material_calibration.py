@@ -119,7 +119,7 @@ def trial(
     error, std = loss_errors(result, material)
     inside = {
         "permittivity": abs(result.permittivity - material.relative_permittivity) <= 2.0 * result.permittivity_std,
-        "conductivity": abs(result.conductivity - material.conductivity_s_m) <= 2.0 * result.conductivity_std,
+        "conductivity": abs(result.conductivity_s_m - material.conductivity_s_m) <= 2.0 * result.conductivity_std_s_m,
     }
     return Trial(
         hidden, stage, start, error, std, rmse, inside, result.undetermined, int(result.used.sum()), seconds, result

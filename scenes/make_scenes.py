@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from sionna_partial.tracing.trace import trace_links
 
 from sionna_partial.constants import CellState
 from sionna_partial.files import atomic_write
@@ -23,6 +22,7 @@ from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings
 from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home
+from sionna_partial.tracing.simulation import trace_links
 
 STEPS = (50, 100, 150, 200)
 

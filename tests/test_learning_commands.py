@@ -134,7 +134,7 @@ class TestTrain:
     @pytest.mark.parametrize(
         ("words", "settings", "fraction"),
         [
-            ("", PredictorSettings("map", 60e9, diffraction=False), 0.3),
+            ("--passes 1", PredictorSettings("map", 60e9, diffraction=False, passes=1), 0.3),
             (
                 "--test-fraction 0.5 --networks paper --passes 2 --seed 3",
                 PredictorSettings("paper", 60e9, diffraction=False, passes=2, seed=3),
