@@ -53,6 +53,11 @@ def require_number(name: str, value: object, low: float, high: float, *, open_lo
     require(inside, name, value, f"give a number in {'(' if open_low else '['}{low:g}, {high:g}].{hint}")
 
 
+def require_memory(memory_gb: object) -> None:
+    """Raise a SettingsError unless `memory_gb` is a limit of memory [GB]."""
+    require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
+
+
 def require_whole(name: str, value: object, low: int, high: int) -> None:
     """Raise a SettingsError unless `value` is a whole number in [low, high]."""
     inside = is_whole(value, low) and int(value) <= high  # type: ignore[call-overload]
@@ -165,5 +170,7 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
     elif hint is bool or arguments == (bool, NoneType):
         require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
     elif isinstance(hint, type) and is_dataclass(hint):
+        if isinstance(value, str) and hasattr(hint, "named"):
+            value = hint.named(value)
         require(isinstance(value, hint), name, value, f"give {hint.__name__}(...).")
     return value

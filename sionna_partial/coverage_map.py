@@ -102,7 +102,7 @@ def grid_receivers(
 ) -> Receivers:
     """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
     require_height(partial, "rx_height_m", rx_height_m)
-    x_m, y_m = _grid_axes(partial, spacing_m)
+    x_m, y_m = grid_axes(partial, spacing_m)
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
@@ -123,7 +123,7 @@ def grid_receivers(
     return Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
-def _grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
+def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
     """Return the x (nx,) and y (ny,) of all cell centres that lie on the map [m]."""
     low = partial.resolution_m / 10
     require_number("spacing_m", spacing_m, low, 1e6)

@@ -1,6 +1,13 @@
 """Exceptions raised for input that cannot give a trustworthy result."""
 
 
+def one_line(text: str) -> str:
+    """Return a text, which may be of a file, without what would move the cursor of a terminal or end the line."""
+    return "".join(
+        each if each.isprintable() else " " if each == "\n" else each.encode("unicode_escape").decode() for each in text
+    )
+
+
 class SionnaPartialError(Exception):
     """Base of every error that this package raises on purpose.
 
@@ -15,6 +22,9 @@ class SionnaPartialError(Exception):
     ...     print(type(error).__name__)
     MapError
     """
+
+    def __init__(self, *arguments: object) -> None:
+        super().__init__(*(one_line(each) if isinstance(each, str) else each for each in arguments))
 
 
 class MapError(SionnaPartialError, ValueError):

@@ -19,7 +19,7 @@ from xarray.backends import H5NetCDFStore
 from sionna_partial.constants import NO_RECEIVER
 from sionna_partial.coverage_map import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.errors import OutputError, SettingsError
-from sionna_partial.files import atomic_write, output_path, read_bytes
+from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5
 from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
 from sionna_partial.network import VARIABLES, require_network
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
@@ -29,8 +29,8 @@ from sionna_partial.plots.style import figure_png
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
 """Variables in CSV and GeoTIFF; `wall_parts` is for pictures alone."""
 
-MAX_BYTES = 500_000_000
-"""Largest file that is read [bytes]."""
+MAX_BYTES, MAX_ARRAY_BYTES = 500_000_000, 4_000_000_000
+"""Largest file that is read, and size of all its arrays [bytes]."""
 
 LINK_STATES = ("link_state", "partial_link_state")
 
@@ -114,6 +114,7 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
     """
     content = read_bytes(path, "path", SettingsError, MAX_BYTES)
     try:
+        require_plain_hdf5(io.BytesIO(content), MAX_ARRAY_BYTES)
         coverage = xr.load_dataset(io.BytesIO(content), engine="h5netcdf")
     except Exception as error:
         raise SettingsError(f"path = '{path}' is no NetCDF file ({error}): give one of save_coverage.") from error

@@ -87,6 +87,32 @@ def read_bytes(
             raise error(f"{field} = '{path}' cannot be read ({cause.strerror}): check the disk.") from cause
 
 
+def require_plain_hdf5(file: Any, most: int) -> None:
+    """Raise a ValueError for an HDF5 file with data elsewhere, or with more than `most` bytes of arrays.
+
+    `file` is a path, or an open stream. Links to other files, external storage and virtual data sets are such data.
+    """
+    import h5py
+
+    total = 0
+
+    def fault(name: str, link: Any) -> str | None:
+        nonlocal total
+        if not isinstance(link, h5py.HardLink):
+            return f"{name!r} is a link, which may lead to another file"
+        entry = content[name]
+        if isinstance(entry, h5py.Dataset):
+            if entry.is_virtual or entry.external:
+                return f"{name!r} has its data in another file"
+            total += (entry.size or 0) * entry.dtype.itemsize
+        return f"its arrays have more than {most:,} bytes" if total > most else None
+
+    with h5py.File(file, "r") as content:
+        found = content.visititems_links(fault)
+    if found:
+        raise ValueError(found)
+
+
 def read_columns(
     path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Mapping[str, str], remedy: str
 ) -> dict[str, list[float]]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Progress, no_progress, real_array, require, require_choice, require_number
+from sionna_partial.checks import Progress, no_progress, real_array, require, require_choice, require_memory
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.coverage_map import (
     Receivers,
@@ -242,7 +242,7 @@ class LinkModel:
         xarray.Dataset
         """
         require_choice("receivers", receivers, RECEIVERS)
-        require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
+        require_memory(memory_gb)
         frequency_hz = self.simulation.trace_settings.frequency_hz
         to_be_found = tx is None and measurements is not None
         names, positions_m = (None, np.empty((0, 3))) if to_be_found else transmitter_positions(self.partial, tx)

@@ -60,6 +60,10 @@ Seed = Annotated[int, Within(0, 2**31 - 1)]
 Count = Annotated[int, Within(1, 1_000_000)]
 
 
+DRYWALL = "drywall"
+"""Name of the default material."""
+
+
 @dataclass(frozen=True)
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
@@ -102,6 +106,12 @@ class Material(Checked):
         if self.itu is not None:
             require_choice("itu", self.itu, ITU_BANDS_GHZ)
 
+    @classmethod
+    def named(cls, name: str) -> "Material":
+        """Return the material "drywall", which is the default, or one of ITU-R P.2040-3, by its name."""
+        require_choice("material", name, (DRYWALL, *ITU_BANDS_GHZ))
+        return cls() if name == DRYWALL else cls(itu=name)
+
     def require_frequency(self, frequency_hz: float) -> None:
         """Raise a SettingsError if the material's model does not cover `frequency_hz`."""
         require_number("frequency_hz", frequency_hz, *FREQUENCIES_HZ)
@@ -120,8 +130,9 @@ class SceneSettings(Checked):
 
     Parameters
     ----------
-    material : Material
-        Material of walls, floor and ceiling, or of those parts of a mesh that name none.
+    material : Material or str
+        Material of walls, floor and ceiling, or of those parts of a mesh that name none; or its name, as of
+        `Material.named`.
     outline_tolerance_cells : float
         Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps
         whose walls are thick and rough because of range noise, and twice as much again along ragged faces.

@@ -2,6 +2,9 @@
 
 import math
 import re
+import sqlite3
+import struct
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -248,3 +251,31 @@ class TestDamage:
             map_from_bag(3)  # type: ignore[arg-type]
         with pytest.raises(MeasurementError, match=r"drive.bag' cannot be read \(No such file or directory\)"):
             poses_from_bag(tmp_path / "drive.bag")
+
+
+class TestHostileStorage:
+    """Storage whose reader would not end, or would read another file."""
+
+    def refused(self, path: Path, message: str) -> None:
+        with pytest.raises(MapError, match=message):
+            map_from_bag(path)
+
+    def test_views(self, tmp_path: Path) -> None:
+        with closing(sqlite3.connect(tmp_path / "a.db3")) as database:
+            database.executescript(
+                "CREATE TABLE topics (id INTEGER); CREATE VIEW messages AS "
+                "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x FROM n;"
+            )
+        self.refused(tmp_path / "a.db3", "it has views in place of tables")
+
+    def test_names_that_are_uris(self, tmp_path: Path) -> None:
+        (tmp_path / "..%2Fother.db3").touch()
+        self.refused(tmp_path / "..%2Fother.db3", "characters % . # in it: rename it")
+
+    def test_huge_chunks_and_arrays(self, tmp_path: Path) -> None:
+        magic, path = b"\x89MCAP0\r\n", tmp_path / "a.mcap"
+        path.write_bytes(magic + struct.pack("<BQ16xQ", 6, 24, 20 * 10**9))
+        self.refused(path, "a chunk of 20,000,000,000 bytes")
+        schema = b"uint8[4000000000] a"
+        path.write_bytes(magic + struct.pack("<BQ", 3, len(schema)) + schema)
+        self.refused(path, "arrays of 4,000,000,000 values")

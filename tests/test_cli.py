@@ -112,7 +112,7 @@ class TestPredict:
     @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--material", "cheese"], "error: itu = 'cheese' is not allowed: choose one of vacuum"),
+            (["--material", "cheese"], "error: material = 'cheese' is not allowed: choose one of drywall, vacuum"),
             (["--material", "2,3"], "--material '2,3' is neither an ITU name nor permittivity,conductivity,thickness"),
             (["--material", "a,b,c"], "--material 'a,b,c' is neither an ITU name nor permittivity,conductivity"),
             (["--material", "0,0,1"], "error: relative_permittivity = 0.0 is not allowed"),
@@ -162,6 +162,14 @@ class TestPredict:
         monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
         run("predict", tmp_path / "none.yaml", "--tx", 1, 1, "--out", tmp_path)
         assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+
+
+@pytest.mark.usefixtures("command_line")
+def test_texts_of_files_do_not_reach_the_terminal_raw() -> None:
+    name = "a\x1b[2J\nb\u202e.yaml"
+    result = run("predict", name, "--tx", "1 1", "--out", "x")
+    assert "a\\x1b[2J b\\u202e.yaml" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
 
 
 class TestMap:

@@ -142,12 +142,14 @@ class TestSeveralTransmitters:
     def test_the_command_network_writes_the_page(self, tmp_path):
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
         options = [word for x, y in SEVERAL.values() for word in ("--tx", x, y)]
+        options += ["--tx-power", 23, "--tx-power", 20]
         words = ["network", tmp_path / "map.yaml", *options, "--spacing", 0.5, "--out", tmp_path / "out"]
         result = CliRunner().invoke(cli.app, [*map(str, words)])
         assert result.exit_code == 0, result.output
         files = ["coverage.nc", "coverage.html", "network.nc", "network.png"]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in files]
         assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(files)
+        assert xr.load_dataset(tmp_path / "out" / "network.nc").attrs["tx_power_dbm"].tolist() == [23.0, 20.0]
 
     def test_the_ros_map_of_a_network_holds_the_outage_of_all(self, several, tmp_path):
         network = network_map(several, n=50)

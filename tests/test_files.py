@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import pytest
 
-from sionna_partial.errors import MapError, OutputError
+from sionna_partial.channels.files import load_channels
+from sionna_partial.errors import MapError, OutputError, SettingsError
+from sionna_partial.export import load_coverage
 from sionna_partial.files import (
     atomic_files,
     atomic_folder,
@@ -372,3 +375,29 @@ class TestLockedFolder:
         (tmp_path / "a").touch()
         with pytest.raises(OutputError, match="a part of the path is a file"):
             locked_folder(tmp_path / "a").__enter__()
+
+
+def _virtual(file: h5py.File) -> None:
+    layout = h5py.VirtualLayout(shape=(4,), dtype="f4")
+    layout[:] = h5py.VirtualSource("other.h5", "a", shape=(4,))
+    file.create_virtual_dataset("v", layout)
+
+
+HDF5_FAULTS = {
+    "'v' has its data in another file": _virtual,
+    "'e' has its data": lambda file: file.create_dataset("e", (4,), "f4", external=[("/etc/passwd", 0, 16)]),
+    "'x' is a link": lambda file: file.__setitem__("x", h5py.ExternalLink("other.h5", "/a")),
+    "more than 4,000,000,000 bytes": lambda file: file.create_dataset("b", (60_000, 60_000), "f8", chunks=(100, 100)),
+}
+"""What is wrong with HDF5 files, and what makes them so."""
+
+
+@pytest.mark.parametrize("fault", HDF5_FAULTS)
+def test_hdf5_files_hold_their_data_themselves(tmp_path: Path, fault: str) -> None:
+    with h5py.File(tmp_path / "file.nc", "w") as file:
+        HDF5_FAULTS[fault](file)
+    with pytest.raises(SettingsError, match=fault):
+        load_coverage(tmp_path / "file.nc")
+    if "bytes" not in fault:
+        with pytest.raises(SettingsError, match=fault):
+            load_channels(tmp_path / "file.nc")

@@ -250,3 +250,28 @@ def test_compressed_pcd_holds_what_an_uncompressed_one_does(tmp_path: Path, seed
     points = np.concatenate([floor, floor * (1.0, 0.0, 0.0) + (0.0, 2.98, 1.0) + floor[::-1] * (0.0, 0.0, 100.0)])
     compressed, plain = (load_map(write(tmp_path / name, points)) for name in ("room.pcd", "room_binary.pcd"))
     assert compressed == plain
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.pts", b"3\n0 0 0\n1 1 1\n", "announces 3 points, and has 2"),
+        ("a.xyz", b"0 0 0\n1 1 1\n2 2", "without a line end and may be cut"),
+        ("a.las", b"LASF".ljust(100, b"\0") + b"\xff" * 4 + bytes(200), "4294967295 and 0 variable length records"),
+        (
+            "a.pcd",
+            b"VERSION .7\nFIELDS x y z i\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1000000000\nWIDTH 1\nHEIGHT 1\n"
+            b"POINTS 1\nDATA binary\n",
+            "announces 1000000003 values for each point",
+        ),
+    ],
+)
+def test_files_that_announce_more_than_they_hold(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MapError, match=message):
+        map_from_points(tmp_path / name)
+
+
+def test_sensors_far_from_the_points() -> None:
+    with pytest.raises(MapError, match=r"sensor_positions_m has \[10000000.0, 0.0\], more than 200 m"):
+        map_from_points(np.random.default_rng(0).uniform(0, 3, (5000, 3)), sensor_positions_m=[(1e7, 0.0)])

@@ -102,8 +102,8 @@ def test_switches(kind: type, name: str) -> None:
 
 
 def test_scene_choices() -> None:
-    with pytest.raises(SettingsError, match=r"material = 'drywall' is not allowed: give Material\(\.\.\.\)"):
-        SceneSettings(material="drywall")  # type: ignore[arg-type]
+    with pytest.raises(SettingsError, match=r"material = 5 is not allowed: give Material\(\.\.\.\)"):
+        SceneSettings(material=5)  # type: ignore[arg-type]
     for extent in ("observed", "map", "none"):
         assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]
     expected = "floor_extent = 'all' is not allowed: choose one of observed, map, none."
@@ -227,3 +227,10 @@ class TestPredictorSettings:
     def test_refused(self, change: dict[str, object], message: str) -> None:
         with pytest.raises(SettingsError, match=re.escape(message)):
             PredictorSettings(**change)
+
+
+def test_materials_by_name() -> None:
+    assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete"))  # type: ignore[arg-type]
+    assert Material.named("drywall") == Material()
+    with pytest.raises(SettingsError, match="material = 'cheese' is not allowed: choose one of drywall, vacuum"):
+        SceneSettings(material="cheese")  # type: ignore[arg-type]

@@ -4,8 +4,10 @@ import dataclasses
 import functools
 import itertools
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -450,6 +452,11 @@ class TestMemory:
         estimate = int(message.split()[1])
         links = trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR)
         assert len(links.a) == pytest.approx(estimate, rel=0.2)
+
+    @pytest.mark.parametrize("memory_gb", [0, -1, math.nan, "4"])
+    def test_limits_are_numbers(self, memory_gb: Any) -> None:
+        with pytest.raises(SettingsError, match=r"memory_gb = .* is not allowed"):
+            trace_links(_room(), (1.05, 2.95, 1.5), [(2.0, 1.0, 1.5)], memory_gb=memory_gb)
 
 
 class TestInvalidLinks:

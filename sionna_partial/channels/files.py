@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sionna_partial.channels.responses import ArrayPaths
 from sionna_partial.checks import Progress, require, require_choice, require_type
 from sionna_partial.errors import OutputError, SettingsError
-from sionna_partial.files import atomic_files, atomic_path, input_path, open_regular, output_path
+from sionna_partial.files import atomic_files, atomic_path, input_path, open_regular, output_path, require_plain_hdf5
 from sionna_partial.progress import reporting
 from sionna_partial.tracing.links import TracedLinks
 
@@ -138,9 +138,12 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
     require(source.suffix in SUFFIXES, "path", str(path), remedy)
     try:
         if source.suffix == ".zarr":
+            if not source.is_dir():
+                raise NotADirectoryError("no folder")
             table = xr.open_zarr(source, chunks=None, consolidated=False)
         else:
             open_regular(source, "path", SettingsError, MAX_BYTES).close()
+            require_plain_hdf5(source, MAX_BYTES)
             table = xr.open_dataset(source, engine="h5netcdf")
     except SettingsError:
         raise

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.channels.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
-from sionna_partial.checks import Progress, require_number, require_whole
+from sionna_partial.checks import Progress, require_memory, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MemoryLimitError
@@ -216,7 +216,7 @@ def sample_channels(
     """
     require_whole("n", n, 1, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
-    require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
+    require_memory(memory_gb)
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
     size_gb = n * np.size(tx) / 3 * np.size(rx) / 3 * _DRAW_BYTES / 1e9
     if size_gb > memory_gb:

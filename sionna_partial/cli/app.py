@@ -16,7 +16,7 @@ from sionna_partial.cli.links import channels, network
 from sionna_partial.cli.options import TransmitterCommand
 from sionna_partial.cli.planning import calibrate, next_views, place
 from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
-from sionna_partial.errors import SionnaPartialError
+from sionna_partial.errors import SionnaPartialError, one_line
 from sionna_partial.process import end_at_signals, end_process
 
 
@@ -44,7 +44,7 @@ class _WarningLine(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record."""
-        typer.echo(f"{record.levelname.lower()}: {record.getMessage()}", err=True)
+        typer.echo(f"{record.levelname.lower()}: {one_line(record.getMessage())}", err=True)
 
 
 app = typer.Typer(
@@ -91,7 +91,7 @@ def _prepare(
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ["MPLBACKEND"] = "agg"  # pictures are files, whatever the variable was
     logging.getLogger("sionna_partial").addHandler(_WarningLine(logging.WARNING))
-    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {message}", err=True)
+    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {one_line(str(message))}", err=True)
 
 
 app.command(cls=TransmitterCommand)(predict)

@@ -28,7 +28,9 @@ def network(
         typer.Option(metavar="X Y [Z]", help="Transmitter [m]; once for each.", show_default=False),
     ],
     out: Annotated[Path, typer.Option(help="Folder for coverage, network and picture.", show_default=False)],
-    tx_power: Annotated[float, typer.Option(help="Transmit power of each [dBm].")] = 20.0,
+    tx_power: Annotated[
+        list[float], typer.Option(help="Transmit power [dBm]; once for all, or once for each.", show_default="20")
+    ] = [20.0],  # noqa: B006
     noise_figure: Annotated[float, typer.Option(help="Of the receivers [dB].")] = 7.0,
     bandwidth: Annotated[float, typer.Option(help="Bandwidth [Hz].")] = 100e6,
     load: Annotated[float, typer.Option(help="Fraction of time in which an interferer transmits.")] = 1.0,
@@ -44,7 +46,7 @@ def network(
     from sionna_partial.network import LinkBudget, transmit_powers_dbm
 
     positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
-    powers_dbm = transmit_powers_dbm(tx_power, len(positions))
+    powers_dbm = transmit_powers_dbm(tx_power[0] if len(tx_power) == 1 else tx_power, len(positions))
     budget = LinkBudget(noise_figure, bandwidth, load, sinr_threshold)
     with opt.reporting_to(out, "loading the predictor") as report:
         coverage = sp.predict_map(
@@ -137,12 +139,12 @@ def _parse_shape(name: str, text: str) -> tuple[int, int]:
 
 def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     """Return positions (N, 3) in free cells [m]."""
-    from sionna_partial.placement.area import grid_positions
+    import numpy as np
 
-    x0, y0, x1, y1 = partial.bounds_m
-    if not spacing_m >= partial.resolution_m / 10.0:
-        raise typer.BadParameter(f"--spacing {spacing_m:g} is too small: give {partial.resolution_m / 10.0:g} or more.")
-    grid_m = grid_positions((x0 + spacing_m / 2.0, x1), (y0 + spacing_m / 2.0, y1), spacing_m, height_m)
+    from sionna_partial.coverage_map import grid_axes
+
+    x_m, y_m = np.meshgrid(*grid_axes(partial, spacing_m))
+    grid_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, height_m)])
     return grid_m[partial.state_at(grid_m) == CellState.FREE]
 
 

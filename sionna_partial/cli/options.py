@@ -20,7 +20,7 @@ from sionna_partial.settings import Material, SceneSettings, SensorSettings, Tra
 
 _MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
 _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
-_MATERIAL_HELP = "ITU material name, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
+_MATERIAL_HELP = "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
 
 Map = Annotated[Path, typer.Argument(metavar="MAP", help=_MAP_HELP, show_default=False)]
 Strict = Annotated[bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")]
@@ -86,7 +86,7 @@ def parse_material(text: str) -> Material:
     """Material from an ITU name or "permittivity,conductivity,thickness"; the default for ""."""
     words = text.split(",")
     if not text or len(words) == 1:
-        return Material(itu=text) if text else Material()
+        return Material.named(text) if text else Material()
     if len(words) != 3 or not all(map(_is_number, words)):
         raise typer.BadParameter(
             f"--material {text!r} is neither an ITU name nor permittivity,conductivity,thickness: "

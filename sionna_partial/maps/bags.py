@@ -2,10 +2,13 @@
 
 import math
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import re
+import sqlite3
+import struct
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,6 +28,11 @@ MAX_BAG_BYTES = 10**12
 
 MAX_MESSAGE_BYTES = MAX_CELLS + 100_000
 """Largest message that is decoded [bytes]."""
+
+MAX_CHUNK_BYTES = 2 * 10**9
+"""Size of a chunk of an MCAP that is unpacked [bytes]."""
+
+_MCAP_MAGIC, _MCAP_SCHEMA, _MCAP_CHUNK = b"\x89MCAP0\r\n", 3, 6
 
 MAX_TILT_RAD = 0.01
 """Largest roll and pitch of a map's origin that pass for level [rad]."""
@@ -98,18 +106,55 @@ def is_recording(path: Path) -> bool:
 
 
 @contextmanager
+def _plain_storage(files: Iterable[Path]) -> Iterator[None]:
+    """Raise a ValueError for storage whose reader would not end: views in SQLite, huge chunks and arrays in MCAP."""
+    for file in files:
+        if file.suffix == ".db3":
+            with closing(sqlite3.connect(f"file:{file.absolute()}?immutable=1", uri=True)) as database:
+                if database.execute("SELECT 1 FROM sqlite_master WHERE type = 'view'").fetchone():
+                    raise ValueError("it has views in place of tables")
+        if file.suffix == ".mcap":
+            with file.open("rb") as stream:
+                _require_plain_mcap(stream)
+    yield
+
+
+def _require_plain_mcap(stream: IO[bytes]) -> None:
+    """Raise a ValueError for chunks, or arrays of message types, that are larger than any map."""
+    stream.seek(len(_MCAP_MAGIC))
+    while len(head := stream.read(9)) == 9:
+        kind, length = struct.unpack("<BQ", head)
+        if kind == _MCAP_SCHEMA:
+            schema = stream.read(min(length, MAX_MESSAGE_BYTES))
+            largest = max(map(int, re.findall(rb"\[(?:<=)?(\d{1,20})\]", schema)), default=0)
+            if largest > MAX_MESSAGE_BYTES:
+                raise ValueError(f"it describes messages with arrays of {largest:,} values")
+            length -= len(schema)
+        if kind == _MCAP_CHUNK:
+            (unpacked,) = struct.unpack("<16xQ", stream.read(24))
+            if unpacked > MAX_CHUNK_BYTES:
+                raise ValueError(f"it has a chunk of {unpacked:,} bytes")
+            length -= 24
+        stream.seek(length, os.SEEK_CUR)
+
+
+@contextmanager
 def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]) -> Iterator[Recording]:
     """Open a rosbag; whatever its reader raises while it is open becomes an `error`."""
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
     source = input_path(path, "path", error, f"give a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder).")
-    for file in source.iterdir() if os.path.isdir(source) else [source]:
+    files = [*source.iterdir()] if os.path.isdir(source) else [source]
+    for file in files:
         open_regular(file, "path", error, MAX_BAG_BYTES).close()
+        if file.suffix == ".db3" and {*"%?#"} & {*str(file)}:  # its reader takes the name for a URI
+            raise error(f"path = '{file}' has one of the characters % ? # in it: rename it.")
     store = Stores.ROS1_NOETIC if source.suffix.lower() == ".bag" else Stores.LATEST
     remedy = "record it again, or repair it with rosbag reindex (ROS 1) or ros2 bag reindex."
     with (
         decoding(source, "no rosbag", error, remedy),
+        _plain_storage(files),
         AnyReader([source], default_typestore=get_typestore(store)) as reader,
     ):
         yield Recording(source, reader, error)

@@ -428,7 +428,8 @@ def plot_network(network: xr.Dataset) -> Figure:
     seen = Line2D([], [], color="0.7", label="border of the observed part")
     legend_below(figure, [Line2D([], [], label="transmitter", **_STAR), seen])
     bandwidth_mhz = float(network.attrs["bandwidth_hz"]) / 1e6
-    figure.suptitle(f"Network of {len(names)} transmitters, {bandwidth_mhz:g} MHz, load {network.attrs['load']:g}")
+    what = f"Network of {len(names)} transmitter{'s' * (len(names) > 1)}"
+    figure.suptitle(f"{what}, {bandwidth_mhz:g} MHz, load {network.attrs['load']:g}")
     return figure
 
 

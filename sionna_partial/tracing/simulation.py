@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.checks import Progress, no_progress, require, require_choice, settings_or_default
+from sionna_partial.checks import Progress, no_progress, require, require_choice, require_memory, settings_or_default
 from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
@@ -121,6 +121,7 @@ class Simulation:
         TracedLinks
         """
         require_choice("invalid", invalid, get_args(InvalidLinks))
+        require_memory(memory_gb)
         require(polarisations in (1, 2), "polarisations", polarisations, "give 1 or 2.")
         if invalid == "nan":
             tx_m, rx_m, valid = valid_links(self.partial, tx, rx, self.trace_settings.frequency_hz)

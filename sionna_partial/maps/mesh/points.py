@@ -45,6 +45,9 @@ MAX_WHOLE_BYTES = 2_000_000_000
 PART, PART_BYTES = 1_000_000, 32_000_000
 """Points, and bytes of text, that are read at a time."""
 
+MAX_FIELDS, MAX_SENSOR_M = 1000, 200.0
+"""Number of values of a point of a PCD at most, and distance of a sensor from the map [m]."""
+
 MAX_HEADER_LINES = 100
 """Lines of a PCD in which its header must end."""
 
@@ -169,6 +172,7 @@ def is_cloud(path: Path) -> bool:
 def _las(stream: IO[bytes]) -> Iterator[Floats]:
     import laspy  # type: ignore[import-untyped]
 
+    _require_records(stream)
     with laspy.open(stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
         count, header = 0, reader.header
         if header.are_points_compressed:
@@ -177,6 +181,16 @@ def _las(stream: IO[bytes]) -> Iterator[Floats]:
             count += len(part)
             yield np.column_stack([part.x, part.y, part.z])
         _require_count(count, header.point_count)
+
+
+def _require_records(stream: IO[bytes]) -> None:
+    """Raise a ValueError for a LAS that announces more variable length records than it has room for."""
+    header, size = stream.read(247).ljust(247, b"\0"), os.fstat(stream.fileno()).st_size
+    points_at, records = struct.unpack_from("<II", header, 96)
+    extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
+    if records * 54 > points_at or extended * 60 > size:
+        raise ValueError(f"it announces {records} and {extended} variable length records, more than it holds")
+    stream.seek(0)
 
 
 def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
@@ -201,6 +215,8 @@ def _pcd(stream: IO[bytes]) -> Iterator[Floats]:
     while len(lines) < MAX_HEADER_LINES and not lines[-1].startswith("DATA"):
         lines.append(stream.readline(1000).decode("ascii").strip())
     header = MetaData.parse_header([line for line in lines if line and not line.startswith("#")])
+    if sum(header.count) > MAX_FIELDS:
+        raise ValueError(f"it announces {sum(header.count)} values for each point")
     size = header.points * header.build_dtype().itemsize
     inside = os.fstat(stream.fileno()).st_size
     if header.data.value.startswith("binary_") or header.data.value == "binaryscompressed":
@@ -234,18 +250,25 @@ def _ply(stream: IO[bytes]) -> Iterator[Floats]:
 
 def _text(stream: IO[bytes]) -> Iterator[Floats]:
     """Read the first three columns of a text, after a header or a number of points, if there are any."""
-    separator, first = None, True
+    separator, first, announced, count = None, True, None, 0
     while block := stream.read(PART_BYTES):
         block += stream.readline(10_000)
+        if block[-1:] not in b"\r\n":
+            raise ValueError("it ends without a line end and may be cut: copy it again, or add a line end")
         if first:
             lines = block.splitlines(keepends=True)
             start = next((n for n, line in enumerate(lines[:50]) if _columns(line) >= 3), None)
             if start is None:
                 raise ValueError("no line has three numbers")
+            announced = next((int(line) for line in lines[:start] if line.strip().isdigit()), None)
             separator = next((mark for mark in ",;" if mark.encode() in lines[start]), None)
             block, first = b"".join(lines[start:]), False
         if block.strip():
-            yield np.loadtxt(io.BytesIO(block), delimiter=separator, usecols=(0, 1, 2), ndmin=2)
+            points = np.loadtxt(io.BytesIO(block), delimiter=separator, usecols=(0, 1, 2), ndmin=2)
+            count += len(points)
+            yield points
+    if announced is not None:
+        _require_count(count, announced)
 
 
 def _columns(line: bytes) -> int:
@@ -275,6 +298,12 @@ def _cloud_map(
         message = f'{what} looks as if y pointed up: give up="y" to turn it, or up="z" to read it as it is.'
         warnings.warn(message, MapWarning, stacklevel=4)
     empty = fitted_grid(bounds, cell)
+    if sensors is not None:
+        x0, y0, x1, y1 = empty.bounds_m
+        far = (sensors < np.array([x0, y0]) - MAX_SENSOR_M) | (sensors > np.array([x1, y1]) + MAX_SENSOR_M)
+        if far.any():
+            at = sensors[far.any(axis=1)][0].tolist()
+            raise MapError(f"sensor_positions_m has {at}, more than {MAX_SENSOR_M:g} m from the points: give metres.")
     column, row = (voxels[:, :2] - np.rint(np.array(empty.origin_m) / cell).astype(np.int64)).T
     z = (voxels[:, 2] + 0.5) * LAYER_M
     floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], reading.height_band_m)
