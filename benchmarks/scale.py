@@ -3,13 +3,15 @@
 Every measurement runs in a process of its own, on all cores. Exponents of growth are fitted to the times above one
 second. Run it with
 
-    python benchmarks/scale.py
+    python benchmarks/scale.py --maps ../shared/slam/*.yaml ../shared/floors/*/map.yaml
 
-which takes about half an hour on two cores; `--only receivers`, for instance, runs one part.
+which takes about half an hour on two cores; `--only receivers`, for instance, runs one part. The maps are measured
+among the buildings, those that are not there are skipped.
 """
 
 import argparse
 import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -21,27 +23,33 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.scene.scene import build_scene
 
-MAPS = Path(__file__).parent / "../../shared"
+RECEIVERS = 20_000
+"""Number of receivers in a building, about."""
+
+_COLUMNS = "map", "segments", "receivers", "seconds", "ms a receiver", "paths for a receiver", "peak memory"
+HEAD = f"\n| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 
 
 def main() -> None:
     """Measure, and print a table for each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", choices=["receivers", "segments", "buildings", "limit"])
-    only = parser.parse_args().only
+    parser.add_argument("--maps", type=Path, nargs="+", default=[], help="of buildings, or of robots")
+    arguments = parser.parse_args()
+    only = arguments.only
     if only in (None, "receivers"):
         growth("receivers", [("hall", count) for count in (3_000, 12_000, 50_000, 250_000)])
     if only in (None, "segments"):
         growth("segments", [(f"pillars {side}", 3_000) for side in (10, 20, 35, 50)])
     if only in (None, "buildings"):
-        buildings()
+        buildings(path for path in arguments.maps if path.exists())
     if only in (None, "limit"):
         limits()
 
 
 def growth(what: str, cases: list[tuple[str, int]]) -> None:
     """Print time and memory of several cases, and the exponent of the time."""
-    print(f"\n| map | segments | receivers | seconds | paths for a receiver | peak memory |\n|{'---|' * 6}")
+    print(HEAD)
     sizes, seconds = [], []
     for name, count in cases:
         row = isolated(measure, name, count)
@@ -53,13 +61,11 @@ def growth(what: str, cases: list[tuple[str, int]]) -> None:
         print(f"time grows with {what} to the power {exponent:.2f}")
 
 
-def buildings() -> None:
-    """Print the same for a hall as a robot maps it, complete and half, and for real floors where they are."""
-    print(f"\n| map | segments | receivers | seconds | paths for a receiver | peak memory |\n|{'---|' * 6}")
-    for name, count in (("hall", 17_000), ("half hall", 17_000)):
-        isolated(measure, name, count)
-    for path in sorted((MAPS / "floors").glob("*/map.yaml")):
-        isolated(measure, str(path), 50_000)
+def buildings(maps: Iterable[Path]) -> None:
+    """Print the same for a hall as a robot maps it, complete and half, and for real maps."""
+    print(HEAD)
+    for name in ("hall", "half hall", *maps):
+        isolated(measure, str(name), RECEIVERS)
     row = isolated(place)
     print(f"\nplace_transmitter on half the hall: {row['seconds']:.1f} s, {row['memory_gb']:.2f} GB")
 
@@ -99,7 +105,8 @@ def measure(name: str, count: int) -> dict:
     links = sp.trace_links(partial, (*tx, 1.5), some)
     segments, receivers = len(build_scene(partial).segments), int(valid.sum())
     print(
-        f"| {name} | {segments} | {receivers} | {seconds:.1f} | {len(links.a) / len(some):.0f} | {memory_gb:.2f} GB |",
+        f"| {name} | {segments} | {receivers} | {seconds:.1f} | {1e3 * seconds / receivers:.2f} "
+        f"| {len(links.a) / len(some):.0f} | {memory_gb:.2f} GB |",
         flush=True,
     )
     return {"segments": segments, "receivers": receivers, "seconds": seconds}
