@@ -32,6 +32,18 @@ DRYWALL_CONDUCTIVITY_S_M = 0.1226
 WALL_THICKNESS_M = 0.1
 """Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""
 
+MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
+"""File formats of meshes."""
+
+POINT_SUFFIXES = (".pcd", ".las", ".laz", ".xyz", ".pts")
+"""File formats of point clouds, besides PLY files without faces."""
+
+DRAWING_SUFFIXES = (".dxf",)
+"""File formats of drawings."""
+
+BAG_SUFFIXES = (".bag", ".mcap", ".db3")
+"""File formats of rosbags; one of ROS 2 may also be a folder with a metadata.yaml."""
+
 
 class LinkState(IntEnum):
     """State of a radio link (paper, Section II-B).

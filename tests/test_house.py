@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterator
 from importlib import import_module, metadata
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 import pytest
 
@@ -141,15 +141,20 @@ def declared(kind: str) -> set[str]:
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
-def loaded_by(code: str) -> set[str]:
-    """Top-level modules in a Python of its own after some code."""
+def after(code: str, names: str) -> set[str]:
+    """Names in a Python of its own after some code."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
-    report = "import sys, json; print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+    command = f"{code}\nimport sys, json; print(json.dumps(sorted({names})))"
     result = subprocess.run(
-        [sys.executable, "-c", f"{code}\n{report}"], env=environment, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", command], env=environment, capture_output=True, text=True, timeout=60
     )
     assert result.returncode == 0, result.stderr
     return set(json.loads(result.stdout.splitlines()[-1]))
+
+
+def loaded_by(code: str) -> set[str]:
+    """Top-level modules in a Python of its own after some code."""
+    return after(code, "{name.partition('.')[0] for name in sys.modules}")
 
 
 class TestOneDirection:
@@ -204,6 +209,33 @@ class TestLightImports:
         arguments = [*filter(None, [command]), "--help"]
         run = f"try:\n    app({arguments})\nexcept SystemExit as end:\n    code = end.code\nassert code == 0"
         assert not loaded_by(f"from sionna_partial.cli.app import app\n{run}") & HEAVY
+
+
+class TestOneCall:
+    """Modules of the package, its `__init__` files aside, that `predict_map` imports, and whose functions it runs."""
+
+    def test_few_modules_run(self) -> None:
+        codes: set[CodeType] = set()
+        predict = sionna_partial.predict_map
+        sys.setprofile(lambda frame, *_: codes.add(frame.f_code))
+        try:
+            predict(ROOT / "scenes/apartment/step050/map.yaml", (2.0, 2.0), spacing_m=2.0)
+        finally:
+            sys.setprofile(None)
+        files = {code.co_filename for code in codes if code.co_name != "<module>"}
+        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 40
+
+    def test_no_other_reader_is_loaded(self) -> None:
+        read = f"import sionna_partial as sp\nsp.load_map({str(ROOT / 'scenes/apartment/step100/map.yaml')!r})"
+        readers = {
+            f"sionna_partial.maps.{name}" for name in ("bags", "drawings", "mesh.cells", "mesh.files", "mesh.points")
+        }
+        assert not after(read, "sys.modules") & (readers | {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"})
+
+    def test_few_modules_are_imported(self) -> None:
+        modules = "name for name, each in sys.modules.items() if not hasattr(each, '__path__')"
+        loaded = after("import sionna_partial as sp\nsp.predict_map", f"{{{modules}}}")
+        assert len([name for name in loaded if name.startswith("sionna_partial.")]) <= 52
 
 
 class TestPublicNames:

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
 
 import sionna_partial as sp
-from sionna_partial.constants import CellState
+from sionna_partial.constants import POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh import points as points_module
-from sionna_partial.maps.mesh.points import POINT_SUFFIXES, map_from_points
+from sionna_partial.maps.mesh.points import map_from_points
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.resources import scenes_folder
 

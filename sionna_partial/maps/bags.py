@@ -14,14 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sionna_partial.checks import number_of, shown
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
+from sionna_partial.constants import BAG_SUFFIXES, DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError, SionnaPartialError
 from sionna_partial.files import decoding, input_path, open_regular
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array
 from sionna_partial.maps.ros_map import states_from_percent, turn_grid
-
-BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-"""File formats of recordings; a ROS 2 recording may also be a folder with a metadata.yaml."""
 
 MAX_BAG_BYTES = 10**12
 """Largest file of a recording [bytes]; only the messages that are asked for are read."""
@@ -98,11 +95,6 @@ class Recording:
         content = self._reader.deserialize(raw, kind)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
         return Message(time_s, None if stamp is None else stamp.sec + stamp.nanosec / 1e9, content)
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a path is a rosbag by its name, or a folder of ROS 2."""
-    return path.suffix.lower() in BAG_SUFFIXES or os.path.isfile(path / "metadata.yaml")
 
 
 @contextmanager

@@ -14,15 +14,12 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import number_of, shown
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
-
-DRAWING_SUFFIXES = (".dxf",)
-"""File formats of drawings."""
 
 MAX_DRAWING_BYTES = 100_000_000
 """Largest drawing that is read [bytes]."""

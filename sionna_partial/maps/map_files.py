@@ -4,17 +4,24 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_dilation
 
 from sionna_partial.checks import number_of, require_bool, shown
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.constants import (
+    BAG_SUFFIXES,
+    DEFAULT_WALL_HEIGHT_M,
+    DRAWING_SUFFIXES,
+    MESH_SUFFIXES,
+    POINT_SUFFIXES,
+    CellState,
+)
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.files import (
     CALIBRATED_FILE,
@@ -25,12 +32,7 @@ from sionna_partial.files import (
     output_path,
     read_bytes,
 )
-from sionna_partial.maps.bags import BAG_SUFFIXES, is_recording, map_from_bag
-from sionna_partial.maps.drawings import DRAWING_SUFFIXES, map_from_drawing
-from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, MeshReading, mesh_map
-from sionna_partial.maps.mesh.files import MAX_MESH_BYTES, MESH_SUFFIXES, read_mesh, read_mitsuba_scene
-from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, material_records
-from sionna_partial.maps.mesh.points import POINT_SUFFIXES, is_cloud, read_cloud
+from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, material_records
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
 from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
 from sionna_partial.settings import Material
@@ -121,36 +123,15 @@ def load_map(
     makers = "For arrays there are map_from_array, map_from_occupancy and map_from_points."
     source = input_path(path, "path", MapError, f"give {ACCEPTED}. {makers}")
     require_bool("strict", strict)
-    reading = MeshReading(height_band_m, observed, resolution_m, up)
-    suffix = source.suffix.lower()
     if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
-    if suffix in POINT_SUFFIXES or (suffix == ".ply" and is_cloud(source)):
-        partial = read_cloud(source, reading)
-    elif is_recording(source):
-        reading.require_unused(source, "a rosbag")
-        partial = map_from_bag(source)
-    elif os.path.isdir(source) or suffix == ".xml":
-        partial = _read_scene(source, reading)
-    elif suffix in MESH_SUFFIXES:
-        partial = mesh_map(read_mesh(source, up), reading)
-    elif suffix in DRAWING_SUFFIXES:
-        replace(reading, resolution_m=None).require_unused(source, "a drawing")
-        partial = map_from_drawing(source, resolution_m=DEFAULT_RESOLUTION_M if resolution_m is None else resolution_m)
-    else:
-        reading.require_unused(source, "none")
-        if suffix in (".yaml", ".yml"):
-            partial = read_ros_map(source, strict=strict)
-        elif suffix == ".npz":
-            partial = _read_npz(source)
-        elif suffix in COVERAGE_SUFFIXES:
-            remedy = "give the map that it was computed from; xarray.open_dataset reads a coverage (.nc)."
-            raise MapError(f"path = '{source}' is a coverage, no map: {remedy}")
-        elif suffix in (".pgm", ".png", ".bmp"):
-            remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
-            raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
-        else:
-            raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+    file, reader = _reader_of(source)
+    given = {"height_band_m": height_band_m, "observed": observed, "resolution_m": resolution_m, "up": up}
+    for name, value in given.items():
+        if value is not None and name not in reader.options:
+            raise MapError(f"{name} is for scans alone, but path = '{source}' is {reader.what}: leave it out.")
+    given["strict"] = strict or None
+    partial = reader.read(file, **{name: given[name] for name in reader.options if given[name] is not None})
     if partial.mesh is None:
         warn_of_odd_states(f"path = '{source}'", partial)
     if wall_height_m is None:
@@ -378,20 +359,43 @@ def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDAr
         raise MapError(f"{name} has shape {array.shape} and {other} {like.shape}: give arrays of one shape.")
 
 
-def _read_scene(source: Path, reading: MeshReading) -> PartialMap:
-    """Read an exported scene, or else the Mitsuba scene that a path leads to, or the map of a calibration."""
-    folder = source if source.is_dir() else source.parent
-    scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
-    if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):
-        reading.require_unused(source, "an exported map (remove its map.yaml to read the meshes of its scene alone)")
-        return read_ros_map(folder / "map.yaml", confined=True)
-    if source.is_dir() and not scenes and (folder / CALIBRATED_FILE).is_file():
-        reading.require_unused(source, "the map of a calibration")
-        return _read_npz(folder / CALIBRATED_FILE)
-    if len(scenes) != 1:
-        remedy = f"give the path of one, or {ACCEPTED}."
-        raise MapError(f"path = '{source}' is no scene: it has {len(scenes)} .xml files; {remedy}")
-    return mesh_map(read_mitsuba_scene(scenes[0]), reading)
+def _read_cloud(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.mesh.points import map_from_points
+
+    return map_from_points(source, **options)
+
+
+def _read_mesh(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+    from sionna_partial.maps.mesh.files import read_mesh
+
+    reading = MeshReading(**options)
+    return mesh_map(read_mesh(source, reading.up), reading)
+
+
+def _read_ply(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.mesh.points import is_cloud
+
+    return (_read_cloud if is_cloud(source) else _read_mesh)(source, **options)
+
+
+def _read_mitsuba(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+    from sionna_partial.maps.mesh.files import read_mitsuba_scene
+
+    return mesh_map(read_mitsuba_scene(source), MeshReading(**options))
+
+
+def _read_drawing(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.drawings import map_from_drawing
+
+    return map_from_drawing(source, **options)
+
+
+def _read_bag(source: Path) -> PartialMap:
+    from sionna_partial.maps.bags import map_from_bag
+
+    return map_from_bag(source)
 
 
 def _read_npz(source: Path) -> PartialMap:
@@ -416,3 +420,65 @@ def _read_npz(source: Path) -> PartialMap:
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
     return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material)
+
+
+def _read_exported(source: Path) -> PartialMap:
+    return read_ros_map(source, confined=True)
+
+
+class _Reader(NamedTuple):
+    """What a file is, how it is read, and with which arguments of `load_map`."""
+
+    what: str
+    read: Callable[..., PartialMap]
+    options: tuple[str, ...] = ()
+
+
+_OF_SCANS = ("height_band_m", "observed", "resolution_m", "up")
+_BAG = _Reader("a rosbag", _read_bag)
+_MITSUBA = _Reader("a Mitsuba scene", _read_mitsuba, _OF_SCANS)
+_CALIBRATED = _Reader("the map of a calibration", _read_npz)
+_EXPORTED = _Reader("an exported map (remove its map.yaml to read the meshes of its scene alone)", _read_exported)
+
+_READERS = {
+    **dict.fromkeys((".yaml", ".yml"), _Reader("none", read_ros_map, ("strict",))),
+    ".npz": _Reader("none", _read_npz),
+    **dict.fromkeys(MESH_SUFFIXES, _Reader("a mesh", _read_mesh, _OF_SCANS)),
+    **dict.fromkeys(POINT_SUFFIXES, _Reader("a point cloud", _read_cloud, _OF_SCANS)),
+    ".ply": _Reader("a mesh or a point cloud", _read_ply, _OF_SCANS),
+    **dict.fromkeys(DRAWING_SUFFIXES, _Reader("a drawing", _read_drawing, ("resolution_m",))),
+    **dict.fromkeys(BAG_SUFFIXES, _BAG),
+}
+"""Readers by suffix. Their modules, and the libraries that these need, are imported when a file is read."""
+
+
+def _reader_of(source: Path) -> tuple[Path, _Reader]:
+    """Return the file that a path leads to, and its reader."""
+    suffix = source.suffix.lower()
+    if suffix not in BAG_SUFFIXES and (source / "metadata.yaml").is_file():
+        return source, _BAG
+    if suffix == ".xml" or (source.is_dir() and suffix not in BAG_SUFFIXES):
+        return _reader_of_scene(source)
+    if suffix in COVERAGE_SUFFIXES:
+        remedy = "give the map that it was computed from; xarray.open_dataset reads a coverage (.nc)."
+        raise MapError(f"path = '{source}' is a coverage, no map: {remedy}")
+    if suffix in (".pgm", ".png", ".bmp"):
+        remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
+        raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
+    if suffix not in _READERS:
+        raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
+    return source, _READERS[suffix]
+
+
+def _reader_of_scene(source: Path) -> tuple[Path, _Reader]:
+    """Return the file of an exported scene, of the only Mitsuba scene there, or of the map of a calibration."""
+    folder = source if source.is_dir() else source.parent
+    scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
+    if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):
+        return folder / "map.yaml", _EXPORTED
+    if source.is_dir() and not scenes and (folder / CALIBRATED_FILE).is_file():
+        return folder / CALIBRATED_FILE, _CALIBRATED
+    if len(scenes) != 1:
+        remedy = f"give the path of one, or {ACCEPTED}."
+        raise MapError(f"path = '{source}' is no scene: it has {len(scenes)} .xml files; {remedy}")
+    return scenes[0], _MITSUBA

@@ -20,8 +20,7 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, open_regular, read_bytes
-from sionna_partial.maps.mesh.files import read_exported_mesh
-from sionna_partial.maps.mesh.mesh import material_records
+from sionna_partial.maps.mesh.mesh import SceneMesh, material_records
 from sionna_partial.maps.partial_map import MAX_CELLS, MAX_INTERIOR_CELLS, MapWarning, PartialMap, frontier_cells
 from sionna_partial.settings import Material
 
@@ -121,8 +120,14 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
-    mesh = read_exported_mesh(path.parent, raw["mesh"], raw.get("scene_offset")) if "mesh" in raw else None
+    mesh = _exported_mesh(path.parent, raw) if "mesh" in raw else None
     return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material)
+
+
+def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
+    from sionna_partial.maps.mesh.files import read_exported_mesh  # few maps have a mesh, and trimesh is heavy
+
+    return read_exported_mesh(folder, raw["mesh"], raw.get("scene_offset"))
 
 
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,12 +44,6 @@ class MeshReading:
     def __post_init__(self) -> None:
         if self.up is not None and not (isinstance(self.up, str) and self.up in ("z", "y")):
             raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
-
-    def require_unused(self, path: Path, what: str) -> None:
-        """Raise a MapError if anything has been given, for a file that is no scan but `what`."""
-        for name, value in vars(self).items():
-            if value is not None:
-                raise MapError(f"{name} is for scans alone, but path = '{path}' is {what}: leave it out.")
 
 
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:

@@ -25,15 +25,9 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, read_bytes
-from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES, SceneMesh, merged_mesh
+from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
-
-MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
-"""File formats of meshes."""
-
-MAX_MESH_BYTES = 2_000_000_000
-"""Largest mesh file that is read [bytes]: more should be cut or simplified first."""
 
 CUT = "cut or simplify the mesh."
 

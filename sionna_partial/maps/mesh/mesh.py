@@ -17,6 +17,9 @@ from sionna_partial.settings import Material
 MAX_TRIANGLES = 5_000_000
 """Largest number of triangles of a mesh: more should be cut or simplified first."""
 
+MAX_MESH_BYTES = 2_000_000_000
+"""Largest file of a mesh that is read [bytes]: more should be cut or simplified first."""
+
 MAX_MATERIALS = 256
 """Largest number of materials of a mesh: each triangle has one byte for its own."""
 

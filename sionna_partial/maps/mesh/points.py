@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import real_array
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, open_regular
 from sionna_partial.maps.mesh.cells import (
@@ -33,9 +33,6 @@ from sionna_partial.maps.mesh.cells import (
 from sionna_partial.maps.mesh.mesh import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.process import njit
-
-POINT_SUFFIXES = (".pcd", ".las", ".laz", ".xyz", ".pts")
-"""File formats of point clouds, besides PLY files without faces."""
 
 MAX_CLOUD_BYTES = 20_000_000_000
 """Largest point cloud that is read [bytes]; of PCD and PLY, which are read whole, `MAX_WHOLE_BYTES`."""
@@ -138,7 +135,7 @@ def map_from_points(
     """
     reading = MeshReading(height_band_m, observed, resolution_m, up)
     if isinstance(points, str | os.PathLike):
-        partial = read_cloud(Path(points), reading, sensor_positions_m)
+        partial = _read(Path(points), reading, sensor_positions_m)
     else:
         cloud = real_array("points", points, MapError, "give x, y, z in metres, (N, 3), or the path of a file.")
         if cloud.ndim != 2 or cloud.shape[1] != 3:
@@ -148,8 +145,7 @@ def map_from_points(
     return partial if wall_height_m is None else replace(partial, wall_height_m=wall_height_m)
 
 
-def read_cloud(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None = None) -> PartialMap:
-    """Read the map of a point cloud from a file."""
+def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None) -> PartialMap:
     kind = path.suffix.lower().removeprefix(".")
     reader = {"las": _las, "laz": _las, "pcd": _pcd, "ply": _ply}.get(kind, _text)
     most = MAX_WHOLE_BYTES if kind in ("pcd", "ply") else MAX_CLOUD_BYTES
