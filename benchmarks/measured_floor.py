@@ -60,17 +60,17 @@ def sensor_errors(partial: sp.PartialMap, values: NDArray[np.float64]) -> dict[s
         for draw in range(DRAWS):
             order = np.random.default_rng(draw).permutation(len(rx_m))
             known, rest = order[:number], order[number:]
-            told = Assimilation(
+            fitted = Assimilation.fit(
                 partial,
                 tx_m,
                 sp.Measurements(tx_m, rx_m[known], power_dbm[known]),
                 prior.take(known),
-                TRACE.frequency_hz,
+                frequency_hz=TRACE.frequency_hz,
             )
             guesses = {
                 "path loss, fitted": np.polyval(np.polyfit(log_m[known], power_dbm[known], 1), log_m[rest]),
                 "trace and one offset": links.gain_db[rest] + (power_dbm - links.gain_db)[known].mean(),
-                "assimilated": told.update(rx_m[rest], prior.take(rest)).gain_mean_db + told.offset_db,
+                "assimilated": fitted.update(rx_m[rest], prior.take(rest)).gain_mean_db + fitted.offset_db,
             }
             for method, guess_dbm in guesses.items():
                 squares[method].append(np.sqrt(np.mean((guess_dbm - power_dbm[rest]) ** 2)))

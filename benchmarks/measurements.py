@@ -156,8 +156,8 @@ def predictions(
                 ("prediction", known.prior, at.prior),
                 ("distance alone", known.by_distance, at.by_distance),
             ):
-                told = Assimilation(partial, tx_m, measured, source.take(chosen))
-                yield (name, str(number), method), told.update(at.rx_m, target)
+                fitted = Assimilation.fit(partial, tx_m, measured, source.take(chosen))
+                yield (name, str(number), method), fitted.update(at.rx_m, target)
             log_m = [np.log10(np.linalg.norm(rx_m - tx_m, axis=1)) for rx_m in (measured.rx, at.rx_m)]
             slope, start = np.polyfit(log_m[0], heard_db, 1)
             fitted = np.clip(start + slope * log_m[1], -150.0, 0.0)

@@ -401,7 +401,9 @@ def _transmitter_of(
         for each_m, each_p in zip(tx_m, p_powers, strict=True):
             prior, _ = _prior(model, each_m, measured.rx, at_once)
             frequency_hz = model.simulation.trace_settings.frequency_hz
-            assimilations.append(Assimilation(model.partial, each_m, measured, prior, frequency_hz, each_p))
+            assimilations.append(
+                Assimilation.fit(model.partial, each_m, measured, prior, frequency_hz=frequency_hz, p_powers=each_p)
+            )
     return _Transmitter(tx_m, weights, assimilations, position_m)
 
 

@@ -45,7 +45,7 @@ def prior(count: int, p_outage: float = 0.5, mean_db: float = -95.0, std_db: flo
     )
 
 
-def told(
+def fitted(
     rx_m: NDArray[np.float64],
     gain_db: NDArray[np.float64],
     partial: sp.PartialMap = HOUSE,
@@ -53,12 +53,12 @@ def told(
     **options: object,
 ) -> Assimilation:
     measured = sp.Measurements(UNSEEN, rx_m, gain_db, **options)
-    return Assimilation(partial, UNSEEN, measured, prior(len(rx_m), p_outage))
+    return Assimilation.fit(partial, UNSEEN, measured, prior(len(rx_m), p_outage))
 
 
 def test_what_is_measured_is_what_is_predicted_there():
     gains_db = np.where(LEFT[:, 0] > 2.5, -85.0, -100.0)
-    after = told(LEFT, gains_db, std_db=1.0).update(LEFT, prior(30))
+    after = fitted(LEFT, gains_db, std_db=1.0).update(LEFT, prior(30))
     assert np.abs(after.gain_mean_db - gains_db).mean() < 4.0
     assert (after.gain_std_db < prior(30).gain_std_db / 2).all()
     assert (after.p_outage < 0.05).all()
@@ -68,7 +68,7 @@ def test_what_is_measured_is_what_is_predicted_there():
 def test_neighbours_hear_what_a_measurement_hears(gain_db, rises):
     """A gain at the sensitivity is known to be no higher, which makes an outage likelier."""
     at, beside = LEFT[:1], LEFT[:1] + np.array([0.5, 0.0, 0.0])
-    after = told(at, np.array([gain_db]), sensitivity_db=-120.0).update(beside, prior(1))
+    after = fitted(at, np.array([gain_db]), sensitivity_db=-120.0).update(beside, prior(1))
     assert (after.p_outage[0] > 0.6) if rises else (after.p_outage[0] < 0.3)
 
 
@@ -82,7 +82,7 @@ def test_walls_stop_what_measurements_tell():
         """
     )
     here, there = np.array([[1.0, 1.0, 1.5]]), np.array([[2.5, 1.0, 1.5]])
-    measured = told(here, np.array([-80.0]), closed)
+    measured = fitted(here, np.array([-80.0]), closed)
     before, after = prior(1), measured.update(there, prior(1))
     assert all(getattr(before, each.name) == getattr(after, each.name) for each in fields(after))
     assert measured.update(here, prior(1)).p_outage[0] < 0.3
@@ -92,8 +92,8 @@ def test_where_nothing_was_seen_measurements_tell_of_places_farther_away():
     """A seen transmitter: what misleads predictions are walls not seen, and these shadow whole rooms."""
     seen_tx, at = LEFT[0], UNSEEN[None]
     measured = sp.Measurements(seen_tx, at, [-90.0])
-    told = Assimilation(HOUSE, seen_tx, measured, prior(1))
-    farther, in_sight = told.update([(8.6, 2.8, 1.5), (8.6, 1.0, 1.5)], prior(2)).p_outage
+    posterior = Assimilation.fit(HOUSE, seen_tx, measured, prior(1))
+    farther, in_sight = posterior.update([(8.6, 2.8, 1.5), (8.6, 1.0, 1.5)], prior(2)).p_outage
     assert farther < 0.4
     assert in_sight > 0.48
 
@@ -101,23 +101,23 @@ def test_where_nothing_was_seen_measurements_tell_of_places_farther_away():
 def test_a_certain_state_stays_and_its_gain_heeds_the_measurement():
     certain = prior(30, p_outage=0.0, mean_db=-80.0, std_db=0.0)
     measured = sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0))
-    told = Assimilation(HOUSE, UNSEEN, measured, certain)
-    after = told.update(LEFT, certain)
+    posterior = Assimilation.fit(HOUSE, UNSEEN, measured, certain)
+    after = posterior.update(LEFT, certain)
     assert (after.p_nlos == 1.0).all()
     assert (after.gain_std_db == 0.0).all()
     assert (after.gain_mean_db < -80.5).all()
-    assert np.abs(after.gain_mean_db + told.offset_db + 84.0).max() < told.noise_db
+    assert np.abs(after.gain_mean_db + posterior.offset_db + 84.0).max() < posterior.noise_db
 
 
 def test_priors_are_of_the_measured_links():
     with pytest.raises(MeasurementError, match="prior has 3 links, and measured 30: give the same links"):
-        Assimilation(HOUSE, UNSEEN, sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0)), prior(3))
+        Assimilation.fit(HOUSE, UNSEEN, sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0)), prior(3))
 
 
 def test_what_measurements_have_in_common_is_an_offset():
     """Powers in dBm, with transmit power and antenna gains, tell as much as path gains do."""
     gains_db = np.where(LEFT[:, 0] > 2.5, -90.0, -98.0)
-    truth, shifted = told(LEFT, gains_db, p_outage=0.0), told(LEFT, gains_db + 60.0, p_outage=0.0)
+    truth, shifted = fitted(LEFT, gains_db, p_outage=0.0), fitted(LEFT, gains_db + 60.0, p_outage=0.0)
     assert abs(truth.offset_db) < 1.0
     assert 45.0 < shifted.offset_db < 75.0
     after, other = (each.update(LEFT, prior(30, 0.0)).gain_mean_db for each in (truth, shifted))
@@ -126,7 +126,7 @@ def test_what_measurements_have_in_common_is_an_offset():
 
 
 def test_one_deep_value_is_no_offset():
-    deep = told(LEFT[:1], np.array([-120.0]), p_outage=0.05)
+    deep = fitted(LEFT[:1], np.array([-120.0]), p_outage=0.05)
     assert abs(deep.offset_db) < 5.0
     after = deep.update(LEFT[:1], prior(1, p_outage=0.05))
     assert after.gain_mean_db[0] < -112.0
@@ -134,7 +134,7 @@ def test_one_deep_value_is_no_offset():
 
 def test_tiny_standard_deviations_give_gains_that_links_have():
     twice = np.concatenate([LEFT[:2], LEFT[:2] + np.array([0.02, 0.0, 0.0])])
-    sure = told(twice, np.array([-60.0, -90.0, -90.0, -60.0]), std_db=1e-9)
+    sure = fitted(twice, np.array([-60.0, -90.0, -90.0, -60.0]), std_db=1e-9)
     after = sure.update(LEFT, prior(30))
     for name in ("gain_mean_db", "gain_nlos_mean_db", "gain_los_mean_db"):
         assert (np.abs(getattr(after, name) + 75.0) <= 75.0).all()
@@ -146,22 +146,22 @@ def test_powers_say_how_deep_shadows_are():
     depth_db = np.linspace(0.0, 40.0, 30)
     certain = prior(30, p_outage=0.0, mean_db=free_db - depth_db, std_db=0.0)
     measured = sp.Measurements(UNSEEN, LEFT, free_db - depth_db / 2 + 50.0)
-    told = Assimilation(HOUSE, UNSEEN, measured, certain)
-    assert told.shadow_scale == pytest.approx(0.5, abs=0.1)
-    assert np.abs(told.update(LEFT, certain).gain_mean_db + told.offset_db - measured.gain_db).max() < 4.0
+    posterior = Assimilation.fit(HOUSE, UNSEEN, measured, certain)
+    assert posterior.shadow_scale == pytest.approx(0.5, abs=0.1)
+    assert np.abs(posterior.update(LEFT, certain).gain_mean_db + posterior.offset_db - measured.gain_db).max() < 4.0
 
 
 def test_contradictions_count_as_noise():
     twice = np.concatenate([LEFT, LEFT + np.array([0.05, 0.0, 0.0])])
-    agreeing, contrary = (told(twice, np.repeat([-90.0, -90.0 - gap], 30)) for gap in (0.5, 18.0))
+    agreeing, contrary = (fitted(twice, np.repeat([-90.0, -90.0 - gap], 30)) for gap in (0.5, 18.0))
     assert contrary.noise_db > 2 * agreeing.noise_db
     assert contrary.update(LEFT, prior(30)).gain_std_db.mean() > agreeing.update(LEFT, prior(30)).gain_std_db.mean()
-    assert told(LEFT, np.full(30, -90.0), std_db=2.5).noise_db == pytest.approx(2.5)
+    assert fitted(LEFT, np.full(30, -90.0), std_db=2.5).noise_db == pytest.approx(2.5)
 
 
 def test_thousands_of_measurements_are_averaged_where_they_are_dense():
     many = np.column_stack([RNG.uniform(0.6, 4.2, 5000), RNG.uniform(0.6, 3.0, 5000), np.full(5000, 1.5)])
-    measured = told(many, -90.0 + 3.0 * RNG.standard_normal(5000))
+    measured = fitted(many, -90.0 + 3.0 * RNG.standard_normal(5000))
     assert len(measured._weights) <= MOST_POINTS
     assert np.abs(measured.update(LEFT, prior(30)).gain_mean_db + 90.0).max() < 4.0
 

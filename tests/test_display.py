@@ -67,7 +67,6 @@ def test_every_public_class_is_shown_in_one_line() -> None:
     classes = {name for name in sp.__all__ if isinstance(getattr(sp, name), type)}
     own = {name for name in classes if getattr(getattr(sp, name).__repr__, "__module__", "").endswith(".display")}
     others = {"CellState", "LinkState", "SionnaPartialError", "Simulation", "LinkModel", "DifferentiableScene"}
-    others.add("Assimilation")
     assert classes - own == others | ({kind.__name__ for kind in SETTINGS} & classes)
 
 

@@ -1,7 +1,8 @@
-"""Predictions that heed measurements: a Gaussian process on the residuals, correlated over the distance of a walk."""
+"""Predictions that measurements correct: a Gaussian process on the residuals, correlated over the length of walks."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,6 +16,7 @@ from scipy.special import log_ndtr
 
 from sionna_partial.checks import require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError
 from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
@@ -32,7 +34,7 @@ CELL_M = 0.3
 UNKNOWN_COST = 3.0
 """Length of a walk through unknown cells, in lengths of one through free cells."""
 
-UNSEEN_REACH_M = 12.0
+UNSEEN_RANGE_M = 12.0
 """Walk over which residuals stay correlated where both links have an end in a cell that was not seen [m]."""
 
 LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
@@ -57,7 +59,7 @@ class Kind(NamedTuple):
     shadow: tuple[float, float]
     """Mean and standard deviation of a factor on what is predicted below the gain in free space [1]."""
 
-    seen_reach_m: float
+    seen_range_m: float
     """Walk over which residuals stay correlated where both ends of a link are in cells that were seen [m]."""
 
     trace_std_db: float
@@ -72,11 +74,11 @@ KINDS = (Kind(2.0, (1.0, 0.0), 0.8, 1.0, 3.0), Kind(40.0, (0.5, 0.2), 4.0, 3.0, 
 """Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
 
 MOST_POINTS = 500
-"""Number of places with measurements from which on neighbours are averaged."""
+"""Number of measured positions from which on neighbours are averaged."""
 
 _SWEEPS, _DAMPING = 8, 0.5
-_REACHES = 5.0
-_LEAST_TOLD = 1e-6
+_RANGES = 5.0
+_LEAST_EXPLAINED = 1e-6
 _LEAST_P = 1e-6
 
 
@@ -128,8 +130,95 @@ class Walks:
         return self._nearest[row, column]
 
 
-class Assimilation:
-    """What measurements of one transmitter tell of the links to other receivers.
+@dataclass(frozen=True, eq=False)
+class _Links:
+    """The links of one transmitter (3,), and the correlation of their residuals with those that were measured."""
+
+    walks: Walks
+    tx_m: Floats
+    frequency_hz: float
+
+    @property
+    def tx_seen(self) -> bool:
+        """Whether the transmitter is in a cell that was seen."""
+        return bool(self.walks.partial.state_at(self.tx_m[None])[0] == CellState.FREE)
+
+    def free_space_db(self, rx_m: Floats) -> Floats:
+        return free_space_gain_db(np.linalg.norm(rx_m - self.tx_m, axis=1), self.frequency_hz)
+
+    def correlation(self, rx_m: Floats, kind: Kind) -> Floats:
+        """Correlation (P, N) of residuals at the measured positions and at other receivers (N, 3)."""
+        walks_m = self.walks.lengths_m(rx_m)
+        either_seen = self._both_seen(self.walks.points_m)[:, None] | self._both_seen(rx_m)
+        range_m = np.where(either_seen, kind.seen_range_m, UNSEEN_RANGE_M)
+        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
+
+    def _both_seen(self, rx_m: Floats) -> Bools:
+        """Whether both ends of the links to receivers (N, 3) are in cells that were seen."""
+        return self.tx_seen & (self.walks.partial.state_at(rx_m) == CellState.FREE)
+
+
+class _Sample(NamedTuple):
+    """M measurements in P groups of neighbours: positions (P, 3), whether received, sizes, group of each (M,)."""
+
+    measured: Measurements
+    rx_m: Floats
+    received: Bools
+    size: NDArray[np.intp]
+    group: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, measured: Measurements) -> "_Sample":
+        received = measured.gain_db > measured.sensitivity_db
+        first, group, size = grouped(measured.rx, received, MOST_POINTS)
+        return cls(measured, measured.rx[first], received[first], size, group)
+
+    def averaged(self, values: Floats) -> Floats:
+        return np.bincount(self.group, weights=values) / self.size
+
+    def noises_db(self) -> dict[float, Floats]:
+        """Return standard deviations (P,) of averages by that of a measurement [dB]: those to try, or the given."""
+        std_db = self.measured.std_db
+        if std_db is None:
+            return {noise_db: noise_db / np.sqrt(self.size) for noise_db in NOISES_DB}
+        return {LIKELY_NOISE_DB: np.sqrt(self.averaged(std_db**2) / self.size)}
+
+
+class _Hypothesis(NamedTuple):
+    """What the measurements may be, and the process that follows: residuals, covariance and noise, without unit."""
+
+    log_p: float
+    kind: Kind
+    noise_db: float
+    common: Floats
+    covariance: Floats
+    residual: Floats
+    noise: Floats
+
+
+def _hypotheses(sample: _Sample, links: _Links, prior: LinkPrediction, p_powers: float) -> Iterator[_Hypothesis]:
+    """Yield all hypotheses with the logarithms of their posterior probability, but for a constant."""
+    measured, received = sample.measured, sample.received
+    above_db = np.maximum(measured.gain_db, measured.sensitivity_db) - prior.gain_mean_db
+    below_db = prior.gain_mean_db - links.free_space_db(measured.rx)
+    for kind, p_kind in zip(KINDS, (1.0 - p_powers, p_powers), strict=True):
+        scale_db = sample.averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
+        factor, spread = kind.shadow
+        residual = sample.averaged(above_db - (factor - 1.0) * below_db) / scale_db
+        common = np.stack([np.full(len(residual), kind.offset_db), spread * sample.averaged(below_db)]) / scale_db
+        covariance = _positive(links.correlation(sample.rx_m, kind)) + common.T @ common
+        believed = np.maximum(residual, -kind.deepest)
+        for each_db, noise_db in sample.noises_db().items():
+            log_p = math.log(p_kind) - 0.5 * (math.log(each_db / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
+            log_p += _log_evidence(covariance, believed, noise_db / scale_db, received)
+            log_p -= np.log(scale_db[received]).sum()
+            mean_db = float(np.sqrt(np.mean(noise_db**2 * sample.size)))
+            yield _Hypothesis(log_p, kind, mean_db, common, covariance, residual, noise_db / scale_db)
+
+
+@dataclass(frozen=True, eq=False)
+class Assimilation(Shown):
+    """Posterior of the links to other receivers, given measurements of one transmitter: see `fit`.
 
     The residual of a link is what its gain is above the predicted mean, in predicted standard deviations. Residuals are
     a Gaussian process, whose correlation falls off with the length of the walk between receivers. A gain at or below
@@ -140,37 +229,17 @@ class Assimilation:
 
     `predict_map` does this for a map; for single links, predict the measured links, and those that are wanted.
 
-    Parameters
-    ----------
-    partial : PartialMap
-    tx_m : (3,) array-like
-        The transmitter [m].
-    measured : Measurements
-        M links of this transmitter, at least one.
-    prior : LinkPrediction
-        Of these links, without the measurements.
-    frequency_hz : float
-    p_powers : float, optional
-        Prior probability that powers were measured, with an unknown offset, and no path gains.
-
-    Raises
-    ------
-    MeasurementError
-        If `prior` has another number of links, or there are none.
-    MapError, PositionError, SettingsError
-        For arguments of another kind.
-
     Examples
     --------
     >>> import sionna_partial as sp
     >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 2, 1], [1, 0, 0, 0, 2, 1], [1, 1, 1, 1, 1, 1]]
     >>> partial, tx = sp.map_from_array(cells, resolution_m=1.0), (4.5, 1.5, 1.5)  # in a cell that was not seen
-    >>> model = sp.Predictor.load()
-    >>> def predict(rx):
-    ...     return model.predict(sp.link_features(partial, sp.trace_links(partial, tx, rx)))
+    >>> model = sp.LinkModel(partial)
     >>> measured = sp.Measurements(tx, [(1.5, 1.5, 1.5), (2.5, 2.5, 1.5)], [-81.0, -78.0])
-    >>> told, wanted = sp.Assimilation(partial, tx, measured, predict(measured.rx)), [(2.2, 1.8, 1.5)]
-    >>> bool(told.update(wanted, predict(wanted)).gain_mean_db < predict(wanted).gain_mean_db)
+    >>> posterior = sp.Assimilation.fit(partial, tx, measured, model.predict(tx, measured.rx))
+    >>> rx = [(2.2, 1.8, 1.5)]
+    >>> before = model.predict(tx, rx)
+    >>> bool(posterior.update(rx, before).gain_mean_db < before.gain_mean_db)
     True
     """
 
@@ -183,15 +252,48 @@ class Assimilation:
     shadow_scale: float
     """What gains below free space are multiplied by."""
 
-    def __init__(
-        self,
+    _kind: Kind = field(repr=False)
+    _links: _Links = field(repr=False)
+    _weights: Floats = field(repr=False)
+    _precision: Floats = field(repr=False)
+
+    @classmethod
+    def fit(
+        cls,
         partial: PartialMap,
         tx_m: ArrayLike,
         measured: Measurements,
         prior: LinkPrediction,
+        *,
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
         p_powers: float | None = None,
-    ) -> None:
+    ) -> "Assimilation":
+        """Fit the process to measurements.
+
+        Parameters
+        ----------
+        partial : PartialMap
+        tx_m : (3,) array-like
+            The transmitter [m].
+        measured : Measurements
+            M links of this transmitter, at least one.
+        prior : LinkPrediction
+            Of these links, without the measurements.
+        frequency_hz : float
+        p_powers : float, optional
+            Prior probability that powers were measured, with an unknown offset, and no path gains.
+
+        Returns
+        -------
+        Assimilation
+
+        Raises
+        ------
+        MeasurementError
+            If `prior` has another number of links, or there are none.
+        MapError, PositionError, SettingsError
+            For arguments of another kind.
+        """
         require_map("partial", partial)
         require_type("measured", measured, Measurements, "give sp.Measurements(...).")
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the measured links.")
@@ -205,47 +307,24 @@ class Assimilation:
         tx_m = position_array("tx_m", tx_m)
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
-        self._tx_m, self._frequency_hz = tx_m, float(frequency_hz)
-        rx_m, gain_db, std_db = measured.rx, measured.gain_db, measured.std_db
-        self._tx_seen = bool(partial.state_at(tx_m[None])[0] == CellState.FREE)
-        heard = gain_db > measured.sensitivity_db
-        first, place, count = places_of(rx_m, heard, MOST_POINTS)
-        heard = heard[first]
-
-        def averaged(values: Floats) -> Floats:
-            return np.bincount(place, weights=values) / count
-
-        above_db = np.maximum(gain_db, measured.sensitivity_db) - prior.gain_mean_db
-        below_db = prior.gain_mean_db - self._free_space_db(rx_m)
-        longest_m = _REACHES * max(UNSEEN_REACH_M, *(kind.seen_reach_m for kind in KINDS))
-        self._walks = Walks(partial, rx_m[first], longest_m)
-        noises = {noise: noise / np.sqrt(count) for noise in NOISES_DB}
-        if std_db is not None:
-            noises = {LIKELY_NOISE_DB: np.sqrt(averaged(std_db**2) / count)}
-        best = -math.inf
+        sample = _Sample.of(measured)
+        longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in KINDS))
+        links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
         if p_powers is None:
-            p_powers = P_POWERS if self._tx_seen else UNSEEN_P_POWERS
-        p_powers = min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P)
-        for kind, p_kind in zip(KINDS, (1.0 - p_powers, p_powers), strict=True):
-            scale_db = averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
-            factor, spread = kind.shadow
-            residual = averaged(above_db - (factor - 1.0) * below_db) / scale_db
-            common = np.stack([np.full(len(first), kind.offset_db), spread * averaged(below_db)]) / scale_db
-            covariance = _positive(self._correlation(rx_m[first], kind.seen_reach_m)) + common.T @ common
-            for noise, noise_db in noises.items():
-                log_chance = math.log(p_kind) - 0.5 * (math.log(noise / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
-                believed = np.maximum(residual, -kind.deepest)
-                log_chance += _log_evidence(covariance, believed, noise_db / scale_db, heard)
-                log_chance -= np.log(scale_db[heard]).sum()
-                if log_chance > best:
-                    best, chosen = log_chance, (kind, common, covariance, residual, noise_db, scale_db)
-        kind, common, covariance, residual, noise_db, scale_db = chosen
-        self._seen_reach_m, self._trace_std_db = kind.seen_reach_m, kind.trace_std_db
-        self.noise_db = float(np.sqrt(np.mean(noise_db**2 * count)))
-        self._weights, self._precision = _posterior(covariance, residual, heard, noise_db / scale_db)
-        in_common = common @ self._weights
-        self.offset_db = float(kind.offset_db * in_common[0])
-        self.shadow_scale = float(kind.shadow[0] + kind.shadow[1] * in_common[1])
+            p_powers = P_POWERS if links.tx_seen else UNSEEN_P_POWERS
+        hypotheses = _hypotheses(sample, links, prior, min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P))
+        best = max(hypotheses, key=lambda each: each.log_p)
+        weights, precision = _posterior(best.covariance, best.residual, sample.received, best.noise)
+        in_common, kind = best.common @ weights, best.kind
+        return cls(
+            best.noise_db,
+            float(kind.offset_db * in_common[0]),
+            float(kind.shadow[0] + kind.shadow[1] * in_common[1]),
+            kind,
+            links,
+            weights,
+            precision,
+        )
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
         """Return what is predicted of the links to receivers given the measurements, from what was before.
@@ -272,15 +351,15 @@ class Assimilation:
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m))
         prior = self._shadowed(rx_m, prior)
-        across = self._correlation(rx_m, self._seen_reach_m)
-        told = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
-        touched = told > _LEAST_TOLD
-        told = np.where(touched, told, 1.0)
-        scale_db = np.hypot(prior.gain_std_db, self._trace_std_db)
-        gain_db = prior.gain_mean_db + scale_db * (self._weights @ across) / told
-        noise_db2 = scale_db**2 * (1.0 - told) / told
+        across = self._links.correlation(rx_m, self._kind)
+        explained = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
+        informed = explained > _LEAST_EXPLAINED
+        explained = np.where(informed, explained, 1.0)
+        scale_db = np.hypot(prior.gain_std_db, self._kind.trace_std_db)
+        gain_db = prior.gain_mean_db + scale_db * (self._weights @ across) / explained
+        noise_db2 = scale_db**2 * (1.0 - explained) / explained
         probabilities, means_db, stds_db = prior.by_state
-        variance = stds_db**2 + self._trace_std_db**2
+        variance = stds_db**2 + self._kind.trace_std_db**2
         total = variance + noise_db2
         with np.errstate(divide="ignore"):
             logs = np.log(probabilities) - 0.5 * np.log(total) - 0.5 * (gain_db - means_db) ** 2 / total
@@ -288,65 +367,51 @@ class Assimilation:
         pull = np.where(np.arange(3)[:, None] == LinkState.OUTAGE, 0.0, variance / total)
         means_db = np.clip(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB, 0.0)
         stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, variance * (1.0 - pull)), 0.0))
-        return prior.where(touched, LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db))
+        return prior.where(informed, LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db))
 
     def _shadowed(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
         """Scale what is predicted of gains below free space."""
         if self.shadow_scale == 1.0:
             return prior
-        free_db = self._free_space_db(rx_m)
+        free_db = self._links.free_space_db(rx_m)
         probabilities, means_db, stds_db = prior.by_state
         scaled_db = np.maximum(free_db + self.shadow_scale * (means_db - free_db), GAIN_FLOOR_DB)
         scaled_db[LinkState.OUTAGE] = GAIN_FLOOR_DB
         return LinkPrediction.of_parts(probabilities, scaled_db, stds_db)
 
-    def _both_seen(self, rx_m: Floats) -> Bools:
-        """Whether both ends of the links to receivers (N, 3) are in cells that were seen."""
-        return self._tx_seen & (self._walks.partial.state_at(rx_m) == CellState.FREE)
 
-    def _free_space_db(self, rx_m: Floats) -> Floats:
-        return free_space_gain_db(np.linalg.norm(rx_m - self._tx_m, axis=1), self._frequency_hz)
+def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Group measurements (M,) that share a cell of the finest grid which leaves `most` groups or fewer.
 
-    def _correlation(self, rx_m: Floats, seen_reach_m: float) -> Floats:
-        """Correlation (M, N) of residuals at the measured places and at other receivers."""
-        walks_m = self._walks.lengths_m(rx_m)
-        either_seen = self._both_seen(self._walks.points_m)[:, None] | self._both_seen(rx_m)
-        reach_m = np.where(either_seen, seen_reach_m, UNSEEN_REACH_M)
-        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / reach_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
-
-
-def places_of(rx_m: Floats, heard: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """First measurement of each place, place of each measurement (M,), and number of measurements of each place.
-
-    Places are as small as leaves no more than `most` of them.
+    Returned are the first measurement of each group, the group of each measurement, and the sizes of the groups.
     """
     edge_m = 0.01
     while True:
-        keys = np.column_stack([np.floor(rx_m / edge_m), heard])
-        _, first, place, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
+        keys = np.column_stack([np.floor(rx_m / edge_m), received])
+        _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
         if len(first) <= most:
-            return first, place.ravel(), count
+            return first, group.ravel(), count
         edge_m *= 1.5
 
 
 def _positive(correlation: Floats) -> Floats:
-    """Correlation (P, P) of the places among each other, made positive definite: walks are no Euclidean distances."""
+    """Make the correlation (P, P) of positions positive definite: walks are no Euclidean distances."""
     values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
-    return (vectors * np.maximum(values, _LEAST_TOLD)) @ vectors.T
+    return (vectors * np.maximum(values, _LEAST_EXPLAINED)) @ vectors.T
 
 
-def _log_evidence(covariance: Floats, residual: Floats, noise: Floats, heard: Bools) -> float:
-    """Log-likelihood of the residuals (P,) where something was heard, but for a constant."""
-    z = residual[heard]
-    factor = cho_factor(covariance[np.ix_(heard, heard)] + np.diag(noise[heard] ** 2), lower=True)
+def _log_evidence(covariance: Floats, residual: Floats, noise: Floats, received: Bools) -> float:
+    """Log-likelihood of the residuals (P,) where something was received, but for a constant."""
+    z = residual[received]
+    factor = cho_factor(covariance[np.ix_(received, received)] + np.diag(noise[received] ** 2), lower=True)
     return float(-0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
 
 
-def _posterior(covariance: Floats, residual: Floats, heard: Bools, noise: Floats) -> tuple[Floats, Floats]:
-    """Weights (P,) and matrix (P, P) with which the process predicts; where nothing was heard, residuals are bounds."""
-    precision = np.where(heard, 1.0 / noise**2, 0.0)
+def _posterior(covariance: Floats, residual: Floats, received: Bools, noise: Floats) -> tuple[Floats, Floats]:
+    """Weights (P,) and matrix (P, P) with which the process predicts; residuals of nothing received are bounds."""
+    precision = np.where(received, 1.0 / noise**2, 0.0)
     shift = precision * residual
-    for _ in range(1 if heard.all() else _SWEEPS):
+    for _ in range(1 if received.all() else _SWEEPS):
         inverse = _inverse(covariance, precision)
         variance = np.diag(covariance - covariance @ inverse @ covariance)
         mean = covariance @ (shift - inverse @ (covariance @ shift))
@@ -359,8 +424,8 @@ def _posterior(covariance: Floats, residual: Floats, heard: Bools, noise: Floats
         tilted_mean = cavity_mean - cavity * ratio / spread
         bounded_precision = np.clip(1.0 / tilted - 1.0 / cavity, 0.0, 1e6)
         bounded_shift = tilted_mean / tilted - cavity_mean / cavity
-        precision = np.where(heard, precision, (1 - _DAMPING) * precision + _DAMPING * bounded_precision)
-        shift = np.where(heard, shift, (1 - _DAMPING) * shift + _DAMPING * bounded_shift)
+        precision = np.where(received, precision, (1 - _DAMPING) * precision + _DAMPING * bounded_precision)
+        shift = np.where(received, shift, (1 - _DAMPING) * shift + _DAMPING * bounded_shift)
     inverse = _inverse(covariance, precision)
     return shift - inverse @ (covariance @ shift), inverse
 

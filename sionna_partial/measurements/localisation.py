@@ -13,7 +13,7 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.assimilation import LIKELY_NOISE_DB, Walks, places_of
+from sionna_partial.measurements.assimilation import LIKELY_NOISE_DB, Walks, grouped
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.predictor import LinkPrediction
 
@@ -109,7 +109,7 @@ def locate_transmitter(
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
     heard = measured.gain_db > measured.sensitivity_db
-    some = measured.take(places_of(measured.rx, heard, MOST_PLACES)[0])
+    some = measured.take(grouped(measured.rx, heard, MOST_PLACES)[0])
     possible = np.flatnonzero(allowed(points_m))
     if not len(possible):
         raise PositionError("a transmitter can be nowhere: no position is away from walls and measured places.")

@@ -63,7 +63,7 @@ CALLS = {
     "plot_map": {"partial": "room()"},
     "Measurements": {"tx": "[TX]", "rx": "[(3.1, 2.5, 1.5)]", "gain_db": "[-70.0]"},
     "link_features": {"partial": "room()", "links": "links()"},
-    "Assimilation": {"partial": "room()", "tx_m": "TX", "measured": "measured()", "prior": "prediction()"},
+    "Assimilation.fit": {"partial": "room()", "tx_m": "TX", "measured": "measured()", "prior": "prediction()"},
     "TracedLinks.cir": {"self": "links()"},
     "TracedLinks.cfr": {"self": "links()", "frequencies_hz": "[0.0, 1e6]"},
     "TracedLinks.taps": {"self": "links()", "bandwidth_hz": "1e8"},
