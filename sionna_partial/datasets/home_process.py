@@ -1,7 +1,8 @@
 """Homes of a data set, each made in a process beside the worker: one that crashes or hangs costs itself alone.
 
 A process serves one home after the other, so that libraries load and compile once. It ends when the worker does, or
-when it has had nothing to do for a while.
+when it has had nothing to do for a while. Pools of concurrent.futures and pebble would do if they did not spawn: that
+imports `__main__` again, so that a user's script without a guard would begin again in every process.
 """
 
 import contextlib

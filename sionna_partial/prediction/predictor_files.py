@@ -28,20 +28,19 @@ if TYPE_CHECKING:
 FORMAT = "sionna_partial predictor 2"
 """First entry of every card."""
 
-SUFFIX = ".keras"
+SUFFIX, WEIGHTS_FILE = ".keras", "model.weights.h5"
 
 _MAX_BYTES = 64_000_000
 _MAX_CONFIG_BYTES, _MAX_SIZE = 1_000_000, 512
 """Bytes of the configuration of a model, and the largest number in it; ours have 150,000 and 112."""
 
-_FIXED_DATE = (1980, 1, 1, 0, 0, 0)
 _CLASSES = {
     *("Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"),
     *("Conv2D", "BatchNormalization", "MaxPooling2D", "UpSampling2D", "Maximum", "Log10"),
     *("DTypePolicy", "GlorotUniform", "Zeros", "Ones", "Constant", "__keras_tensor__"),
 }
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
-"""Names that Keras numbers through a process; each of our networks has one of each."""
+"""Operations, which take no name: Keras numbers them through a process. Each of our networks has one of each."""
 
 _INPUTS = dict.fromkeys(GAIN_INPUTS, (None, 1))
 _OUTPUTS = {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}
@@ -55,22 +54,18 @@ _FIXED_ENTRIES = {
 
 
 def pack(model: "keras.Model") -> bytes:
-    """Return the `.keras` archive of a model, without dates, addresses and counters that differ from run to run."""
-
-    def without_run(entry: dict[str, Any]) -> dict[str, Any]:
-        return {key: value for key, value in entry.items() if key not in ("shared_object_id", "date_saved")}
-
+    """Return the `.keras` archive of a model, without the date that Keras writes: a training has one hash."""
+    keras = import_keras()
+    config = json.dumps(keras.saving.serialize_keras_object(model)).encode()
+    metadata = json.dumps({"keras_version": keras.__version__}).encode()
     with temporary_folder() as folder:
-        path = folder / f"model{SUFFIX}"
-        model.save(path)
-        packed = io.BytesIO()
-        with zipfile.ZipFile(path) as source, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
-            for name in sorted(source.namelist()):
-                content = source.read(name)
-                if name.endswith(".json"):
-                    content = json.dumps(json.loads(content, object_hook=without_run), sort_keys=True).encode()
-                    content = _COUNTED.sub(rb'"\1"', content)
-                target.writestr(zipfile.ZipInfo(name, _FIXED_DATE), content, zipfile.ZIP_DEFLATED)
+        model.save_weights(folder / WEIGHTS_FILE)
+        weights = (folder / WEIGHTS_FILE).read_bytes()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as target:
+        entries = {"metadata.json": metadata, "config.json": _COUNTED.sub(rb'"\1"', config), WEIGHTS_FILE: weights}
+        for name, content in entries.items():
+            target.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
     return packed.getvalue()
 
 

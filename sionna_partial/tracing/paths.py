@@ -126,7 +126,10 @@ class PathColumns:
 
 
 class PathFiles:
-    """All paths of a trace, in a `.npy` file for each column, in an existing folder."""
+    """All paths of a trace, in a `.npy` file for each column, in an existing folder.
+
+    Not zarr's: its arrays are compressed chunks, and the columns of `TracedLinks` are memory maps of these files.
+    """
 
     def __init__(self, depth: int, folder: Path, polarisations: int) -> None:
         self._folder, self._count, self._room = folder, 0, (depth, polarisations)
