@@ -352,6 +352,7 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
     optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
+    optimizer.build(weights)  # or TensorFlow traces the step again, after the first has made variables
 
     def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
         with tf.GradientTape() as tape:
@@ -365,7 +366,7 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
         optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
         return loss
 
-    compiled: Callable[..., Any] = tf.function(step, jit_compile=False)
+    compiled: Callable[..., Any] = tf.function(step, autograph=False, jit_compile=False)
     return compiled
 
 
