@@ -309,16 +309,16 @@ def test_gap_of_a_tilted_wall_is_closed_and_a_door_is_not(angle_deg: float, thic
 
 @pytest.mark.parametrize("angle_deg", [0, 3, 17, 45, 60, 87])
 @pytest.mark.parametrize("thickness", [0.0, -1.0])
-@pytest.mark.parametrize("phase", [0.11, 0.37, 0.8])
-def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: float, phase: float) -> None:
-    partial = tilted(angle_deg, thickness, phase)
-    outlines = wall_outlines(partial)
-    assert len(outlines.segments) == 1
-    start, end = in_cells(partial, outlines)[0] - 70
-    found = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0]))
-    assert abs((found - angle_deg + 90) % 180 - 90) < 0.6
-    assert 97 < np.hypot(*(end - start)) < 101
-    assert farthest_from_outlines(partial, outlines) < 0.8
+def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: float) -> None:
+    for phase in (0.11, 0.37, 0.8):
+        partial = tilted(angle_deg, thickness, phase)
+        outlines = wall_outlines(partial)
+        assert len(outlines.segments) == 1
+        start, end = in_cells(partial, outlines)[0] - 70
+        found = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0]))
+        assert abs((found - angle_deg + 90) % 180 - 90) < 0.6
+        assert 97 < np.hypot(*(end - start)) < 101
+        assert farthest_from_outlines(partial, outlines) < 0.8
 
 
 @pytest.mark.parametrize("angle_deg", [3, 17, 45])

@@ -86,9 +86,8 @@ def test_commands_and_their_options_exist() -> None:
         assert set(re.findall(r"--[a-z-]+", arguments)) <= {*options, "--help"}, f"{name}{arguments}"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_linked_files_and_headings_exist(page: Path) -> None:
-    for target, anchor in links(page):
+def test_linked_files_and_headings_exist() -> None:
+    for page, (target, anchor) in ((each, link) for each in PAGES for link in links(each)):
         assert target.is_file(), f"{page.name} links to {target}"
         assert not anchor or anchor in anchors(target), f"{page.name} links to {target.name}#{anchor}"
 

@@ -218,20 +218,19 @@ def test_scenes_without_walls_or_floor_load(text: str, names: set[str], tmp_path
     assert count_paths(scene, (10.0, 0.0, 1.5), (11.0, 0.0, 1.5)) >= 1
 
 
-@pytest.mark.parametrize("name", list(ITU_BANDS_GHZ))
-def test_every_itu_material_loads_with_its_constants(name: str, tmp_path: Path) -> None:
-    low, high = ITU_BANDS_GHZ[name][0]
-    frequency_hz = float(np.clip(28.0, low, high)) * 1e9
-    chosen = SceneSettings(material=Material(itu=name, thickness_m=0.07))
-    scene = load(export_scene(drawn(ROOM), tmp_path / "scene", chosen, frequency_hz=frequency_hz))
-    from sionna.rt.radio_materials.itu import itu_material
+def test_every_itu_material_loads_with_its_constants(tmp_path: Path) -> None:
+    for name, bands in ITU_BANDS_GHZ.items():
+        frequency_hz = float(np.clip(28.0, *bands[0])) * 1e9
+        chosen = SceneSettings(material=Material(itu=name, thickness_m=0.07))
+        scene = load(export_scene(drawn(ROOM), tmp_path / name, chosen, frequency_hz=frequency_hz))
+        from sionna.rt.radio_materials.itu import itu_material
 
-    scene.frequency = frequency_hz
-    (material,) = scene.radio_materials.values()
-    permittivity, conductivity = itu_material(name, frequency_hz)
-    assert material.relative_permittivity.numpy() == pytest.approx(float(permittivity), rel=1e-5)
-    assert material.conductivity.numpy() == pytest.approx(float(conductivity), rel=1e-4, abs=1e-12)
-    assert material.thickness.numpy() == pytest.approx(0.07)
+        scene.frequency = frequency_hz
+        (material,) = scene.radio_materials.values()
+        permittivity, conductivity = itu_material(name, frequency_hz)
+        assert material.relative_permittivity.numpy() == pytest.approx(float(permittivity), rel=1e-5)
+        assert material.conductivity.numpy() == pytest.approx(float(conductivity), rel=1e-4, abs=1e-12)
+        assert material.thickness.numpy() == pytest.approx(0.07)
 
 
 def test_frequency_outside_the_material_is_refused_and_nothing_written(tmp_path: Path) -> None:
