@@ -1,4 +1,4 @@
-"""Signals that end a process, folders that are removed with it, and where compiled code is cached."""
+"""Signals that end a process, folders that are removed with it, its cores, and where compiled code is cached."""
 
 import contextlib
 import fcntl
@@ -12,17 +12,22 @@ import stat
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """Signals that end the command line."""
 
 GRACE_S = 1.0
 """Time that native code has to return before the process ends without it [s]."""
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
 
 _cleanups: list[Callable[[], object]] = []
 
@@ -125,6 +130,30 @@ def _locked(folder: Path, *, must: bool = False) -> Iterator[None]:
         yield
     finally:
         os.close(descriptor)
+
+
+def core_count() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
+def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
+    """Yield ``function(item)`` for all items in their order, computed by one thread a core.
+
+    No more than two results a core wait to be taken, which bounds the memory.
+    """
+    waiting: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(core_count()) as pool:
+        try:
+            for item in items:
+                waiting.append(pool.submit(function, item))
+                if len(waiting) >= 2 * core_count():
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            for future in waiting:
+                future.cancel()
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:

@@ -21,7 +21,7 @@ from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing import engine
+from sionna_partial.tracing import engine, simulation
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.gradients import gain_gradients
 from sionna_partial.tracing.links import TracedLinks
@@ -442,12 +442,15 @@ class TestPathsOnDisk:
 
 
 class TestMemory:
-    def test_paths_that_do_not_fit_are_refused_first(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def test_paths_that_do_not_fit_are_refused_first(
+        self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
         caplog.set_level("INFO", "sionna_partial")
-        rx = _grid(_room(), 0.04)
-        assert len(rx) > 10_000
-        with pytest.raises(MemoryLimitError, match=r"memory_gb = 0.01 is too little for about .* give a folder"):
-            trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR, memory_gb=0.01)
+        monkeypatch.setattr(simulation, "RECEIVERS_OF_PLAN", 1_000)
+        rx = _grid(_room(), 0.04)[::6]
+        assert len(rx) > 1_600
+        with pytest.raises(MemoryLimitError, match=r"memory_gb = 0.001 is too little for about .* give a folder"):
+            trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR, memory_gb=0.001)
         (message,) = [message for message in caplog.messages if "paths" in message]
         estimate = int(message.split()[1])
         links = trace_links(_room(), (1.05, 2.95, 1.5), rx, trace_settings=SPECULAR)

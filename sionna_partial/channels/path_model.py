@@ -18,12 +18,12 @@ from scipy.special import expit
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.cores import core_count
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
+from sionna_partial.process import core_count
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import DIFFRACTION, zenith_azimuth

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.cores import in_order
-from sionna_partial.process import njit
+from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power, utd_terms
