@@ -317,6 +317,16 @@ class TestWalls:
         cut = dataclasses.replace(SCREEN, state=np.where(np.arange(10) == 4, CellState.UNKNOWN, SCREEN.state))
         assert LOS not in possible(cut, (1.5, 4.5), rx, state)
 
+    @pytest.mark.parametrize("noise", [0.0, 1.0])
+    @pytest.mark.parametrize("length", [2.5, 3.5])
+    def test_three_cells_of_wall_leave_no_los_but_traced_on_exact_walls(self, length, noise):
+        """Through a wall from its end, the lines beside the direct one are clear."""
+        post = drawn("?........ ......... .#######. ......... ?........")
+        vars(post)["wall_noise"] = noise
+        for state in (OUTAGE, LOS, NLOS):
+            found = possible(post, (8.5 - length, 2.5), (8.5, 2.5), state)
+            assert (LOS in found) == (length < 3.0 or (state, noise) == (LOS, 0.0))
+
     def test_past_the_end_of_a_wall_and_along_its_face_the_trace_is_in_doubt(self):
         assert possible(SCREEN, (0.5, 3.5), (9.5, 1.5), NLOS) == ALL
         assert possible(SCREEN, (4.9, 6.5), (5.1, 0.5), LOS) == ALL
@@ -346,6 +356,10 @@ class TestRegions:
         assert possible(ROOM, (4.5, 4.5), (8.4, 3.5), OUTAGE) == {OUTAGE}
         assert possible(ROOM, (8.4, 3.5), (4.5, 4.5), OUTAGE) == {OUTAGE}
         assert possible(ROOM, (4.5, 4.5), (11.5, 6.5), OUTAGE) == {OUTAGE}
+
+    def test_walls_that_reach_the_border_of_a_crop_may_end_beyond_it(self):
+        crop = drawn("...#... ...#... ...#... ...#...")
+        assert possible(crop, (1.5, 1.5), (5.5, 2.5), OUTAGE) == ALL - {LOS}
 
     def test_what_is_not_in_outage_in_it_is_in_none(self):
         assert possible(ROOM, (3.5, 3.5), (5.5, 4.5), LOS) == {LOS}

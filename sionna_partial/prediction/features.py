@@ -39,8 +39,17 @@ _PATHS_AT_ONCE = 100_000
 SEEN_M = 1e-3
 """Unobserved length below which a path is wholly in observed space [m]."""
 
+LEAST_NOISE = 0.1
+"""Noise of walls up to which a map counts as exact: the edges of what a robot has seen are rough, too."""
+
 _ASIDE_CELLS = 1.5
 """How far to both sides a line has to run into known walls to cross one: the uncertainty of a map [cells]."""
+
+_OPAQUE_CELLS = 3.0
+"""Length of a line in known walls from which it has no LOS, unless it is traced on exact walls [cells]."""
+
+_BEYOND_CELLS = 2
+"""Width of what is labelled around a map, so that walls that reach its border do not part it [cells]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +125,8 @@ class LinkContext(Shown):
             complete[here] = is_enclosed(partial, *ends)
             walled_m[here] = walled_lengths_m(partial, *ends)
             wall_noise[here] = 0.0 if complete[here].all() else partial.wall_noise
-            seen, walled = unobserved_distance_m[here] == 0.0, walled_m[here] > 0.0
-            possible[here] = _possible_states(partial, ends, link_state[here], seen, walled)
+            seen = unobserved_distance_m[here] == 0.0
+            possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
         found = (tx_seen, rx_seen, complete, walled_m, wall_noise, possible)
         _, window_index = transmitters(map_index, tx_m)
         return cls(tx_m, rx_m, *found, indirect_gain_db, strongest_unobserved_m, window_index)
@@ -229,13 +238,14 @@ def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
 
 
 def _possible_states(
-    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, seen: Bools, walled: Bools
+    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, seen: Bools, walled_m: Floats
 ) -> Bools:
     """Return which link states a map leaves possible (N, 3), whatever the networks predict.
 
     - A direct line that crosses a known wall has no LOS. It crosses one where the lines a cell and a half to its left
-      and right both run into known walls, and it does itself (`walled`), or is blocked in the trace: past the corner or
-      along the face of a wall, one of the three stays clear.
+      and right both run into known walls, and it does itself (`walled_m`), or is blocked in the trace: past the corner
+      or along the face of a wall, one of the three stays clear. Posts are narrower, and outlines of noisy walls leak:
+      a line that is in known walls for three cells crosses one, too, but for LOS traced along exact walls.
     - On a direct line that is wholly observed (`seen`) and meets no wall, LOS is as traced.
     - Regions are the parts of a map that known walls separate, gaps of two cells or less being closed. Where the ends
       are in different regions, or in one that is wholly observed, an outage of the trace is an outage, and in one that
@@ -246,8 +256,13 @@ def _possible_states(
     los, states = link_state == LinkState.LOS, np.arange(len(LinkState))
     possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
     if partial.mesh is None:
+        walled = walled_m > 0.0
         doubtful = (walled & ~(seen & los)) | ~los
         blocked[doubtful] = _crosses_wall(partial, *(end_m[doubtful] for end_m in ends_m))
+        opaque = walled_m >= _OPAQUE_CELLS * partial.resolution_m
+        if (opaque & los & ~blocked).any() and partial.wall_noise <= LEAST_NOISE:
+            opaque &= ~los
+        blocked |= opaque
         walled_off, enclosed = _regions(partial, *ends_m)
         outage = (walled_off | enclosed) & (link_state == LinkState.OUTAGE)
         possible[outage] = states == LinkState.OUTAGE
@@ -272,7 +287,7 @@ def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
 
 def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
     """Whether both ends of links (N,) are in different regions, and whether both are in one that is wholly observed."""
-    state = np.pad(partial.state, 1, constant_values=CellState.UNKNOWN)
+    state = np.pad(partial.state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
     regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
     observed = np.ones(count + 1, dtype=bool)
     observed[regions[state == CellState.UNKNOWN]] = False
@@ -284,11 +299,11 @@ def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bo
 def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats) -> NDArray[np.int32]:
     """Return the region (N,) of points (N, 3) [m], which may be in it or beside it; 0 where there is none, or two.
 
-    `regions` (ny + 2, nx + 2) are those of the map's cells and of the cells around it; 0 within a cell of a wall.
+    `regions` are those of the map's cells and of the `_BEYOND_CELLS` around it; 0 within a cell of a wall.
     """
-    row, column = partial.cell_index(points_m)
+    row, column = (index + _BEYOND_CELLS for index in partial.cell_index(points_m))
     around = [
-        regions[np.clip(row + 1 + up, 0, len(regions) - 1), np.clip(column + 1 + right, 0, regions.shape[1] - 1)]
+        regions[np.clip(row + up, 0, len(regions) - 1), np.clip(column + right, 0, regions.shape[1] - 1)]
         for up, right in itertools.product((-1, 0, 1), repeat=2)
     ]
     largest = np.max(around, axis=0)

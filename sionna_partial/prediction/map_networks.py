@@ -21,7 +21,7 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import LinkContext, LinkFeatures
+from sionna_partial.prediction.features import LEAST_NOISE, LinkContext, LinkFeatures
 from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
@@ -50,9 +50,6 @@ LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 
 GAIN_WEIGHT = 0.05
 """Weight of the score of the gain beside the log-likelihood of the link state [1/dB]."""
-
-LEAST_NOISE = 0.1
-"""Noise of walls up to which a map counts as exact: the edges of what a robot has seen are rough, too."""
 
 WIDENING, SEEN_WIDENING = 0.15, 0.5
 """By how much standard deviations are larger on maps of full noise, and where both ends are observed.
