@@ -189,6 +189,18 @@ def test_dark_grey_walls(tmp_path: Path, negate: bool) -> None:
     assert load_state(tmp_path, [[90, 127, 127, 0]] * 150)[0] == [UNKNOWN, UNKNOWN, UNKNOWN, WALL]
 
 
+@pytest.mark.parametrize(("mode", "grey"), [("trinary", 205), ("scale", 120)])
+def test_inflated_costmap(tmp_path: Path, mode: str, grey: int) -> None:
+    """Grey between walls and free cells gets a warning, walls beside free cells with grey behind them none."""
+    shades = np.full((80, 80), 254)
+    shades[20:60, 20:60] = grey
+    shades[22:58, 22:58] = 0
+    with pytest.warns(MapWarning, match=r"between 100% of the walls and the free cells, as in an inflated costmap"):
+        load_map(write_map(tmp_path, shades, mode=mode))
+    shades[20:60, 20:22] = 254
+    load_map(write_map(tmp_path, shades, mode=mode))
+
+
 def test_warning_points_to_the_caller(tmp_path: Path) -> None:
     path = write_map(tmp_path, [[0, 205, 254]], free_thresh=0.25)
     with pytest.warns(MapWarning) as caught:

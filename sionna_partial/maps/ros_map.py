@@ -44,8 +44,11 @@ MAX_IMAGE_BYTES = 16 * MAX_CELLS
 DARK_OCCUPANCY = 0.51
 """Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
 
-FEW_DARK = 100
-"""Number of dark grey pixels up to which nothing is said."""
+FEW_CELLS = 100
+"""Number of dark grey pixels, or of wall cells, up to which nothing is said."""
+
+TOUCHED_WALLS = 0.1
+"""Fraction of the walls that free cells touch up to which a map looks inflated."""
 
 MAX_YAW_RAD = 6.2832
 """Largest yaw of a map's origin: one turn, as people round it; more is meant in degrees [rad]."""
@@ -115,7 +118,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     state = _classify(pixels, sheet)
     if sheet.mode == "trinary" and not strict:
         _keep_unknown(state, pixels, sheet)
-    if not strict:
+    if not (strict or _warn_of_inflation(state, sheet)):
         _warn_of_dark_unknown(state, pixels, sheet)
     state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
@@ -384,13 +387,26 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
     return state
 
 
+def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
+    """Warn if hardly any free cell touches a wall, as around the inflated obstacles of a costmap."""
+    wall, free, square = state == CellState.WALL, state == CellState.FREE, np.ones((3, 3), dtype=bool)
+    faces = wall & binary_dilation(~wall, square)
+    apart = 1.0 - (faces & binary_dilation(free, square)).sum() / max(1, faces.sum())
+    inflated = bool(faces.sum() > FEW_CELLS and free.any() and apart >= 1.0 - TOUCHED_WALLS)
+    if inflated:
+        what = f"grey (unknown) lies between {apart:.0%} of the walls and the free cells, as in an inflated costmap"
+        remedy = "links across it would be unobserved; save the map of the topic /map or of the static layer."
+        warnings.warn(f"{sheet.source}: {what}: {remedy}", MapWarning, stacklevel=4)
+    return inflated
+
+
 def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
     """Warn of dark grey pixels that lie between the thresholds, if they are more than the walls."""
     full = 255 * pixels.per_shade + pixels.opaque
     occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
     dark = (state == CellState.UNKNOWN) & (occupancy > DARK_OCCUPANCY)
     dark &= True if pixels.alpha is None else pixels.alpha > 0
-    if sheet.mode == "raw" or dark.sum() <= max((state == CellState.WALL).sum(), FEW_DARK):
+    if sheet.mode == "raw" or dark.sum() <= max((state == CellState.WALL).sum(), FEW_CELLS):
         return
     lowest = float(occupancy[dark].min())
     what = f"{int(dark.sum()):,} dark grey cells (occupancy from {lowest:.2f}) are read as unknown"
