@@ -1,5 +1,6 @@
 """Measured gains change predictions where they tell something, and nothing else."""
 
+import functools
 import logging
 from dataclasses import fields, replace
 
@@ -32,7 +33,13 @@ TX = np.array([8.0, 2.2, 1.5])
 UNSEEN = np.array([7.0, 2.8, 1.5])
 RNG = np.random.default_rng(0)
 LEFT = np.column_stack([RNG.uniform(0.6, 4.2, 30), RNG.uniform(0.6, 3.0, 30), np.full(30, 1.5)])
-OPTIONS = {"spacing_m": 0.4, "predictor": "paper"}
+OPTIONS = {"spacing_m": 0.4}
+
+
+@functools.cache
+def model() -> sp.LinkModel:
+    """Predict the house, warm: links that several tests ask for are traced once."""
+    return sp.LinkModel(HOUSE, "paper")
 
 
 def prior(count: int, p_outage: float = 0.5, mean_db: float = -95.0, std_db: float = 8.0) -> sp.LinkPrediction:
@@ -171,9 +178,9 @@ class TestPredictMap:
         return {"tx": TX, "rx": rx, "gain_db": np.full(len(rx), gain_db), "std_db": np.full(len(rx), 1.0)}
 
     def test_a_hidden_transmitter_is_heard(self):
-        before = sp.predict_map(HOUSE, UNSEEN, **OPTIONS)
+        before = sp.predict_map(model(), UNSEEN, **OPTIONS)
         table = self.table() | {"tx": UNSEEN}
-        after = sp.predict_map(HOUSE, UNSEEN, measurements=table, **OPTIONS)
+        after = sp.predict_map(model(), UNSEEN, measurements=table, **OPTIONS)
         left = (after.x < 4.0) & (after.y < 3.0) & after.valid
         assert float(after.p_outage.where(left).mean()) < float(before.p_outage.where(left).mean())
         assert float(np.abs(after.gain_mean_db + 75.0).where(left).mean()) < 4.0
@@ -182,14 +189,14 @@ class TestPredictMap:
 
     def test_offsets_of_powers_are_named(self, caplog):
         with caplog.at_level(logging.WARNING):
-            coverage = sp.predict_map(HOUSE, TX, measurements=self.table(-20.0), **OPTIONS)
+            coverage = sp.predict_map(model(), TX, measurements=self.table(-20.0), **OPTIONS)
         assert "dB above the predicted ones: taken for an offset" in caplog.text
         assert coverage.attrs["measured_offset_db"] > 30.0
 
     def test_receivers_in_walls_are_left_out(self, caplog):
         table = self.table(rx=np.concatenate([LEFT, [[0.2, 0.2, 1.5]]]))
         with caplog.at_level(logging.WARNING):
-            coverage = sp.predict_map(HOUSE, TX, measurements=table, **OPTIONS)
+            coverage = sp.predict_map(model(), TX, measurements=table, **OPTIONS)
         assert "1 of 31 measurements are not used" in caplog.text
         assert coverage.attrs["measured_links"] == 30
 
@@ -207,12 +214,12 @@ class TestPredictMap:
     )
     def test_unusable_measurements_are_refused(self, change, error, message):
         with pytest.raises(error, match=message):
-            sp.predict_map(HOUSE, TX, measurements=self.table() | change, **OPTIONS)
+            sp.predict_map(model(), TX, measurements=self.table() | change, **OPTIONS)
 
     def test_too_many_measurements_are_refused(self):
         rx = np.repeat(LEFT, 1000, axis=0)
         with pytest.raises(MeasurementError, match="30,000 links of this transmitter, more than 20,000"):
-            sp.predict_map(HOUSE, TX, measurements=self.table(rx=rx), **OPTIONS)
+            sp.predict_map(model(), TX, measurements=self.table(rx=rx), **OPTIONS)
 
     @pytest.mark.usefixtures("command_line")
     def test_the_command_reads_a_csv(self, tmp_path):

@@ -1,5 +1,6 @@
 """The position of a transmitter from measured gains, and the coverage averaged over it."""
 
+import functools
 import logging
 
 import numpy as np
@@ -28,17 +29,23 @@ HOUSE = drawn(
 )
 TX = np.array([4.5, 1.3, 1.5])
 PLACES = np.array([(1.0, 0.7, 1.5), (2.3, 1.4, 1.5), (3.9, 1.5, 1.5), (5.3, 0.6, 1.5), (1.1, 1.9, 1.5)])
-OPTIONS = {"spacing_m": 0.4, "predictor": "paper"}
+OPTIONS = {"spacing_m": 0.4}
+
+
+@functools.cache
+def model() -> sp.LinkModel:
+    """Predict the house, warm: links that several tests ask for are traced once."""
+    return sp.LinkModel(HOUSE, "paper")
 
 
 def table(**changes: object) -> dict[str, object]:
-    gain_db = sp.trace_links(HOUSE, TX, PLACES, progress=False).gain_db
+    gain_db = sp.trace_links(model(), TX, PLACES, progress=False).gain_db
     return {"rx": PLACES, "gain_db": gain_db, "std_db": 1.0, **changes}
 
 
 @pytest.fixture(scope="module")
 def coverage() -> xr.Dataset:
-    return sp.predict_map(HOUSE, measurements=table(), **OPTIONS)
+    return sp.predict_map(model(), measurements=table(), **OPTIONS)
 
 
 class TestCoverage:
@@ -53,7 +60,7 @@ class TestCoverage:
         assert "transmitter near (" in repr(coverage.radio)
 
     def test_coverage_is_about_that_of_the_position(self, coverage):
-        known = sp.predict_map(HOUSE, TX, **OPTIONS)
+        known = sp.predict_map(model(), TX, **OPTIONS)
         left = (known.x < 2.8) & known.valid & coverage.valid
         assert float(np.abs(coverage.gain_mean_db - known.gain_mean_db).where(left).mean()) < 4.0
         total = coverage.p_los + coverage.p_nlos + coverage.p_outage
@@ -72,13 +79,13 @@ class TestCoverage:
     def test_powers_are_located_too(self, offset_db, caplog):
         power_db = table()["gain_db"] + offset_db
         with caplog.at_level(logging.WARNING):
-            found = sp.predict_map(HOUSE, measurements=table(gain_db=power_db), **OPTIONS)
+            found = sp.predict_map(model(), measurements=table(gain_db=power_db), **OPTIONS)
         assert np.linalg.norm(found.attrs["transmitter_m"] - TX) < 1.5
         warned = "powers were measured and no path gains" in caplog.text
         assert warned or abs(found.attrs["measured_offset_db"] - offset_db) < 10.0
 
     def test_its_height_may_be_known(self):
-        found = sp.predict_map(HOUSE, measurements=table(tx=[np.nan, np.nan, 2.0]), **OPTIONS)
+        found = sp.predict_map(model(), measurements=table(tx=[np.nan, np.nan, 2.0]), **OPTIONS)
         assert found.attrs["transmitter_m"][2] == 2.0
 
     @pytest.mark.usefixtures("command_line")
@@ -96,9 +103,9 @@ class TestCoverage:
 class TestWhatIsRefused:
     def test_no_transmitter_and_no_measurements(self):
         with pytest.raises(PositionError, match="tx = None: give x, y and z in metres, or measurements"):
-            sp.predict_map(HOUSE, **OPTIONS)
+            sp.predict_map(model(), **OPTIONS)
 
-    @pytest.mark.parametrize("call", [lambda m: sp.predict_map(HOUSE, TX, measurements=m), None])
+    @pytest.mark.parametrize("call", [lambda m: sp.predict_map(model(), TX, measurements=m), None])
     def test_measurements_without_a_transmitter(self, call):
         call = call or (lambda measured: sp.calibrate_materials(HOUSE, measured))
         with pytest.raises(MeasurementError, match="5 of 5 links without the position of the transmitter: give tx"):
@@ -107,11 +114,11 @@ class TestWhatIsRefused:
     def test_measurements_of_several_transmitters(self):
         tx = np.tile(TX, (5, 1)) + np.arange(5)[:, None] * [0.3, 0.0, 0.0]
         with pytest.raises(MeasurementError, match="tx = None, and measurements are of several transmitters"):
-            sp.predict_map(HOUSE, measurements=table(tx=tx), **OPTIONS)
+            sp.predict_map(model(), measurements=table(tx=tx), **OPTIONS)
 
     def test_a_position_that_is_not_used_is_named(self, caplog):
         with caplog.at_level(logging.WARNING):
-            sp.predict_map(HOUSE, measurements=table(tx=TX), **OPTIONS)
+            sp.predict_map(model(), measurements=table(tx=TX), **OPTIONS)
         assert "the position of the transmitter in the measurements is not used" in caplog.text
 
     def test_a_transmitter_can_be_nowhere(self):
