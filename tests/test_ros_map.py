@@ -238,40 +238,44 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "value", "message"),
+    ("key", "values", "message"),
     [
-        *[
-            ("resolution", value, r"give a number of metres per cell \(not cells per metre\) in \[0.001, 10\]")
-            for value in (0, -0.05, 50, 1e-9, 1e300, 10**400, math.nan, math.inf, "fine", None, True, [0.05], {})
-        ],
-        *[("occupied_thresh", value, r"give a number in \[0, 1\]") for value in (-0.1, 65, math.nan, "high", None)],
-        *[("free_thresh", value, r"give a number in \[0, 1\]") for value in (-0.1, 19.6, math.nan, "low", None)],
-        *[("free_thresh", value, "give less than occupied_thresh, which is 0.65") for value in (0.65, 0.9)],
-        *[
-            ("origin", value, r"give \[x, y, yaw\] of the lower-left corner, in metres and radians")
-            for value in ([0, 0], [0, 0, 0, 0], [0, math.nan, 0], [math.inf, 0, 0], [0, 0, "north"], 7, None, "0, 0, 0")
-        ],
-        ("origin", [0, 0, 90], r"the yaw in radians, one turn at most \(not degrees\)"),
-        *[("negate", value, "give 0 .dark is wall. or 1 .bright is wall.") for value in (2, -1, 0.0, "maybe", None)],
-        *[("mode", value, "choose one of trinary, scale, raw") for value in ("ternary", 3, None)],
-        *[("image", value, "give the file name of the map image") for value in ("", None, 3, ["map.pgm"], "a\0b")],
-        *[("image", value, "there is no file '.*'; put the image there") for value in ("gone.pgm", ".", "a" * 300)],
-        *[("wall_height", value, r"give a number of metres in \[0.1, 100\]") for value in (0, -3, math.nan, "tall")],
-        *[
-            ("material", value, "give relative_permittivity, conductivity_s_m, thickness_m, itu, as save_map does")
-            for value in (3, {"color": "red"}, {"relative_permittivity": 0.5})
-        ],
-        *[("interior_cells", value, "give the number of free cells") for value in (-1, 2.5, "many", True)],
+        (
+            "resolution",
+            (0, -0.05, 50, 1e-9, 1e300, 10**400, math.nan, math.inf, "fine", None, True, [0.05], {}),
+            r"give a number of metres per cell \(not cells per metre\) in \[0.001, 10\]",
+        ),
+        ("occupied_thresh", (-0.1, 65, math.nan, "high", None), r"give a number in \[0, 1\]"),
+        ("free_thresh", (-0.1, 19.6, math.nan, "low", None), r"give a number in \[0, 1\]"),
+        ("free_thresh", (0.65, 0.9), "give less than occupied_thresh, which is 0.65"),
+        (
+            "origin",
+            ([0, 0], [0, 0, 0, 0], [0, math.nan, 0], [math.inf, 0, 0], [0, 0, "north"], 7, None, "0, 0, 0"),
+            r"give \[x, y, yaw\] of the lower-left corner, in metres and radians",
+        ),
+        ("origin", ([0, 0, 90],), r"the yaw in radians, one turn at most \(not degrees\)"),
+        ("negate", (2, -1, 0.0, "maybe", None), "give 0 .dark is wall. or 1 .bright is wall."),
+        ("mode", ("ternary", 3, None), "choose one of trinary, scale, raw"),
+        ("image", ("", None, 3, ["map.pgm"], "a\0b"), "give the file name of the map image"),
+        ("image", ("gone.pgm", ".", "a" * 300), "there is no file '.*'; put the image there"),
+        ("wall_height", (0, -3, math.nan, "tall"), r"give a number of metres in \[0.1, 100\]"),
+        (
+            "material",
+            (3, {"color": "red"}, {"relative_permittivity": 0.5}),
+            "give relative_permittivity, conductivity_s_m, thickness_m, itu, as save_map does",
+        ),
+        ("interior_cells", (-1, 2.5, "many", True), "give the number of free cells"),
     ],
 )
-def test_wrong_value(tmp_path: Path, key: str, value: object, message: str) -> None:
+def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], message: str) -> None:
     """The error names the file, the field, the value and the remedy."""
     (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
-    path = write_sheet(tmp_path, **{key: value})
-    with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}") as caught:
-        load_map(path)
-    shown = str(value)
-    assert len(shown) > 100 or shown in str(caught.value) or "\0" in shown
+    for value in values:
+        path = write_sheet(tmp_path, **{key: value})
+        with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}") as caught:
+            load_map(path)
+        shown = str(value)
+        assert len(shown) > 100 or shown in str(caught.value) or "\0" in shown
 
 
 def test_origin_too_far(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOL
 from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes
-from sionna_partial.process import cleaned_up
+from sionna_partial.process import cleaned_up, core_count
 from sionna_partial.progress import counting
 from sionna_partial.settings import DatasetSettings
 
@@ -144,7 +144,7 @@ def build_dataset(
 
         if missing:
             report("starting the workers")
-            at_once = min(workers or len(os.sched_getaffinity(0)), len(missing))
+            at_once = min(workers or core_count(), len(missing))
             with _connected(scheduler, at_once) as client, client.as_current():
                 for task, result in _results(client, missing, report):
                     name, note = task.source.name, _failure_path(target, task.source.name)

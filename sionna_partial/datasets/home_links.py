@@ -15,6 +15,7 @@ from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings
 from sionna_partial.simulation.explore import explore_trajectory
+from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 
 NEAREST_M = 0.1
@@ -178,15 +179,20 @@ def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -
     """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
-    simulation = Simulation(home, settings.trace, settings.scene)
-    ends = zip(positions.tx_m, indoors, strict=True)
-    links = [simulation.links(*each, polarisations=1, progress=False) for each in ends]
+    links = _traced(home, positions.tx_m, indoors, settings)
     where = np.concatenate(inside)
     link_state = np.full(len(where), LinkState.OUTAGE, dtype=np.uint8)
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
     link_state[where] = np.concatenate([each.link_state for each in links])
     gain_db[where] = np.concatenate([each.gain_db for each in links])
     return where, link_state, gain_db
+
+
+def _traced(
+    partial: PartialMap, tx_m: list[Floats], rx_m: list[Floats], settings: DatasetSettings
+) -> list[TracedLinks]:
+    simulation = Simulation(partial, settings.trace, settings.scene)
+    return [simulation.links(*ends, polarisations=1, progress=False) for ends in zip(tx_m, rx_m, strict=True)]
 
 
 def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSettings) -> list[LinkFeatures]:
@@ -196,8 +202,6 @@ def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSe
         if index and partial == maps[index - 1]:
             features.append(features[-1])
             continue
-        simulation = Simulation(partial, settings.trace, settings.scene)
-        ends = zip(positions.tx_m, positions.rx_m, strict=True)
-        links = [simulation.links(*each, polarisations=1, progress=False) for each in ends]
+        links = _traced(partial, positions.tx_m, positions.rx_m, settings)
         features.append(LinkFeatures.concatenate([link_features(partial, each, windows=False) for each in links]))
     return features
