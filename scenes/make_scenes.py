@@ -16,11 +16,11 @@ import numpy as np
 import trimesh
 
 from sionna_partial.constants import CellState
+from sionna_partial.exploration.explore import explore
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings
-from sionna_partial.simulation.explore import explore
 from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.simulation import trace_links
 

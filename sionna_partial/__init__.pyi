@@ -15,6 +15,9 @@ from sionna_partial.datasets.shards import read_dataset as read_dataset
 from sionna_partial.differentiable.scene import DifferentiableScene as DifferentiableScene
 from sionna_partial.errors import SionnaPartialError as SionnaPartialError
 from sionna_partial.evaluation.evaluate import evaluate as evaluate
+from sionna_partial.exploration.explore import Exploration as Exploration
+from sionna_partial.exploration.explore import explore as explore
+from sionna_partial.exploration.explore import explore_trajectory as explore_trajectory
 from sionna_partial.exploration.next_views import NextView as NextView
 from sionna_partial.exploration.next_views import NextViews as NextViews
 from sionna_partial.exploration.next_views import next_views as next_views
@@ -63,9 +66,6 @@ from sionna_partial.settings import PredictorSettings as PredictorSettings
 from sionna_partial.settings import SceneSettings as SceneSettings
 from sionna_partial.settings import SensorSettings as SensorSettings
 from sionna_partial.settings import TraceSettings as TraceSettings
-from sionna_partial.simulation.explore import Exploration as Exploration
-from sionna_partial.simulation.explore import explore as explore
-from sionna_partial.simulation.explore import explore_trajectory as explore_trajectory
 from sionna_partial.simulation.homes import make_home as make_home
 from sionna_partial.tracing.gradients import GainGradients as GainGradients
 from sionna_partial.tracing.gradients import gain_gradients as gain_gradients

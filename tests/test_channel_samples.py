@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import sionna_partial as sp
-from sionna_partial.channels.path_training import example, fit_path_model
 from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.path_training import example, fit_path_model
 from sionna_partial.resources import scenes_folder
 from sionna_partial.tracing.antennas import planar_array
 

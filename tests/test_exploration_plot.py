@@ -8,11 +8,11 @@ from PIL import Image
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.exploration.explore import Exploration, explore_trajectory
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.exploration_plot import MAX_PANELS, animate_exploration, plot_exploration
 from sionna_partial.plots.style import BLUE, RED, YELLOW
 from sionna_partial.settings import SensorSettings
-from sionna_partial.simulation.explore import Exploration, explore_trajectory
 
 
 @pytest.fixture(scope="module")

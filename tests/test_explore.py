@@ -13,11 +13,11 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.exploration.explore import Exploration, explore, explore_trajectory
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
-from sionna_partial.simulation.explore import Exploration, explore, explore_trajectory
 from sionna_partial.simulation.homes import make_home
 from sionna_partial.simulation.robot import FORWARD_M, TURN_DEG
 

@@ -11,10 +11,10 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import MapError
+from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings
-from sionna_partial.simulation.explore import explore_trajectory
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 

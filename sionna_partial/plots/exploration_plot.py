@@ -19,6 +19,7 @@ from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
 from sionna_partial.coverage import predict_map
+from sionna_partial.exploration.explore import Exploration
 from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.partial_map import PartialMap
@@ -39,7 +40,6 @@ from sionna_partial.plots.style import (
     window_m,
 )
 from sionna_partial.simulation.camera import view_corners_m
-from sionna_partial.simulation.explore import Exploration
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
 """Time of a frame of an animation, and of its last one [ms]."""

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import Progress, are_stages, is_whole, require, require_choice, settings_or_default
 from sionna_partial.constants import CellState
-from sionna_partial.display import Pictured, later
+from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError
+from sionna_partial.exploration.next_views import coverage_choice
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.progress import reporting
@@ -217,7 +218,7 @@ def explore_trajectory(
     choose: Choice | None = None
     if policy == "coverage":
         origin_m = float(corner_m[0]), float(corner_m[1])
-        choose = later("exploration.next_views:coverage_choice")(replace(home, mesh=None), origin_m, tx, sensor)
+        choose = coverage_choice(replace(home, mesh=None), origin_m, tx, sensor)
     robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor, choose)
 
     by_fraction = not all(map(is_whole, steps))
