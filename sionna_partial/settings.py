@@ -7,6 +7,7 @@ from sionna_partial.checks import Checked, Within, are_stages, plain, require, r
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
+    DRYWALL_CONDUCTIVITY_EXPONENT,
     DRYWALL_CONDUCTIVITY_S_M,
     DRYWALL_PERMITTIVITY,
     WALL_THICKNESS_M,
@@ -60,27 +61,26 @@ Seed = Annotated[int, Within(0, 2**31 - 1)]
 Count = Annotated[int, Within(1, 1_000_000)]
 
 
-DRYWALL = "drywall"
-"""Name of the default material."""
-
-
 @dataclass(frozen=True)
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
-    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one with constant permittivity and
-    conductivity. The default is the paper's layered drywall.
+    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one, whose constants are by default those of the
+    paper's layered drywall at 28 GHz. `Material.named` has materials of walls with their usual thickness.
 
     Parameters
     ----------
     relative_permittivity : float
         Real relative permittivity, at least 1. Ignored for an ITU material.
     conductivity_s_m : float
-        Conductivity [S/m], at least 0. Ignored for an ITU material.
+        Conductivity at 28 GHz [S/m], at least 0. Ignored for an ITU material.
     thickness_m : float
         Slab thickness in the reflection and transmission coefficients [m].
     itu : str or None
         Name of an ITU material (a key of `ITU_BANDS_GHZ`).
+    conductivity_exponent : float
+        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. Ignored
+        for an ITU material.
 
     Raises
     ------
@@ -100,6 +100,7 @@ class Material(Checked):
     conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
     thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
+    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -108,9 +109,20 @@ class Material(Checked):
 
     @classmethod
     def named(cls, name: str) -> "Material":
-        """Return the material "drywall", which is the default, or one of ITU-R P.2040-3, by its name."""
-        require_choice("material", name, (DRYWALL, *ITU_BANDS_GHZ))
-        return cls() if name == DRYWALL else cls(itu=name)
+        """Return a material of walls with its usual thickness, by its name.
+
+        The names are those of `WALL_MATERIALS`, such as "drywall", which is the default, and those of ITU-R P.2040-3,
+        with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
+        such walls: `docs/materials.md`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> sp.Material.named("concrete").thickness_m
+        0.2
+        """
+        require_choice("material", name, dict.fromkeys((*WALL_MATERIALS, *ITU_BANDS_GHZ)))
+        return WALL_MATERIALS.get(name) or cls(itu=name)
 
     def require_frequency(self, frequency_hz: float) -> None:
         """Raise a SettingsError if the material's model does not cover `frequency_hz`."""
@@ -122,6 +134,24 @@ class Material(Checked):
         spans = " or ".join(f"{low:g}-{high:g} GHz" for low, high in bands)
         remedy = f"ITU material {self.itu!r} is defined for {spans}; choose a frequency there or a custom Material."
         require(covered, "frequency_hz", frequency_hz, remedy)
+
+
+WALL_MATERIALS = {
+    "drywall": Material(conductivity_exponent=DRYWALL_CONDUCTIVITY_EXPONENT),
+    "brick": Material(itu="brick", thickness_m=0.11),
+    "concrete": Material(itu="concrete", thickness_m=0.2),
+    "reinforced concrete": Material(itu="concrete", thickness_m=0.25),
+    "glass": Material(itu="glass", thickness_m=0.006),
+    "coated glass": Material(6.31, 10.0, 0.006),
+    "wood": Material(itu="wood", thickness_m=0.04),
+    "door": Material(itu="chipboard", thickness_m=0.04),
+    "metal": Material(itu="metal", thickness_m=0.005),
+}
+"""Materials that walls have, with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less
+below; coated glass is glass whose conductivity stands for its film of metal."""
+
+DRYWALL = WALL_MATERIALS["drywall"]
+"""The default material."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +189,7 @@ class SceneSettings(Checked):
     'observed'
     """
 
-    material: Material = field(default_factory=Material)
+    material: Material = DRYWALL
     outline_tolerance_cells: Annotated[float, Within(0.0, 2.0)] = 0.5
     bridge_gap_m: Annotated[float, Within(0.0, 1.0)] = 0.5
     floor_extent: Literal["observed", "map", "none"] = "observed"

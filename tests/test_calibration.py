@@ -17,7 +17,7 @@ from sionna_partial.calibration.measured_building import custom_material
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
-from sionna_partial.scene.scene import itu_constants
+from sionna_partial.scene.scene import constants_of
 from sionna_partial.tracing.slab import reflection_loss_db
 
 SETTINGS = sp.TraceSettings(max_depth=2)
@@ -250,5 +250,5 @@ class TestWrongArguments:
 
 def test_itu_material_becomes_a_custom_one() -> None:
     brick = custom_material(sp.Material(itu="brick", thickness_m=0.2), 28e9)
-    assert (brick.relative_permittivity, brick.conductivity_s_m) == pytest.approx(itu_constants("brick", 28e9))
+    assert (brick.relative_permittivity, brick.conductivity_s_m) == pytest.approx(constants_of(sp.Material(itu="brick"), 28e9))
     assert (brick.itu, brick.thickness_m) == (None, 0.2)

@@ -43,6 +43,7 @@ RANGES = {
     (Material, "relative_permittivity"): ("[1, 1e+06]", (1, 1.0, 1e6), (0.999, -1, 1.1e6)),
     (Material, "conductivity_s_m"): ("[0, 1e+09]", (0, 0.0, 1e9), (-1e-9, 2e9)),
     (Material, "thickness_m"): ("(0, 10]", (1e-9, 10), (0, -0.1, 10.1)),
+    (Material, "conductivity_exponent"): ("[0, 2]", (0, 0.0, 2), (-0.1, 2.1)),
     (SceneSettings, "outline_tolerance_cells"): ("[0, 2]", (0, 2.0), (-0.1, 2.1)),
     (SceneSettings, "bridge_gap_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
@@ -226,7 +227,7 @@ class TestPredictorSettings:
 
 
 def test_materials_by_name() -> None:
-    assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete"))  # type: ignore[arg-type]
-    assert Material.named("drywall") == Material()
-    with pytest.raises(SettingsError, match="material = 'cheese' is not allowed: choose one of drywall, vacuum"):
+    assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete", thickness_m=0.2))  # type: ignore[arg-type]
+    assert Material.named("drywall") == SceneSettings().material
+    with pytest.raises(SettingsError, match="material = 'cheese' is not allowed: choose one of drywall, brick"):
         SceneSettings(material="cheese")  # type: ignore[arg-type]

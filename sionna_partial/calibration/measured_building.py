@@ -13,7 +13,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.features import SEEN_M, path_unobserved_m
 from sionna_partial.progress import part_of
-from sionna_partial.scene.scene import itu_constants
+from sionna_partial.scene.scene import constants_of
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathSet
 from sionna_partial.tracing.simulation import Simulation, nearest_m
@@ -161,7 +161,7 @@ def require_positions(partial: PartialMap, measured: Measurements, frequency_hz:
 def start_materials(
     partial: PartialMap, start: Material | None, scene_settings: SceneSettings, frequency_hz: float
 ) -> dict[str, Material]:
-    """Return the materials of a scene by their names there, with constants in place of ITU's formulas."""
+    """Return the materials of a scene by their names there, with constants in place of formulas."""
     if partial.mesh is None:
         materials = {"material": start or scene_settings.material}
     else:
@@ -173,10 +173,8 @@ def start_materials(
 
 
 def custom_material(material: Material, frequency_hz: float) -> Material:
-    """Put constants in place of ITU's formulas."""
-    if material.itu is None:
-        return material
-    permittivity, conductivity_s_m = itu_constants(material.itu, frequency_hz)
+    """Put constants in place of formulas."""
+    permittivity, conductivity_s_m = constants_of(material, frequency_hz)
     return Material(float(permittivity), float(conductivity_s_m), material.thickness_m)
 
 

@@ -83,13 +83,13 @@ def parse_position(text: str) -> tuple[float, ...]:
 
 
 def parse_material(text: str) -> Material:
-    """Material from an ITU name or "permittivity,conductivity,thickness"; the default for ""."""
+    """Material from a name, as of `Material.named`, or "permittivity,conductivity,thickness"; the default for ""."""
     words = text.split(",")
     if not text or len(words) == 1:
-        return Material.named(text) if text else Material()
+        return Material.named(text or "drywall")
     if len(words) != 3 or not all(map(_is_number, words)):
         raise typer.BadParameter(
-            f"--material {text!r} is neither an ITU name nor permittivity,conductivity,thickness: "
+            f"--material {text!r} is neither a name nor permittivity,conductivity,thickness: "
             "give for example concrete, or 2.94,0.1226,0.1."
         )
     permittivity, conductivity_s_m, thickness_m = map(float, words)

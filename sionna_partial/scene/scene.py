@@ -24,7 +24,7 @@ from sionna_partial.maps.partial_map import PartialMap, require_map, row_runs
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
 from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
-from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
+from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
     settings = settings_or_default("scene_settings", settings, SceneSettings)
     default = partial.material or settings.material
     used = {default} if partial.mesh is None else partial.mesh.used_materials(default)
-    if used and settings.material not in (Material(), *used):
+    if used and settings.material not in (DRYWALL, *used):
         _log.warning(
             "material = %s of the scene settings is not used: the map or mesh has its own; leave it out, or set that "
             "of the map with dataclasses.replace",
@@ -253,13 +253,16 @@ def write_mesh_scene(
     return _write_xml(scene, folder)
 
 
-def itu_constants(name: str, frequency_hz: float) -> tuple[float, float]:
-    """Return relative permittivity and conductivity [S/m] of an ITU material (ITU-R P.2040-3, eq. 28 and 29)."""
+def constants_of(material: Material, frequency_hz: float) -> tuple[float, float]:
+    """Return relative permittivity and conductivity [S/m] at a frequency (of ITU: ITU-R P.2040-3, eq. 28 and 29)."""
+    if material.itu is None:
+        grown = (frequency_hz / CARRIER_FREQUENCY_HZ) ** material.conductivity_exponent
+        return material.relative_permittivity, material.conductivity_s_m * grown
     load_llvm()
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
     frequency_ghz = frequency_hz / 1e9
-    bands = ITU_MATERIALS_PROPERTIES[name].items()
+    bands = ITU_MATERIALS_PROPERTIES[material.itu].items()
     a, b, c, d = next(factors for (low, high), factors in bands if low <= frequency_ghz <= high)
     return a * frequency_ghz**b, c * frequency_ghz**d
 
@@ -302,8 +305,7 @@ def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz
         bsdf = ET.SubElement(scene, "bsdf", type="itu-radio-material", id=name)
         ET.SubElement(bsdf, "string", name="type", value=itu)
     else:
-        constants = material.relative_permittivity, material.conductivity_s_m
-        permittivity, conductivity_s_m = constants if itu is None else itu_constants(itu, frequency_hz)
+        permittivity, conductivity_s_m = constants_of(material, frequency_hz)
         bsdf = ET.SubElement(scene, "bsdf", type="radio-material", id=name)
         ET.SubElement(bsdf, "float", name="relative_permittivity", value=repr(float(permittivity)))
         ET.SubElement(bsdf, "float", name="conductivity", value=repr(float(conductivity_s_m)))

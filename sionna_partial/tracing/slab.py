@@ -51,3 +51,16 @@ def reflection_coefficients(
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
     te, tm = (face * (1.0 - inside) / (1.0 - face**2 * inside) for face in faces)
     return te, tm
+
+
+def transmission_coefficients(
+    permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return the transmission coefficients of a slab, TE and TM, likewise."""
+    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
+    eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
+    root = np.sqrt(eta - (1.0 - cosine**2))
+    once = np.exp(-2j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
+    faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
+    te, tm = ((1.0 - face**2) * once / (1.0 - face**2 * once**2) for face in faces)
+    return te, tm
