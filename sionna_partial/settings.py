@@ -40,6 +40,9 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 FREQUENCIES_HZ = (1e6, 1e12)
 """Lowest and highest carrier frequency [Hz]."""
 
+OPAQUE_FROM_HZ = 24e9
+"""Frequency from which on walls are opaque unless settings say otherwise [Hz]."""
+
 HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
 """Kinds of procedural homes; the last three are large."""
 
@@ -218,9 +221,18 @@ class TraceSettings(Checked):
     power_tolerance_db : float
         By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
         every path. Bounds of the power of all candidates, before any is verified, guarantee it.
-    refraction, diffuse_reflection : bool
-        Further interactions. With either of them, every path is found by shooting rays (Sionna RT's own candidate
-        generator), which is slower than exact beams.
+    refraction : bool or None
+        Whether paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
+        below. On meshes such paths are found by shooting rays.
+    max_walls : int
+        Largest number of walls of a floor plan that a path goes through, 1 to 16. `max_depth` does not count them.
+    wall_depth_m : float
+        How deep one wall of a floor plan may be [m], 0 to 10. Of the faces that a path goes through one after the
+        other, with no free cell between them, those within this depth are one wall, and have the loss of one slab of
+        the material. At 0 every face is a slab, as in the exported scene.
+    diffuse_reflection : bool
+        Diffuse reflections. With them, every path is found by shooting rays (Sionna RT's own candidate generator),
+        which is slower than exact beams.
     samples_per_tx : int
         Number of rays shot from the transmitter where rays are shot.
     seed : int
@@ -244,10 +256,22 @@ class TraceSettings(Checked):
     diffraction_walls: Annotated[int, Within(0, 2)] = 2
     open_ends: bool = False
     power_tolerance_db: Annotated[float, Within(0.0, 1.0)] = 0.1
-    refraction: bool = False
+    refraction: bool | None = None
+    max_walls: Annotated[int, Within(1, 16)] = 8
+    wall_depth_m: Annotated[float, Within(0.0, 10.0)] = 0.6
     diffuse_reflection: bool = False
     samples_per_tx: Annotated[int, Within(1, 100_000_000)] = 1_000_000
     seed: Seed = 42
+
+    @property
+    def through_walls(self) -> bool:
+        """Whether paths go through walls at this frequency."""
+        return self.frequency_hz < OPAQUE_FROM_HZ if self.refraction is None else self.refraction
+
+    @property
+    def most_interactions(self) -> int:
+        """Largest number of interactions on a path, at least 1."""
+        return max(1, self.max_depth + (self.max_walls if self.through_walls else 0))
 
 
 @dataclass(frozen=True)

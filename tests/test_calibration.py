@@ -250,5 +250,7 @@ class TestWrongArguments:
 
 def test_itu_material_becomes_a_custom_one() -> None:
     brick = custom_material(sp.Material(itu="brick", thickness_m=0.2), 28e9)
-    assert (brick.relative_permittivity, brick.conductivity_s_m) == pytest.approx(constants_of(sp.Material(itu="brick"), 28e9))
+    assert (brick.relative_permittivity, brick.conductivity_s_m) == pytest.approx(
+        constants_of(sp.Material(itu="brick"), 28e9)
+    )
     assert (brick.itu, brick.thickness_m) == (None, 0.2)

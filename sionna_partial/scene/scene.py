@@ -120,7 +120,7 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
         open_end=_open_ends(partial, outlines),
-        floor_m=_rectangles(_floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
+        floor_m=_rectangles(floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
         cell_m=partial.resolution_m,
         height_m=partial.wall_height_m,
         ceiling=settings.ceiling,
@@ -360,7 +360,7 @@ def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
             strips = shapely.intersection(area, shapely.box([x0, *cuts], y0, [*cuts, x1], y1))
 
 
-def _floor_cells(partial: PartialMap, extent: str) -> Bools:
+def floor_cells(partial: PartialMap, extent: str) -> Bools:
     """Cells (ny, nx) that floor and ceiling cover."""
     if extent == "none":
         return np.zeros(partial.shape, dtype=bool)

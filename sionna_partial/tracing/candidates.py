@@ -10,6 +10,9 @@ from sionna_partial.arrays import Floats, Indices
 EDGE = -2
 """Stands for the face of an interaction in a candidate where that is a diffraction."""
 
+WALL, SAME_WALL = 1, 2
+"""What crossing a face costs: the loss of a wall, or nothing, since it belongs to a wall that has been crossed."""
+
 
 @dataclass(frozen=True)
 class Wedges:
@@ -37,7 +40,9 @@ class Candidates:
     `rx` (C,) is the receiver of each. `face` (C, D) is the face of the scene at every interaction in order from the
     transmitter, counted through its shapes; any of the faces in one plane stands for all. It is EDGE where the path is
     diffracted, and -1 where there is no interaction. `vertices_m` (C, D, 3) are the points of interaction [m]. If all
-    candidates are diffracted, `wedge` (C,) is the one of `wedges` at which each is.
+    candidates are diffracted, `wedge` (C,) is the one of `wedges` at which each is. If any candidate goes through
+    walls, `crossed` (C, D) is WALL where it does, SAME_WALL at further faces of that wall, which cost nothing, and 0
+    elsewhere.
     """
 
     rx: NDArray[np.int32]
@@ -45,21 +50,26 @@ class Candidates:
     vertices_m: Floats
     wedge: NDArray[np.int32] | None = None
     wedges: Wedges | None = None
+    crossed: NDArray[np.uint8] | None = None
 
     def is_like(self, other: "Candidates") -> bool:
         """Whether both can be verified together."""
-        return self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
+        same = self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
+        return same and (self.crossed is None) == (other.crossed is None)
 
     @classmethod
     def concatenate(cls, parts: list["Candidates"]) -> "Candidates":
         """Join candidates that can be verified together; at least one part."""
         wedge = None if parts[0].wedge is None else np.concatenate([each.wedge for each in parts])  # type: ignore[misc]
+        crossed = None if parts[0].crossed is None else np.concatenate([each.crossed for each in parts])  # type: ignore[misc]
         rx, face, vertices_m = (
             np.concatenate([getattr(each, name) for each in parts]) for name in ("rx", "face", "vertices_m")
         )
-        return cls(rx, face, vertices_m, wedge, parts[0].wedges)
+        return cls(rx, face, vertices_m, wedge, parts[0].wedges, crossed)
 
     def rows(self, index: Indices) -> "Candidates":
         """Pick some of the candidates."""
         wedge = None if self.wedges is None or self.wedge is None else self.wedge[index]
-        return replace(self, rx=self.rx[index], face=self.face[index], vertices_m=self.vertices_m[index], wedge=wedge)
+        crossed = None if self.crossed is None else self.crossed[index]
+        rx, face, vertices_m = self.rx[index], self.face[index], self.vertices_m[index]
+        return replace(self, rx=rx, face=face, vertices_m=vertices_m, wedge=wedge, crossed=crossed)

@@ -27,7 +27,7 @@ from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.process import signals_held
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import EDGE, Candidates, Wedges
+from sionna_partial.tracing.candidates import EDGE, SAME_WALL, Candidates, Wedges
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
@@ -38,10 +38,9 @@ TESTED_VERSION = "2.2"
 
 REMEDY = f"""run pip install "sionna-rt=={TESTED_VERSION}.*" to have the fast engine back."""
 
-_BUFFER_FIELDS = {
-    *("_vertices_x", "_vertices_y", "_vertices_z", "_shapes", "_primitives", "_interaction_types"),
-    *("_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"),
-}
+_BUFFER_COLUMNS = "_vertices_x", "_vertices_y", "_vertices_z", "_shapes", "_primitives", "_interaction_types"
+
+_BUFFER_FIELDS = {*_BUFFER_COLUMNS, "_valid", "_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"}
 """Private fields of Sionna RT's `PathsBuffer` that are filled here."""
 
 _log = logging.getLogger(__name__)
@@ -178,6 +177,32 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
         setattr(buffer, name, type(getattr(buffer, name))(beyond, kind.shape))
 
 
+def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
+    """Return verified candidates without the faces that cost nothing: a refraction does not change a path."""
+    if candidates.crossed is None:
+        return buffer
+    import drjit as dr
+    import mitsuba as mi
+    from sionna.rt.constants import InteractionType
+    from sionna.rt.path_solvers.paths_buffer import PathsBuffer
+
+    dropped, none = candidates.crossed == SAME_WALL, candidates.face == -1
+    count, depth = dropped.shape
+    kept = np.argsort(dropped, axis=1, kind="stable")
+    kept = kept[:, : max(1, int((~dropped & ~none).sum(axis=1).max()))]
+    flat = to_device(mi.UInt, (kept + depth * np.arange(count)[:, None]).astype(np.uint32).ravel())
+    shorter = PathsBuffer(*kept.shape, buffer.diffracting_wedges is not None)
+    for name in _BUFFER_COLUMNS:
+        column: Any = getattr(buffer, name)
+        setattr(shorter, name, type(column)(dr.gather(type(column.array), column.array, flat), kept.shape))
+    ended = to_device(mi.Bool, np.take_along_axis(dropped | none, kept, axis=1).ravel())
+    kind = dr.select(ended, InteractionType.NONE, shorter.interaction_types.array)
+    shorter._interaction_types = mi.TensorXu(kind, kept.shape)
+    for name in ("_valid", "_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"):
+        setattr(shorter, name, getattr(buffer, name))
+    return shorter
+
+
 _ALIGNMENT_BYTES = 64
 """Alignment of Dr.Jit's own arrays [bytes]."""
 
@@ -282,6 +307,7 @@ class SceneSolver:
             return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
         ends, diffraction = (_points(tx_m[None]), _points(rx_m)), candidates.wedges is not None
         buffer = self._symbolic.verify(self._scene, self._buffer(candidates), *ends, diffraction)
+        buffer = _without_same_walls(buffer, candidates)
         buffer = self._symbolic.evaluate(self._scene, buffer, *ends, self._field, diffraction)
         return _read_buffer(buffer, tx_m, rx_m)
 
@@ -351,7 +377,8 @@ class SceneSolver:
 
         buffer = self._buffer(candidates)
         buffer._src_indices = to_device(mi.UInt, tx_index.astype(np.uint32))
-        return verification.verify(self._scene, buffer, *ends, candidates.wedges is not None)
+        buffer = verification.verify(self._scene, buffer, *ends, candidates.wedges is not None)
+        return _without_same_walls(buffer, candidates)
 
     def _power(self, verification: _Verification, buffer: Any, ends: tuple[Any, Any], diffraction: bool) -> Any:
         """Squared magnitude of the coefficients of verified paths."""
@@ -390,6 +417,8 @@ class SceneSolver:
         face = candidates.face
         kind = np.where(face == EDGE, InteractionType.DIFFRACTION, InteractionType.SPECULAR).astype(np.uint32)
         kind[face == -1] = InteractionType.NONE
+        if candidates.crossed is not None:
+            kind[candidates.crossed > 0] = InteractionType.REFRACTION
         if candidates.wedges is not None and candidates.wedge is not None:
             # Sionna RT takes the normal of the 0-face from the face that a path diffracts at
             face = np.where(face == EDGE, candidates.wedges.face[candidates.wedge, :1], face)

@@ -13,10 +13,11 @@ from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import Progress
+from sionna_partial.constants import CellState
 from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.progress import part_of
-from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_mesh_scene, write_scene
+from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, floor_cells, write_mesh_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
 from sionna_partial.tracing.candidates import Candidates, Wedges
@@ -24,6 +25,7 @@ from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, 
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION, SolvedPaths
+from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
@@ -55,6 +57,7 @@ class PlanScene:
     settings: TraceSettings
     geometry: SceneGeometry
     wedges: Wedges
+    interior: Interior
 
     def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths between a transmitter (3,) and receivers (N, 3) that are strong enough to matter."""
@@ -66,7 +69,17 @@ class PlanScene:
                 for candidates, fraction in kind.blocks(strengths):
                     yield candidates, low + (high - low) * fraction, message
 
-        return _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
+        if not self.settings.through_walls:
+            yield from _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
+            return
+        power = np.zeros(len(rx_m))
+        for candidates, paths in _strong_paths(solver, listed, tx_m, rx_m, self.settings, part_of(report, 0.0, 0.5)):
+            indirect = ~paths.is_direct
+            np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
+            yield candidates, paths
+        crossing = CrossingCandidates(self.geometry, Room.of(self.geometry, tx_m, rx_m), self.interior, self.settings)
+        blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
+        yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.5, 1.0))
 
     def _kinds(self, room: Room) -> dict[str, SpecularCandidates | DiffractionCandidates]:
         """Kinds of candidates, by what is done with them."""
@@ -145,7 +158,10 @@ def write_scene_of(
         return MeshScene(xml, shapes, settings, mesh.vertices_m - [*offset_m, 0.0], mesh.triangles)
     geometry = build_scene(partial, scene_settings)
     xml = write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz)
-    return PlanScene(xml, SHAPES, settings, geometry, find_wedges(geometry, open_ends=settings.open_ends))
+    floor = floor_cells(partial, scene_settings.floor_extent)
+    interior = Interior(partial.state == CellState.FREE, floor, partial.resolution_m, settings.wall_depth_m)
+    wedges = find_wedges(geometry, open_ends=settings.open_ends)
+    return PlanScene(xml, SHAPES, settings, geometry, wedges, interior)
 
 
 def _strong_paths(
@@ -258,7 +274,7 @@ def _options(settings: TraceSettings) -> dict[str, Any]:
         "los": True,
         "specular_reflection": True,
         "diffuse_reflection": settings.diffuse_reflection,
-        "refraction": settings.refraction,
+        "refraction": settings.through_walls,
         "diffraction": diffraction,
         "edge_diffraction": diffraction,
         "seed": settings.seed,

@@ -95,7 +95,7 @@ class PathSet:
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
         self._rows = [slice(*each) for each in itertools.pairwise(ends)]
-        paths = SolvedPaths.concatenate(self.solved, simulation.trace_settings.max_depth)
+        paths = SolvedPaths.concatenate(self.solved, simulation.trace_settings.most_interactions)
         self.path_tx, self.path_rx, self.interactions = paths.path_tx, paths.path_rx, paths.interactions
         self.power, self.vertices_m = paths.power, paths.vertices_m
         self.is_direct = paths.is_direct
@@ -125,7 +125,7 @@ class PathSet:
 
     def links(self) -> TracedLinks:
         """Return the links as `trace_links` does."""
-        paths = join_paths(self.solved, self._simulation.trace_settings.max_depth)
+        paths = join_paths(self.solved, self._simulation.trace_settings.most_interactions)
         sums = LinkSums(math.prod(self.base.tx_m.shape[:-1]), len(self.rx_m))
         for each in self.solved:
             sums.add(each)
@@ -156,9 +156,9 @@ class PathSet:
         vertices_m = np.full_like(self.vertices_m, math.nan)
         for (candidates, paths), rows in zip(self._parts, self._rows, strict=True):
             found = solver.moved(candidates, paths.path_tx, *self._ends(), variables, differentiable=False)
-            power[rows], depth = found[0].numpy(), candidates.face.shape[1]
-            in_scene_m = np.transpose(found[1].numpy()).reshape(-1, depth, 3)
-            vertices_m[rows, :depth] = self._simulation.in_world(in_scene_m)
+            power[rows] = found[0].numpy()
+            in_scene_m = np.transpose(found[1].numpy()).reshape(len(candidates.rx), -1, 3)
+            vertices_m[rows, : in_scene_m.shape[1]] = self._simulation.in_world(in_scene_m)
         vertices_m[self.interactions == 0] = math.nan
         return power, vertices_m
 

@@ -129,7 +129,7 @@ class Simulation:
             tx_m, rx_m = checked_positions(self.partial, tx, rx, self.trace_settings.frequency_hz)
             valid = np.ones((len(tx_m), len(rx_m)), dtype=bool)
         ends: dict[str, Any] = {"tx": tx_m.reshape(np.shape(tx)), "rx": rx_m}
-        room = max(1, self.trace_settings.max_depth), polarisations
+        room = self.trace_settings.most_interactions, polarisations
         settings: dict[str, Any] = {"trace_settings": self.trace_settings, "scene_settings": self.scene_settings}
         with reporting(progress) as report:
             report(0.0, "building the scene")
@@ -239,14 +239,14 @@ class Simulation:
     @property
     def _only_by_rays(self) -> list[str]:
         """Settings that ask for paths which only rays find."""
-        names = "refraction", "diffuse_reflection", *(() if self.partial.mesh is None else ("diffraction",))
+        names = "diffuse_reflection", *(() if self.partial.mesh is None else ("diffraction", "refraction"))
         return [name for name in names if getattr(self.trace_settings, name)]
 
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
         """What finds the paths, with the scene in memory; a warning is logged where only rays do."""
         if self._only_by_rays:
-            names = [f"{name} on a mesh" if name == "diffraction" else name for name in self._only_by_rays]
+            names = [name if name == "diffuse_reflection" else f"{name} on a mesh" for name in self._only_by_rays]
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
             _log.warning(message, " and ".join(names).replace("_", " "), self.trace_settings.samples_per_tx)
         with temporary_folder() as folder:
@@ -441,6 +441,8 @@ def checked_settings(
         material.require_frequency(settings.frequency_hz)
     if settings.diffraction is None:
         settings = replace(settings, diffraction=partial.mesh is None)
+    if settings.refraction is None:
+        settings = replace(settings, refraction=settings.through_walls and partial.mesh is None)
     return settings, scene_settings
 
 

@@ -13,9 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
+from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
-from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
-from sionna_partial.tracing.plan.beams import _add_points, _reflect, _root_beams, _Scratch, _visible_pieces
+from sionna_partial.scene.floor_plan import Plan, bin_points, grow
+from sionna_partial.scene.scene import SceneGeometry, constants_of
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.bounds import dropped_power
+from sionna_partial.tracing.candidates import SAME_WALL, WALL, Candidates
+from sionna_partial.tracing.plan.beams import TOLERANCE_M, _add_points, _reflect, _root_beams, _Scratch, _visible_pieces
 from sionna_partial.tracing.plan.specular import CEILING, FLOOR, Room, can_bounce, merge_heights, unfolded_height
 from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
 
@@ -24,8 +30,26 @@ _COSINES = 2048
 _VARIANTS = 5
 """Reflections at floor and ceiling that a path through walls may have: none, floor, ceiling, both in either order."""
 
-_FACES = 24
-"""Most faces that a path may cross, the two of each wall counted."""
+_USUAL_REFLECTIONS, _MOST_REFLECTIONS = 3, 4
+"""Number of reflections at walls beyond which beams must be stronger, and the largest, unless all paths are asked for."""
+
+_WEAKEST, _WEAKEST_OF_ALL = 1e-3, 1e-6
+"""Beams that bring less than this fraction of a link's power are left out; the second where every path is asked for."""
+
+_RARER = 0.01
+"""Fraction of its power that counts of a beam with more than the usual reflections."""
+
+_CELL_M = 1.0
+"""Edge of the cells of receivers that beams are compared with [m]."""
+
+_AT_ONCE = 100_000
+"""Number of candidates that are written together, which bounds the memory."""
+
+_FLAT = 3
+"""Kind of a reflection at floor or ceiling, beside 0 at a wall, WALL and SAME_WALL."""
+
+_FACES = 40
+"""Most faces of walls that a leg may cross."""
 
 _SHORTEST_LEG_M = 0.0101
 """Sionna RT drops paths with legs of 1 cm or less."""
@@ -57,30 +81,38 @@ class Interior(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """Most reflections, of them at walls, and most walls crossed of a path; how weak a beam may be beside its link."""
+    """Most reflections of a path, most of them at walls, and most walls that it goes through.
+
+    `rarer` is what counts of the power of beams for each reflection beyond `_USUAL_REFLECTIONS`.
+    """
 
     depth: int
     reflections: int
     walls: int
-    weakest: float
+    rarer: float
 
 
-class Prune(NamedTuple):
-    """What a beam must reach to matter, from cells of receivers sorted by their distance from the transmitter.
+class Needed(NamedTuple):
+    """What a beam must bring to matter, from receivers (N,) sorted by their distance from the transmitter in the plan.
 
-    `loss` (B,) is the smallest relative power, of cells at least that far, and `power` (B,) the smallest power of
-    cells at most that far.
+    `relative` is the smallest power that matters, relative to free space, to any receiver at least that far away;
+    `power` the smallest that matters to any receiver at most that far away, times (4 pi / wavelength)^2, and `cells`
+    (ny, nx) the same of the receivers in square cells, whose corner x0 and y0 and edge [m] are `grid` (3,).
     """
 
     distance_m: Floats
-    loss: Floats
+    relative: Floats
     power: Floats
+    cells: Floats
+    grid: Floats
 
 
 class Tree(NamedTuple):
-    """Beams: node (M, 3) with parent, piece of wall and whether it is crossed; image sources (M, 2); pairs (K, 2).
+    """Beams that reflect at walls and go through them, and the receivers in each.
 
-    `loss` (M,) bounds what a path keeps of its power at the walls of a beam.
+    `node` (M, 3) has the parent of each beam, its piece of wall and whether it went through; the roots have -1, -1, 0.
+    `source` (M, 2) is the image of the transmitter [m], `loss` (M,) bounds what the walls leave of the power. `pair`
+    (K, 2) are beams and receivers, each sequence of reflections once for a receiver.
     """
 
     node: NDArray[np.int32]
@@ -89,48 +121,139 @@ class Tree(NamedTuple):
     pair: NDArray[np.int64]
 
 
+class CrossingCandidates:
+    """Paths between the transmitter and the receivers of a room that go through walls, without diffraction.
+
+    They have at most three reflections at walls, and two at floor and ceiling. Beams that bring less than a thousandth
+    of the power of every link are left out.
+    """
+
+    def __init__(self, geometry: SceneGeometry, room: Room, interior: Interior, settings: TraceSettings) -> None:
+        self._geometry, self._room, self._interior = geometry, room, interior
+        self._tolerance_db = settings.power_tolerance_db
+        exact = self._tolerance_db == 0.0
+        most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
+        self._limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
+        self._weakest = _WEAKEST_OF_ALL if exact else _WEAKEST
+        self._wavelength_m = SPEED_OF_LIGHT_M_S / settings.frequency_hz
+        material = geometry.material
+        constants = *constants_of(material, settings.frequency_hz), material.thickness_m
+        self._slab = slab_of(np.array(constants), settings.frequency_hz)
+        self._trail = trail_of(geometry.plan)
+
+    def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
+        """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
+        straight = self._straight()
+        power = self._powers(straight, np.zeros(len(found)))
+        total = found + np.bincount(straight.pair[:, 1], power.sum(axis=1), len(found))
+        needed = self._weakest * np.maximum(total, 10.0 ** (GAIN_FLOOR_DB / 10.0))
+        trees = [(straight, power)]
+        if self._limits.depth:
+            tree = self._tree(needed)
+            trees.append((tree, self._powers(tree, needed)))
+        least = self._least([(tree.pair[:, 1], power) for tree, power in trees], found)
+        for number, (tree, power) in enumerate(trees):
+            chosen, variant = np.nonzero((power > 0.0) & (power >= least[tree.pair[:, 1], None]))
+            for start in range(0, len(chosen), _AT_ONCE):
+                rows = slice(start, start + _AT_ONCE)
+                yield self._written(tree, chosen[rows], variant[rows]), (number + 1) / len(trees)
+
+    def _straight(self) -> Tree:
+        """Return the straight lines to all receivers, as pairs without a beam."""
+        count = len(self._room.rx_m)
+        pair = np.stack([np.full(count, -1), np.arange(count)], axis=1)
+        return Tree(np.zeros((0, 3), np.int32), np.zeros((0, 2)), np.zeros(0), pair)
+
+    def _tree(self, needed: Floats) -> Tree:
+        """Trace the beams."""
+        room, receivers = self._room, bin_points(self._room.rx_m[:, :2])
+        least = _needed_by_distance(room, needed, self._wavelength_m)
+        node, sequence, source, loss, pair = _trace(
+            self._geometry.plan,
+            _root_beams(room.tx_m[None, :2]),
+            receivers,
+            self._slab,
+            self._interior.depth_m,
+            self._limits,
+            least,
+            2.0 * room.height_m,
+        )
+        pair = np.stack([pair[:, 0], receivers.order[pair[:, 1]]], axis=1).astype(np.int64)
+        order = np.lexsort((pair[:, 1], sequence[pair[:, 0]]))
+        pair, same = pair[order], sequence[pair[order, 0]]
+        new = np.ones(len(pair), dtype=bool)
+        new[1:] = (same[1:] != same[:-1]) | (pair[1:, 1] != pair[:-1, 1])
+        return Tree(node, source, loss, pair[new])
+
+    def _powers(self, tree: Tree, needed: Floats) -> Floats:
+        """Power (K, V) of the paths of all pairs, and of their variants by floor and ceiling; 0 where there is none."""
+        return pair_powers(  # type: ignore[no-any-return]
+            tree,
+            needed,
+            self._geometry.plan,
+            self._interior,
+            self._room,
+            self._slab,
+            self._limits,
+            self._wavelength_m,
+            self._trail,
+        )
+
+    def _least(self, parts: list[tuple[Indices, Floats]], found: Floats) -> Floats:
+        """Power (N,) below which links can do without paths."""
+        rx = np.concatenate([np.repeat(pair_rx, _VARIANTS) for pair_rx, _ in parts])
+        power = np.concatenate([each.ravel() for _, each in parts])
+        rx, power = rx[power > 0.0], power[power > 0.0]
+        order = np.lexsort((power, rx))
+        rx, power = rx[order], power[order]
+        allowed = dropped_power(found + np.bincount(rx, power, len(found)), self._tolerance_db)
+        sums = np.cumsum(power)
+        before = np.concatenate([[0.0], sums])[np.searchsorted(rx, np.arange(len(found)))]
+        kept = sums - before[rx] > allowed[rx]
+        least = np.full(len(found), np.inf)
+        np.minimum.at(least, rx[kept], power[kept])
+        return least
+
+    def _written(self, tree: Tree, chosen: Indices, variant: Indices) -> Candidates:
+        """Write the paths of some pairs."""
+        geometry = self._geometry
+        surface, kind, vertices_m = write_paths(
+            tree, chosen, variant, geometry.plan, self._interior, self._room, self._limits, self._trail
+        )
+        used = max(1, int((kind >= 0).sum(axis=1).max(initial=0)))
+        surface, kind, vertices_m = surface[:, :used], kind[:, :used], vertices_m[:, :used]
+        flat = np.where(vertices_m[:, :, 2] > 0.5 * self._room.height_m, geometry.ceiling_face, geometry.floor_face)
+        face = np.where(kind == _FLAT, flat, np.where(kind < 0, -1, 2 * surface)).astype(np.int32)
+        crossed = np.where((kind == WALL) | (kind == SAME_WALL), kind, 0).astype(np.uint8)
+        return Candidates(tree.pair[chosen, 1].astype(np.int32), face, vertices_m, crossed=crossed)
+
+
 def slab_of(material: Floats, frequency_hz: float) -> Slab:
     """Tabulate the coefficients of a material, its permittivity, conductivity and thickness (3,)."""
     cosine = np.linspace(0.0, 1.0, _COSINES + 1)
-    reflection = np.stack(reflection_coefficients(*material, frequency_hz, cosine), axis=1)
-    transmission = np.stack(transmission_coefficients(*material, frequency_hz, cosine), axis=1)
+    reflection = np.stack(reflection_coefficients(*material, frequency_hz, cosine), axis=1)  # type: ignore[call-arg]
+    transmission = np.stack(transmission_coefficients(*material, frequency_hz, cosine), axis=1)  # type: ignore[call-arg]
     reflection[0], transmission[0] = -1.0, 0.0
-    most_r, most_t = (np.max(np.abs(each) ** 2, axis=1) for each in (reflection, transmission))
-    return Slab(
-        reflection, transmission, np.maximum.accumulate(most_r[::-1])[::-1].copy(), np.maximum.accumulate(most_t)
-    )
+    reflected, transmitted = (np.max(np.abs(each) ** 2, axis=1) for each in (reflection, transmission))
+    most_reflected = np.maximum.accumulate(reflected[::-1])[::-1].copy()
+    return Slab(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted))
 
 
-def prune_of(tx_m: Floats, rx_m: Floats, power: Floats, weakest: float, wavelength_m: float) -> Prune:
-    """Prepare what beams are compared with: the links' power (N,), of which `weakest` matters."""
-    distance = np.linalg.norm(rx_m[:, :2] - tx_m[:2], axis=1)
-    order = np.argsort(distance, kind="stable")
-    distance, needed = distance[order], weakest * power[order]
-    free = (wavelength_m / (4.0 * math.pi * np.maximum(distance, 1e-3))) ** 2
-    return Prune(
-        distance,
-        np.minimum.accumulate((needed / free)[::-1])[::-1].copy(),
-        np.minimum.accumulate(needed) * (4.0 * math.pi / wavelength_m) ** 2,
-    )
-
-
-def trace_tree(plan: Plan, receivers: PointBins, tx_m: Floats, slab: Slab, interior: Interior, limits: Limits,
-               prune: Prune, height_m: float) -> Tree:
-    """Find the sequences of walls, reflected at or crossed, that a path can have to some receivers, each pair once."""
-    node, sequence, source, loss, pair = _trace(
-        plan, _root_beams(tx_m[None, :2]), receivers, slab, interior.depth_m, limits, prune, height_m
-    )
-    pair = pair.astype(np.int64)
-    pair[:, 1] = receivers.order[pair[:, 1]]
-    key = np.lexsort((pair[:, 1], sequence[pair[:, 0]]))
-    pair, same = pair[key], sequence[pair[key, 0]]
-    new = np.ones(len(pair), bool)
-    new[1:] = (same[1:] != same[:-1]) | (pair[1:, 1] != pair[:-1, 1])
-    return Tree(node, source, loss, pair[new])
+def _needed_by_distance(room: Room, needed: Floats, wavelength_m: float) -> Needed:
+    """Sort what matters to receivers (N,) by distance."""
+    distance_m = np.linalg.norm(room.rx_m[:, :2] - room.tx_m[:2], axis=1)
+    order = np.argsort(distance_m, kind="stable")
+    distance_m, needed = distance_m[order], needed[order] * (4.0 * math.pi / wavelength_m) ** 2
+    relative = np.minimum.accumulate((needed * np.maximum(distance_m, 1e-3) ** 2)[::-1])[::-1].copy()
+    low = room.rx_m[:, :2].min(axis=0)
+    column, row = ((room.rx_m[order, :2] - low) / _CELL_M).astype(np.int64).T
+    cells = np.full((row.max() + 1, column.max() + 1), np.inf)
+    np.minimum.at(cells, (row, column), needed)
+    return Needed(distance_m, relative, np.minimum.accumulate(needed), cells, np.array([*low, _CELL_M]))
 
 
 @njit(cache=True, nogil=True)
-def _trace(plan, beam, receivers, slab, depth_m, limits, prune, height_m):  # type: ignore[no-untyped-def]
+def _trace(plan, beam, receivers, slab, depth_m, limits, needed, height_m):  # type: ignore[no-untyped-def]
     """Breadth-first tree of beams: nodes, numbers of their sequences of reflections, image sources and pairs."""
     walls, count = plan.pieces_m, len(beam)
     node = np.empty((count, 3), np.int32)
@@ -184,7 +307,13 @@ def _trace(plan, beam, receivers, slab, depth_m, limits, prune, height_m):  # ty
                     loss *= slab.most_transmitted[min(int(most * _COSINES) + 1, _COSINES)]
                 else:
                     cosine = min(value[k, 1], least)
-                if crossed <= limits.walls and _matters(loss, near, prune):
+                last = state[k, 0] == limits.reflections
+                rarer = limits.rarer ** max(0, state[k, 0] - _USUAL_REFLECTIONS)
+                if (
+                    crossed <= limits.walls
+                    and _matters(loss * rarer, near, needed)
+                    and (not last or _reaches(ends, near, loss * rarer, needed))
+                ):
                     node[count, 0], node[count, 1], node[count, 2] = k, wall, 1
                     state[count, 0], state[count, 1], state[count, 2], state[count, 3] = state[k, 0], crossed, first, 1
                     value[count, 0], value[count, 1], sequence[count] = loss, cosine, sequence[k]
@@ -193,7 +322,13 @@ def _trace(plan, beam, receivers, slab, depth_m, limits, prune, height_m):  # ty
             if state[k, 0] < limits.reflections:
                 flat = near / np.hypot(near, height_m)
                 loss = value[k, 0] * slab.most_reflected[int(least * flat * _COSINES)]
-                if _matters(loss, near, prune) and _reflect(beam[k], piece, walls[wall], beam[count]):
+                last = state[k, 0] + 1 == limits.reflections
+                rarer = limits.rarer ** max(0, state[k, 0] + 1 - _USUAL_REFLECTIONS)
+                if (
+                    _matters(loss * rarer, near, needed)
+                    and _reflect(beam[k], piece, walls[wall], beam[count])
+                    and (not last or _reaches(beam[count], near, loss * rarer, needed))
+                ):
                     node[count, 0], node[count, 1], node[count, 2] = k, wall, 0
                     state[count, 0], state[count, 1] = state[k, 0] + 1, state[k, 1]
                     state[count, 2], state[count, 3] = -1, state[k, 3]
@@ -206,7 +341,7 @@ def _trace(plan, beam, receivers, slab, depth_m, limits, prune, height_m):  # ty
 
 @njit(cache=True)
 def _mixed(sequence, line):  # type: ignore[no-untyped-def]
-    """Number of a sequence of lines with one more (splitmix64)."""
+    """Hash a sequence of lines and one line more (splitmix64)."""
     z = np.uint64(sequence) + np.uint64(line + 1) * np.uint64(0x9E3779B97F4A7C15)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -241,12 +376,42 @@ def _apart(first, second):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _matters(loss, near, prune):  # type: ignore[no-untyped-def]
+def _matters(loss, near, needed):  # type: ignore[no-untyped-def]
     """Whether a beam with this loss, which has come this far at least, may matter to any receiver."""
-    at = np.searchsorted(prune.distance_m, near)
-    if at < len(prune.distance_m) and loss >= prune.loss[at]:
+    at = np.searchsorted(needed.distance_m, near)
+    if at < len(needed.distance_m) and loss >= needed.relative[at]:
         return True
-    return at > 0 and loss >= prune.power[at - 1] * near * near
+    return at > 0 and loss >= needed.power[at - 1] * near * near
+
+
+@njit(cache=True)
+def _reaches(beam, near, loss, needed):  # type: ignore[no-untyped-def]
+    """Whether a beam matters to any receiver behind its window, with all that stands there taken away."""
+    x0, y0, edge = needed.grid
+    rows, columns = needed.cells.shape
+    far = np.hypot(
+        max(abs(beam[0] - x0), abs(beam[0] - x0 - columns * edge)),
+        max(abs(beam[1] - y0), abs(beam[1] - y0 - rows * edge)),
+    )
+    corner = np.empty((4, 2))
+    for e in range(2):
+        dx, dy = beam[2 + 2 * e] - beam[0], beam[3 + 2 * e] - beam[1]
+        scale = max(1.0, 2.0 * far / max(np.hypot(dx, dy), 1e-9))
+        corner[e, 0], corner[e, 1] = beam[2 + 2 * e], beam[3 + 2 * e]
+        corner[3 - e, 0], corner[3 - e, 1] = beam[0] + scale * dx, beam[1] + scale * dy
+    low, high = np.min(corner[:, 1]) - TOLERANCE_M, np.max(corner[:, 1]) + TOLERANCE_M
+    for row in range(max(0, int(np.floor((low - y0) / edge))), min(rows, int(np.floor((high - y0) / edge)) + 1)):
+        left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
+        if left > right:
+            continue
+        first = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
+        last = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
+        for column in range(first, last + 1):
+            x, y = x0 + (column + 0.5) * edge - beam[0], y0 + (row + 0.5) * edge - beam[1]
+            length = max(near, np.hypot(x, y) - 0.7072 * edge)
+            if loss >= needed.cells[row, column] * length * length:
+                return True
+    return False
 
 
 class Trail(NamedTuple):
@@ -268,7 +433,7 @@ class Trail(NamedTuple):
 
 def trail_of(plan: Plan) -> Trail:
     """Make scratch for paths in a plan."""
-    room = _FACES + 16
+    room = 64
     return Trail(
         np.empty(16, np.int64),
         np.empty((16, 3)),
@@ -289,8 +454,11 @@ def _follow(tree, node, plan, interior, tx_m, target, limits, trail):  # type: i
         k += 1 - tree.node[above, 2]
         above = tree.node[above, 0]
     x, y = target[0], target[1]
-    total = np.hypot(x - tree.source[node, 0], y - tree.source[node, 1]) if node >= 0 else np.hypot(
-        x - tx_m[0], y - tx_m[1])
+    total = (
+        np.hypot(x - tree.source[node, 0], y - tree.source[node, 1])
+        if node >= 0
+        else np.hypot(x - tx_m[0], y - tx_m[1])
+    )
     level = k - 1
     while level >= 0:
         while tree.node[node, 2] == 1:
@@ -313,7 +481,12 @@ def _follow(tree, node, plan, interior, tx_m, target, limits, trail):  # type: i
     ax, ay, done, own = tx_m[0], tx_m[1], 0.0, -1
     for level in range(k + 1):
         if level < k:
-            bx, by, stop, other = trail.bounce[level, 0], trail.bounce[level, 1], trail.bounce[level, 2], trail.walls[level]
+            bx, by, stop, other = (
+                trail.bounce[level, 0],
+                trail.bounce[level, 1],
+                trail.bounce[level, 2],
+                trail.walls[level],
+            )
         else:
             bx, by, stop, other = target[0], target[1], 1.0, -1
         count, more = _cross_leg(plan, interior, ax, ay, bx, by, own, other, done, stop, count, trail)
@@ -360,7 +533,12 @@ def _cross_leg(plan, interior, ax, ay, bx, by, own, other, done, stop, count, tr
             trail.visit[i] = stamp
             if (own >= 0 and plan.line[i] == plan.line[own]) or (other >= 0 and plan.line[i] == plan.line[other]):
                 continue
-            px, py, qx, qy = plan.pieces_m[i, 0, 0], plan.pieces_m[i, 0, 1], plan.pieces_m[i, 1, 0], plan.pieces_m[i, 1, 1]
+            px, py, qx, qy = (
+                plan.pieces_m[i, 0, 0],
+                plan.pieces_m[i, 0, 1],
+                plan.pieces_m[i, 1, 0],
+                plan.pieces_m[i, 1, 1],
+            )
             side_p, side_q = dx * (py - ay) - dy * (px - ax), dx * (qy - ay) - dy * (qx - ax)
             if (side_p >= 0.0) == (side_q >= 0.0):
                 continue
@@ -500,10 +678,10 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
 
 
 @njit(cache=True, nogil=True)
-def pair_powers(tree, needed, start, stop, plan, interior, room, slab, limits, wavelength, trail):  # type: ignore[no-untyped-def]
-    """Power (K, V) of each variant of pairs start to stop; 0 where there is none that crosses a wall."""
-    power = np.zeros((stop - start, _VARIANTS))
-    for i in range(start, stop):
+def pair_powers(tree, needed, plan, interior, room, slab, limits, wavelength, trail):  # type: ignore[no-untyped-def]
+    """Power (K, V) of each variant of all pairs; 0 where there is none that goes through a wall, or is needed."""
+    power = np.zeros((len(tree.pair), _VARIANTS))
+    for i in range(len(tree.pair)):
         node, rx = tree.pair[i, 0], tree.pair[i, 1]
         target = room.rx_m[rx]
         if node >= 0:
@@ -517,7 +695,7 @@ def pair_powers(tree, needed, start, stop, plan, interior, room, slab, limits, w
         for variant in range(_VARIANTS):
             bounces, first, good = _can_bounce(variant, room)
             if good and reflections + bounces <= limits.depth:
-                power[i - start, variant] = _path_power(
+                power[i, variant] = _path_power(
                     trail, count, length, room, target, bounces, first, plan, interior, slab, wavelength
                 )
     return power
@@ -534,8 +712,9 @@ def _has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def write_paths(tree, chosen, variants, columns, plan, interior, room, limits, trail):  # type: ignore[no-untyped-def]
-    """Write chosen pairs: surfaces (C, D) and kinds of `Trail`, floor and ceiling as kind 3, -1 none; vertices (C, D, 3)."""
+def write_paths(tree, chosen, variants, plan, interior, room, limits, trail):  # type: ignore[no-untyped-def]
+    """Write chosen pairs: surfaces (C, D), kinds of `Trail` or _FLAT, -1 where there is nothing, vertices (C, D, 3)."""
+    columns = len(trail.surface) + 2
     surface, kind = np.full((len(chosen), columns), -1, np.int32), np.full((len(chosen), columns), -1, np.int32)
     vertices = np.zeros((len(chosen), columns, 3))
     item = np.empty(len(trail.surface), np.int64)
@@ -544,8 +723,6 @@ def write_paths(tree, chosen, variants, columns, plan, interior, room, limits, t
         target = room.rx_m[rx]
         count, _, _ = _follow(tree, node, plan, interior, room.tx_m, target, limits, trail)
         bounces, first, _ = _can_bounce(variants[c], room)
-        if count + bounces > columns:
-            continue
         for k in range(count):
             item[k] = k
         merge_heights(item[:count], trail.points[:count], room, target, bounces, first, surface[c], vertices[c])
@@ -554,5 +731,5 @@ def write_paths(tree, chosen, variants, columns, plan, interior, room, limits, t
                 kind[c, d] = trail.kind[surface[c, d]]
                 surface[c, d] = plan.owner[trail.surface[surface[c, d]]]
             else:
-                kind[c, d] = 3
+                kind[c, d] = _FLAT
     return surface, kind, vertices
