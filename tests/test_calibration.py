@@ -242,8 +242,8 @@ class TestWrongArguments:
     def test_start_and_settings(self) -> None:
         with pytest.raises(SettingsError, match="start = 'brick' is not allowed: give a Material, or None for the s"):
             calibrate(measured(), start="brick")
-        with pytest.raises(SettingsError, match="refraction = True is not allowed"):
-            calibrate(measured(), trace_settings=sp.TraceSettings(refraction=True))
+        with pytest.raises(SettingsError, match="diffuse_reflection = True is not allowed"):
+            calibrate(measured(), trace_settings=sp.TraceSettings(diffuse_reflection=True))
         with pytest.raises(SettingsError, match="'wet_ground' is defined for 1-10 GHz"):
             calibrate(measured(), start=sp.Material(itu="wet_ground"))
 

@@ -116,11 +116,10 @@ class TestGainGradients:
 
 
 class TestErrors:
-    @pytest.mark.parametrize("name", ["refraction", "diffuse_reflection"])
-    def test_rays_are_shot(self, name: str) -> None:
-        message = f"{name} = True is not allowed: paths that are found by shooting rays have no gradients: give False"
+    def test_rays_are_shot(self) -> None:
+        message = "diffuse_reflection = True is not allowed: paths that are found by shooting rays have no gradients"
         with pytest.raises(SettingsError, match=message):
-            gain_gradients(FIELD, TX, RX, trace_settings=sp.TraceSettings(**{name: True}))
+            gain_gradients(FIELD, TX, RX, trace_settings=sp.TraceSettings(diffuse_reflection=True))
 
     def test_diffraction_on_a_mesh(self, tmp_path: Path) -> None:
         room().export(tmp_path / "room.ply")

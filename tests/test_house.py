@@ -31,8 +31,8 @@ ROOMS = {
     "simulation": ("furniture", "buildings", "homes", "camera", "robot"),
     "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
     "tracing": (
-        *("candidates", "paths", "links", "engine", "slab", "bounds"),
-        *("plan.beams", "plan.specular", "plan.diffraction"),
+        *("paths", "candidates", "links", "engine", "slab", "bounds"),
+        *("plan.beams", "plan.specular", "plan.crossings", "plan.diffraction"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder"),
         *("path_set", "simulation", "gradients"),
         "antennas",

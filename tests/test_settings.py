@@ -79,7 +79,7 @@ def test_ranges(kind: type, name: str) -> None:
 SWITCHES = {
     (TraceSettings, "diffraction"): None,
     (TraceSettings, "open_ends"): False,
-    (TraceSettings, "refraction"): False,
+    (TraceSettings, "refraction"): None,
     (TraceSettings, "diffuse_reflection"): False,
     (SceneSettings, "ceiling"): True,
 }

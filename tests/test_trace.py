@@ -247,9 +247,9 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
     tx, rx = (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]]
     trace_links(_room(), tx, rx)
     assert not caplog.messages
-    trace_links(_room(), tx, rx, trace_settings=all_paths(max_depth=1, refraction=True, samples_per_tx=1000))
+    trace_links(_room(), tx, rx, trace_settings=all_paths(max_depth=1, diffuse_reflection=True, samples_per_tx=1000))
     assert caplog.messages == [
-        "refraction: Sionna RT shoots 1000 rays for one receiver after the other, and finds most paths, not all"
+        "diffuse reflection: Sionna RT shoots 1000 rays for one receiver after the other, and finds most paths, not all"
     ]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
+from sionna_partial.tracing.paths import widened
 
 EDGE = -2
 """Stands for the face of an interaction in a candidate where that is a diffraction."""
@@ -66,6 +67,12 @@ class Candidates:
             np.concatenate([getattr(each, name) for each in parts]) for name in ("rx", "face", "vertices_m")
         )
         return cls(rx, face, vertices_m, wedge, parts[0].wedges, crossed)
+
+    def widened(self, depth: int) -> "Candidates":
+        """Return them with room for `depth` interactions."""
+        crossed = None if self.crossed is None else widened(self.crossed, depth, 0)
+        face, vertices_m = widened(self.face, depth, -1), widened(self.vertices_m, depth, 0.0)
+        return replace(self, face=face, vertices_m=vertices_m, crossed=crossed)
 
     def rows(self, index: Indices) -> "Candidates":
         """Pick some of the candidates."""

@@ -193,11 +193,12 @@ def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
     flat = to_device(mi.UInt, (kept + depth * np.arange(count)[:, None]).astype(np.uint32).ravel())
     shorter = PathsBuffer(*kept.shape, buffer.diffracting_wedges is not None)
     for name in _BUFFER_COLUMNS:
-        column: Any = getattr(buffer, name)
-        setattr(shorter, name, type(column)(dr.gather(type(column.array), column.array, flat), kept.shape))
-    ended = to_device(mi.Bool, np.take_along_axis(dropped | none, kept, axis=1).ravel())
-    kind = dr.select(ended, InteractionType.NONE, shorter.interaction_types.array)
-    shorter._interaction_types = mi.TensorXu(kind, kept.shape)
+        column = getattr(buffer, name)
+        values = dr.gather(type(column.array), column.array, flat)
+        if name == "_interaction_types":
+            ended = to_device(mi.Bool, np.take_along_axis(dropped | none, kept, axis=1).ravel())
+            values = dr.select(ended, InteractionType.NONE, values)
+        setattr(shorter, name, type(column)(values, kept.shape))
     for name in ("_valid", "_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"):
         setattr(shorter, name, getattr(buffer, name))
     return shorter

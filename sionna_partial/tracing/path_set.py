@@ -7,7 +7,7 @@ the derivatives. A path that other values make invalid has no power; one that th
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables, forward_passes
 from sionna_partial.tracing.links import LinkSums, TracedLinks
-from sionna_partial.tracing.paths import SolvedPaths, join_paths, widened
+from sionna_partial.tracing.paths import SolvedPaths, join_paths
 
 PATHS_PER_BLOCK = 50_000
 """Number of paths that are evaluated together, which bounds the memory."""
@@ -252,19 +252,19 @@ class PathSet:
 
 
 def _merged(parts: list[Part]) -> list[Part]:
-    """Join parts of one kind, without diffraction or with it, and cut them to `PATHS_PER_BLOCK`."""
+    """Join parts that can be verified together, and cut them to `PATHS_PER_BLOCK`."""
     merged = []
-    for is_diffracted in (False, True):
-        some = [part for part in parts if (part[0].wedges is not None) == is_diffracted and len(part[0].rx)]
+    for diffracted, crossing in ((False, False), (True, False), (False, True)):
+        some = [
+            (candidates, paths)
+            for candidates, paths in parts
+            if len(candidates.rx)
+            and (candidates.wedges is not None, candidates.crossed is not None) == (diffracted, crossing)
+        ]
         if not some:
             continue
         depth = max(candidates.face.shape[1] for candidates, _ in some)
-        candidates = Candidates.concatenate(
-            [
-                replace(each, face=widened(each.face, depth, -1), vertices_m=widened(each.vertices_m, depth, 0.0))
-                for each, _ in some
-            ]
-        )
+        candidates = Candidates.concatenate([each.widened(depth) for each, _ in some])
         paths = SolvedPaths.concatenate([solved for _, solved in some], depth)
         for start in range(0, len(paths.a), PATHS_PER_BLOCK):
             rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))

@@ -31,7 +31,7 @@ _VARIANTS = 5
 """Reflections at floor and ceiling that a path through walls may have: none, floor, ceiling, both in either order."""
 
 _USUAL_REFLECTIONS, _MOST_REFLECTIONS = 3, 4
-"""Number of reflections at walls beyond which beams must be stronger, and the largest, unless all paths are asked for."""
+"""Reflections at walls beyond which beams must be stronger, and the most of them, unless all paths are asked for."""
 
 _WEAKEST, _WEAKEST_OF_ALL = 1e-3, 1e-6
 """Beams that bring less than this fraction of a link's power are left out; the second where every path is asked for."""

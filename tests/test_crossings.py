@@ -1,0 +1,182 @@
+"""Paths through walls: their loss is that of the walls between, counted once, and none that matters is missing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sionna_partial as sp
+from sionna_partial.tracing.engine import open_scene
+from sionna_partial.tracing.finder import stock_paths
+from sionna_partial.tracing.simulation import checked_settings
+from sionna_partial.tracing.slab import transmission_coefficients
+
+BRICK = sp.Material(3.91, 0.031, 0.1)
+LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
+STRAIGHT = sp.TraceSettings(frequency_hz=5e9, max_depth=0, power_tolerance_db=0.0)
+REFRACTION = 4
+
+
+def walled(cells: int, *, resolution_m: float = 0.1, unseen: bool = False) -> sp.PartialMap:
+    """A field with a wall of some cells across it; of an unseen one only the first cells are known."""
+    state = np.zeros((60, 80), dtype=np.uint8)
+    state[:, 40 : 40 + cells] = 1
+    if unseen:
+        state[:, 41:60] = 2
+    return sp.PartialMap(state, resolution_m)
+
+
+def slab_loss_db(cosine: float, frequency_hz: float = 5e9, material: sp.Material = BRICK) -> float:
+    constants = material.relative_permittivity, material.conductivity_s_m, material.thickness_m
+    return float(-20.0 * np.log10(np.abs(transmission_coefficients(*constants, frequency_hz, cosine)[0])))
+
+
+def loss_db(partial: sp.PartialMap, tx: tuple[float, ...], rx: tuple[float, ...], **changes: object) -> float:
+    """Loss of a link beyond free space."""
+    links = sp.trace_links(partial, tx, [rx], trace_settings=replace(STRAIGHT, **changes), scene_settings=LONELY)  # type: ignore[arg-type]
+    free_db = 20.0 * np.log10(299792458.0 / 5e9 / (4.0 * np.pi * np.linalg.norm(np.subtract(rx, tx))))
+    return float(free_db - links.gain_db[0])
+
+
+class TestOneWall:
+    @pytest.mark.parametrize("cells", [1, 3, 6])
+    @pytest.mark.parametrize("angle_deg", [0, 30, 60])
+    def test_costs_its_slab_however_deep_it_is(self, cells: int, angle_deg: float) -> None:
+        aside = 1.5 * np.tan(np.radians(angle_deg))
+        tx, rx = (3.0, 2.97 - aside, 1.5), (6.0, 2.97 + aside, 1.5)
+        loss = loss_db(walled(cells), tx, rx)
+        assert loss == pytest.approx(slab_loss_db(np.cos(np.radians(angle_deg))), abs=0.02)
+
+    def test_costs_the_same_where_one_face_was_seen(self) -> None:
+        tx, rx = (2.5, 2.97, 1.5), (6.5, 3.11, 1.5)
+        assert loss_db(walled(1, unseen=True), tx, rx) == pytest.approx(loss_db(walled(1), tx, rx), abs=0.02)
+
+    def test_deeper_than_one_wall(self) -> None:
+        """A block of 0.9 m is two walls, and one if walls may be that deep; two slabs wherever each face is one."""
+        tx, rx, once = (2.5, 2.97, 1.5), (6.5, 2.97, 1.5), slab_loss_db(1.0)
+        assert loss_db(walled(9), tx, rx) == pytest.approx(2 * once, abs=0.02)
+        assert loss_db(walled(9), tx, rx, wall_depth_m=1.0) == pytest.approx(once, abs=0.02)
+        assert loss_db(walled(3), tx, rx, wall_depth_m=0.0) == pytest.approx(2 * once, abs=0.02)
+
+    def test_a_gap_parts_two_walls(self) -> None:
+        state = walled(1).state.copy()
+        state[:, 44] = 1
+        twice = 2 * slab_loss_db(1.0)
+        assert loss_db(sp.PartialMap(state, 0.1), (2.5, 2.97, 1.5), (6.5, 2.97, 1.5)) == pytest.approx(twice, abs=0.02)
+
+    def test_more_walls_than_allowed(self) -> None:
+        state = walled(1).state.copy()
+        state[:, 44] = 1
+        ends = (2.5, 2.97, 1.5), (6.5, 2.97, 1.5)
+        links = sp.trace_links(
+            sp.PartialMap(state, 0.1), ends[0], [ends[1]], trace_settings=replace(STRAIGHT, max_walls=1)
+        )
+        assert links.link_state.tolist() == [sp.LinkState.OUTAGE]
+
+
+def rooms() -> sp.PartialMap:
+    """Three rooms beside each other, with a door in one of the walls between them, a pillar and a tilted wall."""
+    state = np.zeros((50, 90), dtype=np.uint8)
+    state[[0, -1]], state[:, [0, -1]] = 1, 1
+    state[:30, 30:32], state[:, 60] = 1, 1
+    state[20:24, 12:16] = 1
+    state[np.arange(5, 25), np.arange(70, 80).repeat(2)] = 1
+    return sp.PartialMap(state, 0.1, (-2.0, 3.0))
+
+
+TX = (-0.52, 4.13, 1.5)
+RX = np.array([[2.51, 7.23, 1.3], [5.3, 6.04, 1.5], [1.93, 3.81, 1.7], [6.6, 3.92, 1.5], [0.61, 7.7, 1.1]])
+EVERY = sp.TraceSettings(
+    frequency_hz=5e9, max_depth=4, max_walls=4, power_tolerance_db=0.0, wall_depth_m=0.0, diffraction=False
+)
+
+
+def test_stock_finds_no_other_paths(tmp_path: Path) -> None:
+    """With each face a slab, all strong paths of the public solver, at the same points, as strong."""
+    settings, scene_settings = checked_settings(rooms(), EVERY, sp.SceneSettings(material=BRICK))
+    ours = sp.trace_links(rooms(), TX, RX, trace_settings=settings, scene_settings=scene_settings)
+    folder = sp.export_scene(replace(rooms(), origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
+    scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
+    found = 0
+    for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
+        own = np.flatnonzero(ours.path_rx == rx)
+        for path in np.flatnonzero(paths.power > 1e-3 * paths.power.sum()):
+            kinds = paths.interactions[path][paths.interactions[path] > 0]
+            at_m = paths.vertices_m[path, : len(kinds)] + shift
+            same = [
+                k
+                for k in own
+                if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
+                and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
+            ]
+            assert len(same) == 1
+            assert abs(ours.a[same[0]]) ** 2 == pytest.approx(paths.power[path], rel=2e-3)
+            found += REFRACTION in kinds
+    assert found > 30
+
+
+def test_reciprocity() -> None:
+    settings = replace(EVERY, wall_depth_m=0.6, max_depth=3)
+    there = sp.trace_links(rooms(), TX, RX, trace_settings=settings)
+    back = [sp.trace_links(rooms(), rx, [TX], trace_settings=settings).gain_db[0] for rx in RX]
+    np.testing.assert_allclose(there.gain_db, back, atol=0.02)
+
+
+def test_turned_and_mirrored() -> None:
+    settings = replace(EVERY, wall_depth_m=0.6, power_tolerance_db=0.1)
+    gain_db = sp.trace_links(rooms(), TX, RX, trace_settings=settings).gain_db
+    turned = sp.PartialMap(rooms().state.T[:, ::-1].copy(), 0.1)  # (x, y) -> (height - y, x)
+
+    def there(points: object) -> np.ndarray:
+        x, y, z = (np.asarray(points) - [-2.0, 3.0, 0.0]).T
+        return np.stack([5.0 - y, x, z], axis=-1)
+
+    again = sp.trace_links(turned, there(TX), there(RX), trace_settings=settings).gain_db
+    np.testing.assert_allclose(again, gain_db, atol=0.15)
+
+
+def test_opaque_paths_stay() -> None:
+    """Those without walls are the same, to the byte, and those with walls say so."""
+    opaque, leaky = (
+        sp.trace_links(rooms(), TX, RX, trace_settings=replace(EVERY, refraction=on, diffraction=None))
+        for on in (False, True)
+    )
+    through = (leaky.interactions == REFRACTION).any(axis=1)
+    assert through.any()
+    assert np.sort(leaky.a[~through]).tobytes() == np.sort(opaque.a).tobytes()
+    walls = (leaky.interactions == REFRACTION).sum(axis=1)
+    assert walls.max() <= EVERY.max_walls
+
+
+def test_weak_paths_that_are_left_out_do_not_matter() -> None:
+    settings = replace(EVERY, wall_depth_m=0.6)
+    whole, short = (
+        sp.trace_links(rooms(), TX, RX, trace_settings=replace(settings, power_tolerance_db=tolerance_db))
+        for tolerance_db in (0.0, 0.1)
+    )
+    assert len(short.a) < len(whole.a)
+    np.testing.assert_allclose(short.gain_db, whole.gain_db, atol=0.15)
+
+
+def test_on_by_default_below_24_ghz() -> None:
+    for frequency_hz, through in ((5e9, True), (23.9e9, True), (24e9, False), (60e9, False)):
+        assert sp.TraceSettings(frequency_hz).through_walls is through
+        assert sp.Simulation(rooms(), sp.TraceSettings(frequency_hz)).trace_settings.refraction is through
+    assert sp.TraceSettings(5e9, refraction=False).through_walls is False
+
+
+def test_slopes_of_materials() -> None:
+    """Derivatives with respect to the thickness of walls agree with differences."""
+    simulation = sp.Simulation(rooms(), replace(EVERY, wall_depth_m=0.6, power_tolerance_db=0.1))
+    paths = simulation.paths(TX, RX[1:3])
+    through = (paths.interactions == REFRACTION).any(axis=1)
+    strong = through & (paths.power > 1e-4 * paths.power[through].max())
+    for name, step in (("thickness_m", 2e-5), ("conductivity_s_m", 1e-3)):
+        value = getattr(paths.base, name)
+        ends = [paths.at(replace(paths.base, **{name: value + by}))[0] for by in (step, -step)]
+        slope = paths.slopes(paths.base, (name,))[name][:, 0]
+        expected = (ends[0] - ends[1]) / (2.0 * step)
+        np.testing.assert_allclose(
+            slope[strong], expected[strong], rtol=0.05, atol=0.02 * np.abs(expected[strong]).max()
+        )
