@@ -173,6 +173,7 @@ def provenance(simulation: Simulation, model: Predictor | None) -> dict[str, Any
         "references": "Yin et al., Wireless Channel Prediction in Partially Observed Environments",
         "frequency_hz": float(trace_settings.frequency_hz),
         "gain_floor_db": GAIN_FLOOR_DB,
+        "walls": "through walls" if trace_settings.through_walls else "opaque walls",
         "map_resolution_m": partial.resolution_m,
         "map_wall_height_m": partial.wall_height_m,
         "map_observed_fraction": partial.observed_fraction,

@@ -38,6 +38,14 @@ Diffraction = Annotated[
     bool,
     typer.Option("--diffraction/--no-diffraction", help="Diffraction at vertical edges of walls."),
 ]
+ThroughWalls = Annotated[
+    bool | None,
+    typer.Option(
+        "--through-walls/--opaque-walls",
+        help="Whether paths go through walls. Default: below 24 GHz, not from there on.",
+        show_default=False,
+    ),
+]
 RxHeight = Annotated[float, typer.Option(help="Height of the receivers [m].")]
 Memory = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
 PredictorName = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
@@ -101,9 +109,10 @@ def settings_of(
     material: MaterialText = "",
     max_depth: MaxDepth = 6,
     diffraction: Diffraction = True,
+    through_walls: ThroughWalls = None,
 ) -> dict[str, Any]:
     """Return settings of scene and trace by the names of arguments; with diffraction where it is the default."""
-    trace = TraceSettings(frequency, max_depth, diffraction=None if diffraction else False)
+    trace = TraceSettings(frequency, max_depth, None if diffraction else False, refraction=through_walls)
     return {"scene_settings": SceneSettings(material=parse_material(material)), "trace_settings": trace}
 
 

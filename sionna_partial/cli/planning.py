@@ -30,6 +30,7 @@ def calibrate(
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     max_depth: opt.MaxDepth = 6,
     diffraction: opt.Diffraction = True,
+    through_walls: opt.ThroughWalls = None,
     partial: opt.PartialMap,
 ) -> None:
     """Find the material of a building from measured path gains.
@@ -37,7 +38,7 @@ def calibrate(
     The folder --out gets the map with the calibrated material, the numbers as JSON, and a picture. predict takes the
     folder as a map.
     """
-    settings = opt.settings_of(frequency, material, max_depth, diffraction)
+    settings = opt.settings_of(frequency, material, max_depth, diffraction, through_walls)
     from sionna_partial.measurements.measurements import measurements_of
 
     measured = measurements_of(measurements)

@@ -204,8 +204,10 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 
 
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
-    """Title that names the transmitter's position, or how many there are, and the frequency."""
-    return f"{what}: {transmitter_text(maps)}, {next(iter(maps.values())).attrs['frequency_hz'] / 1e9:g} GHz"
+    """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque."""
+    attributes = next(iter(maps.values())).attrs
+    walls = f", {attributes['walls']}" if "walls" in attributes else ""
+    return f"{what}: {transmitter_text(maps)}, {attributes['frequency_hz'] / 1e9:g} GHz{walls}"
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:

@@ -7,13 +7,14 @@ one wall if they are at most `depth_m` apart, measured across them. Only the fir
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
+from sionna_partial.cores import in_order
 from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, bin_points, grow
@@ -44,6 +45,9 @@ _CELL_M = 1.0
 
 _AT_ONCE = 100_000
 """Number of candidates that are written together, which bounds the memory."""
+
+_PAIRS_AT_ONCE = 5_000
+"""Number of pairs whose power is computed by one thread at a time."""
 
 _FLAT = 3
 """Kind of a reflection at floor or ceiling, beside 0 at a wall, WALL and SAME_WALL."""
@@ -139,7 +143,6 @@ class CrossingCandidates:
         material = geometry.material
         constants = *constants_of(material, settings.frequency_hz), material.thickness_m
         self._slab = slab_of(np.array(constants), settings.frequency_hz)
-        self._trail = trail_of(geometry.plan)
 
     def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
         """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
@@ -168,16 +171,17 @@ class CrossingCandidates:
         """Trace the beams."""
         room, receivers = self._room, bin_points(self._room.rx_m[:, :2])
         least = _needed_by_distance(room, needed, self._wavelength_m)
-        node, sequence, source, loss, pair = _trace(
-            self._geometry.plan,
-            _root_beams(room.tx_m[None, :2]),
-            receivers,
-            self._slab,
-            self._interior.depth_m,
-            self._limits,
-            least,
-            2.0 * room.height_m,
-        )
+
+        def of_root(root: Floats) -> tuple[Any, ...]:
+            fixed = self._slab, self._interior.depth_m, self._limits, least, 2.0 * room.height_m
+            return _trace(self._geometry.plan, root[None].copy(), receivers, *fixed)  # type: ignore[no-any-return]
+
+        parts = list(in_order(of_root, _root_beams(room.tx_m[None, :2])))
+        before = np.cumsum([0, *(len(part[0]) for part in parts)])[:-1]
+        for (nodes, *_, pairs), first in zip(parts, before, strict=True):
+            nodes[:, 0] = np.where(nodes[:, 0] < 0, -1, nodes[:, 0] + first)
+            pairs[:, 0] += first
+        node, sequence, source, loss, pair = (np.concatenate(column) for column in zip(*parts, strict=True))
         pair = np.stack([pair[:, 0], receivers.order[pair[:, 1]]], axis=1).astype(np.int64)
         order = np.lexsort((pair[:, 1], sequence[pair[:, 0]]))
         pair, same = pair[order], sequence[pair[order, 0]]
@@ -187,17 +191,14 @@ class CrossingCandidates:
 
     def _powers(self, tree: Tree, needed: Floats) -> Floats:
         """Power (K, V) of the paths of all pairs, and of their variants by floor and ceiling; 0 where there is none."""
-        return pair_powers(  # type: ignore[no-any-return]
-            tree,
-            needed,
-            self._geometry.plan,
-            self._interior,
-            self._room,
-            self._slab,
-            self._limits,
-            self._wavelength_m,
-            self._trail,
-        )
+
+        def of_pairs(start: int) -> Floats:
+            some = tree._replace(pair=tree.pair[start : start + _PAIRS_AT_ONCE])
+            fixed = self._geometry.plan, self._interior, self._room, self._slab, self._limits, self._wavelength_m
+            return pair_powers(some, needed, *fixed, trail_of(self._geometry.plan))  # type: ignore[no-any-return]
+
+        starts = range(0, len(tree.pair), _PAIRS_AT_ONCE)
+        return np.concatenate([np.zeros((0, _VARIANTS)), *in_order(of_pairs, starts)])
 
     def _least(self, parts: list[tuple[Indices, Floats]], found: Floats) -> Floats:
         """Power (N,) below which links can do without paths."""
@@ -218,7 +219,7 @@ class CrossingCandidates:
         """Write the paths of some pairs."""
         geometry = self._geometry
         surface, kind, vertices_m = write_paths(
-            tree, chosen, variant, geometry.plan, self._interior, self._room, self._limits, self._trail
+            tree, chosen, variant, geometry.plan, self._interior, self._room, self._limits, trail_of(geometry.plan)
         )
         used = max(1, int((kind >= 0).sum(axis=1).max(initial=0)))
         surface, kind, vertices_m = surface[:, :used], kind[:, :used], vertices_m[:, :used]
@@ -694,6 +695,12 @@ def pair_powers(tree, needed, plan, interior, room, slab, limits, wavelength, tr
         reflections = count - np.sum(trail.kind[:count] > 0)
         for variant in range(_VARIANTS):
             bounces, first, good = _can_bounce(variant, room)
+            if good and bounces > 0 and node >= 0:
+                up = unfolded_height(room, target, bounces, first)
+                total = np.hypot(length, up)
+                flat = slab.reflection[min(int(up / total * _COSINES) + 1, _COSINES)]
+                most = tree.loss[node] * max(abs(flat[0]), abs(flat[1])) ** (2 * bounces)
+                good = most * (wavelength / (4.0 * np.pi * total)) ** 2 >= needed[rx]
             if good and reflections + bounces <= limits.depth:
                 power[i, variant] = _path_power(
                     trail, count, length, room, target, bounces, first, plan, interior, slab, wavelength
