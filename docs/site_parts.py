@@ -28,8 +28,8 @@ SECTIONS = {
     "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],
     "Reference": ["build/api/index", "docs/conventions", "docs/glossary"],
     "Method and results": [
-        *("docs/method", "docs/predictor", "docs/results", "docs/speed", "docs/limits", "docs/wireless_insite"),
-        *("docs/homes", "docs/buildings", "docs/experiments"),
+        *("docs/method", "docs/predictor", "docs/results", "docs/speed", "docs/limits", "docs/through_walls"),
+        *("docs/wireless_insite", "docs/homes", "docs/buildings", "docs/experiments"),
     ],
     "Development": ["CONTRIBUTING", "docs/development", "docs/traps", "SECURITY", "CHANGELOG"],
 }

@@ -12,7 +12,7 @@ from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.paths import REFRACTION, SolvedPaths
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -343,8 +343,8 @@ class TracedLinks(Shown):
         of : {"links", "paths"}
             Links have the numbers `tx` and `rx` and the positions [m] of their ends, `link_state`, `gain_db`,
             `distance_m`, the number of `paths` and the shortest `delay_s` (NaN without paths). Paths have `tx`, `rx`,
-            `gain_db`, `phase_rad`, `delay_s`, angles [rad], and `interactions` by Sionna RT's `InteractionType`, such
-            as "1-1-8".
+            `gain_db`, `phase_rad`, `delay_s`, angles [rad], `interactions` by Sionna RT's `InteractionType`, such as
+            "1-1-8", and the number of `walls` that they go through.
 
         Returns
         -------
@@ -396,6 +396,7 @@ class TracedLinks(Shown):
             **{f"{end}_zenith_rad": values[:, 0] for end, values in angles.items()},
             **{f"{end}_azimuth_rad": values[:, 1] for end, values in angles.items()},
             "interactions": np.array(types, dtype=object),
+            "walls": (self.interactions == REFRACTION).sum(axis=1),
         }
 
 

@@ -2,7 +2,7 @@
 
 Beams split at each wall into one that is reflected and one that goes on behind it, from the same image of the
 transmitter. What counts as one wall is decided along the ray: consecutive faces without a free cell between them are
-one wall if they are at most `depth_m` apart, measured across them. Only the first face of a wall costs anything.
+one wall if they are at most `depth_m` apart, measured across them. Only one face of a wall costs anything.
 """
 
 import math
@@ -418,14 +418,15 @@ def _reaches(beam, near, loss, needed):  # type: ignore[no-untyped-def]
 class Trail(NamedTuple):
     """Scratch of one path in the plan: its reflections, and all it meets, in order from the transmitter.
 
-    `surface` are pieces of walls, `kind` 0 where it is reflected, 1 where it crosses into a wall, 2 where it crosses
-    another face of the same wall; `points` (x, y, fraction of the length).
+    `surface` are pieces of walls, `kind` 0 where it is reflected, WALL where it crosses a wall, SAME_WALL at further
+    faces of the same wall, `cosine` that of the incidence there; `points` are (x, y, fraction of the length).
     """
 
     walls: NDArray[np.int64]
     bounce: Floats
     surface: NDArray[np.int64]
     kind: NDArray[np.int64]
+    cosine: Floats
     points: Floats
     found: Floats
     wall: NDArray[np.int64]
@@ -440,6 +441,7 @@ def trail_of(plan: Plan) -> Trail:
         np.empty((16, 3)),
         np.empty(room, np.int64),
         np.empty(room, np.int64),
+        np.empty(room),
         np.empty((room, 3)),
         np.empty(room),
         np.empty(room, np.int64),
@@ -567,26 +569,36 @@ def _group(plan, interior, ax, ay, dx, dy, length, n, done, stop, count, trail):
     Walls are counted from the end whose coordinates are smaller, so that a link is the same in both directions.
     """
     backwards = dx < 0.0 or (dx == 0.0 and dy < 0.0)
-    walls, start, steep = 0, 0.0, 1.0
-    previous = -1.0
+    walls, begin, start, previous, steep = 0, 0, 0.0, 0.0, 1.0
     for j in range(n):
-        at = n - 1 - j if backwards else j
-        t, i = trail.found[at], trail.wall[at]
-        x, y = ax + t * dx, ay + t * dy
+        t, i = trail.found[n - 1 - j if backwards else j], trail.wall[n - 1 - j if backwards else j]
         wx, wy = plan.pieces_m[i, 1, 0] - plan.pieces_m[i, 0, 0], plan.pieces_m[i, 1, 1] - plan.pieces_m[i, 0, 1]
         cosine = abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
         same = j > 0 and abs(t - start) * length * min(cosine, steep) <= interior.depth_m
         if same:
             same = not _is_free_between(interior, ax, ay, dx, dy, length, min(t, previous), max(t, previous))
-        if same:
-            steep = min(steep, cosine)
-        else:
-            walls, start, steep = walls + 1, t, cosine
-        entry = count + at
-        trail.surface[entry], trail.kind[entry] = i, 2 if same else 1
-        trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2] = x, y, done + t * (stop - done)
-        previous = t
+        if not same:
+            _choose(trail, count, n, begin, j, backwards)
+            walls, begin, start, steep = walls + 1, j, t, 1.0
+        entry = count + (n - 1 - j if backwards else j)
+        trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, SAME_WALL, cosine
+        trail.points[entry, 0], trail.points[entry, 1] = ax + t * dx, ay + t * dy
+        trail.points[entry, 2] = done + t * (stop - done)
+        previous, steep = t, min(steep, cosine)
+    _choose(trail, count, n, begin, n, backwards)
     return walls
+
+
+@njit(cache=True)
+def _choose(trail, count, n, begin, end, backwards):  # type: ignore[no-untyped-def]
+    """Let one of the faces of a wall have its loss: that of the median angle, as outlines may be ragged."""
+    for j in range(begin, end):
+        own, rank = count + (n - 1 - j if backwards else j), 0
+        for k in range(begin, end):
+            other = count + (n - 1 - k if backwards else k)
+            rank += trail.cosine[other] < trail.cosine[own] or (trail.cosine[other] == trail.cosine[own] and k < j)
+        if rank == (end - begin) // 2:
+            trail.kind[own] = WALL
 
 
 @njit(cache=True)
@@ -641,7 +653,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
             nx, ny, nz = wy / norm, -wx / norm, 0.0
             ax, ay, done = trail.points[item, 0], trail.points[item, 1], trail.points[item, 2]
             item += 1
-            if kind == 2:
+            if kind == SAME_WALL:
                 continue
         else:
             stop = trail.points[item, 2] if item < count else 1.0
@@ -666,7 +678,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
         te = ex * sx + ey * sy + ez * sz
         px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
         tm = ex * px + ey * py + ez * pz
-        table = slab.transmission if kind == 1 else slab.reflection
+        table = slab.transmission if kind == WALL else slab.reflection
         te *= table[low, 0] + part * (table[low + 1, 0] - table[low, 0])
         tm *= table[low, 1] + part * (table[low + 1, 1] - table[low, 1])
         if kind == 0:

@@ -1,0 +1,201 @@
+"""Paths through walls: against stock Sionna RT with refraction, their time, and how much one mapped wall costs.
+
+    python benchmarks/through_walls.py ../shared/gibson/*/map.yaml
+
+takes some minutes for a map on two cores. Without maps it takes procedural homes. `--only stock`, for instance, runs
+one part. Stock `PathSolver` gets one receiver in each call, as rays share a table of paths; it counts every face as a
+slab, so that it is compared with `wall_depth_m=0`, and with paths of as many interactions.
+"""
+
+import argparse
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import sionna_partial as sp
+from sionna_partial.constants import CellState
+from sionna_partial.tracing.engine import open_scene
+from sionna_partial.tracing.finder import stock_paths, write_scene_of
+from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.simulation import checked_settings
+
+REFRACTION = 4
+CASES = {"drywall": 28e9, "brick": 5e9}
+DEPTH = 6
+SAME_M = 0.03
+"""Paths of the same interactions at points closer than this are one path [m]."""
+
+
+def main() -> None:
+    """Measure, and print a table for each part."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("maps", type=Path, nargs="*")
+    parser.add_argument("--only", choices=["stock", "time", "wall"])
+    parser.add_argument("--receivers", type=int, default=20, help="of each map, for stock Sionna RT")
+    parser.add_argument("--rays", type=int, default=1_000_000)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    maps = dict(_maps(arguments.maps))
+    parts = {"stock": against_stock, "time": relative_time, "wall": one_wall}
+    for name, part in parts.items():
+        if arguments.only in (None, name):
+            part(maps, arguments)
+
+
+def _maps(paths: list[Path]) -> Iterator[tuple[str, sp.PartialMap]]:
+    for path in paths:
+        yield path.parent.name if path.name == "map.yaml" else path.stem, sp.load_map(path)
+    if not paths:
+        yield from ((f"home {seed}", sp.make_home(seed, "apartment")) for seed in (1, 2, 3))
+
+
+def ends(partial: sp.PartialMap, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw a transmitter and receivers (N, 3) anywhere in free cells."""
+    rng = np.random.default_rng(seed)
+    row, column = np.nonzero(partial.state == CellState.FREE)
+    cell = rng.permutation(len(row))[: 3 * count + 10]
+    points = np.stack([column[cell], row[cell]], axis=1) + rng.uniform(0.2, 0.8, (len(cell), 2))
+    points_m = np.column_stack([partial.origin_m + points * partial.resolution_m, np.full(len(cell), 1.5)])
+    points_m = points_m[partial.radios_can_stand(points_m)][: count + 1]
+    return points_m[0], points_m[1:]
+
+
+def against_stock(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+    """Compare the paths of stock Sionna RT with ours, path by path."""
+    print(
+        f"\nStock: {arguments.rays:g} rays for each of {arguments.receivers} receivers, depth {DEPTH}; each face a slab"
+    )
+    print("| map | case | of stock's within 20 / 40 dB we find | of ours within 40 dB stock finds |", end="")
+    print(" links within 0.5 dB | stock - ours [dB] | times as fast |\n|---|---|---|---|---|---|---|")
+    for name, partial in maps.items():
+        for material, frequency_hz in CASES.items():
+            _compare(name, partial, material, frequency_hz, arguments)
+
+
+def _compare(
+    name: str, partial: sp.PartialMap, material: str, frequency_hz: float, arguments: argparse.Namespace
+) -> None:
+    tx_m, rx_m = ends(partial, arguments.receivers, arguments.seed)
+    settings, scene_settings = checked_settings(
+        partial,
+        sp.TraceSettings(
+            frequency_hz,
+            DEPTH,
+            diffraction=False,
+            refraction=True,
+            wall_depth_m=0.0,
+            max_walls=DEPTH,
+            power_tolerance_db=0.0,
+            samples_per_tx=arguments.rays,
+        ),
+        sp.SceneSettings(material=material),
+    )
+    simulation = sp.Simulation(partial, replace(settings, power_tolerance_db=0.1), scene_settings)
+    simulation.links(tx_m, rx_m)
+    start = time.perf_counter()
+    simulation.links(tx_m, rx_m)
+    own_s = time.perf_counter() - start
+    ours = sp.trace_links(partial, tx_m, rx_m, trace_settings=settings, scene_settings=scene_settings)
+    shift = np.array([*partial.origin_m, 0.0])
+    with tempfile.TemporaryDirectory() as folder:
+        scene = open_scene(write_scene_of(partial, Path(folder), settings, scene_settings).xml, frequency_hz)
+    start = time.perf_counter()
+    stock = list(stock_paths(scene, settings, tx_m - shift, rx_m - shift))
+    stock_s = time.perf_counter() - start
+    near, far, back, gaps = np.zeros(2), np.zeros(2), np.zeros(2), []
+    for rx, paths in enumerate(stock):
+        own = np.flatnonzero((ours.path_rx == rx) & ((ours.interactions > 0).sum(axis=1) <= DEPTH))
+        found, used = _matched(ours, own, paths, shift)
+        power = np.abs(ours.a[own]) ** 2
+        total = max(power.sum(), paths.power.sum())
+        near += found[paths.power > 1e-2 * total].sum(), (paths.power > 1e-2 * total).sum()
+        far += found[paths.power > 1e-4 * total].sum(), (paths.power > 1e-4 * total).sum()
+        back += used[power > 1e-4 * total].sum(), (power > 1e-4 * total).sum()
+        if total > 1e-15:
+            gaps.append(10.0 * np.log10(max(paths.power.sum(), 1e-15) / max(power.sum(), 1e-15)))
+    print(
+        f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {near[0] / near[1]:.1%} / {far[0] / far[1]:.1%} | "
+        f"{back[0] / back[1]:.1%} | {np.mean(np.abs(gaps) < 0.5):.0%} | {min(gaps):.2f} to {max(gaps):.2f} | "
+        f"{stock_s / own_s:.0f} |"
+    )
+
+
+def _matched(
+    ours: sp.TracedLinks, own: NDArray[np.int64], paths: SolvedPaths, shift: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether each path of stock Sionna RT is one of ours, and each of ours one of its."""
+    found, used = np.zeros(len(paths.a), dtype=bool), np.zeros(len(own), dtype=bool)
+    for path, kinds in enumerate(paths.interactions):
+        length = int((kinds > 0).sum())
+        for index in np.flatnonzero(~used):
+            row = ours.interactions[own[index]]
+            same = (row > 0).sum() == length and (row[:length] == kinds[:length]).all()
+            at_m = paths.vertices_m[path, :length] + shift
+            if same and np.allclose(ours.vertices_m[own[index], :length], at_m, atol=SAME_M):
+                found[path] = used[index] = True
+                break
+    return found, used
+
+
+def relative_time(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+    """Compare warm traces of up to 3,000 receivers with opaque walls and through walls."""
+    print("\n| map | case | receivers | opaque [s] | through walls, times as long | outages gain (median) [dB] |")
+    print("|---|---|---|---|---|---|")
+    for name, partial in maps.items():
+        for material, frequency_hz in CASES.items():
+            tx_m, rx_m = ends(partial, 3000, arguments.seed)
+            seconds, gains = [], []
+            for refraction in (False, True):
+                settings = sp.TraceSettings(frequency_hz, refraction=refraction)
+                simulation = sp.Simulation(partial, settings, sp.SceneSettings(material=material))
+                simulation.links(tx_m, rx_m)
+                start = time.perf_counter()
+                links = simulation.links(tx_m, rx_m)
+                seconds.append(time.perf_counter() - start)
+                gains.append(links.gain_db)
+            opaque = gains[0] <= -150.0
+            gain = f"{np.median(gains[1][opaque] - gains[0][opaque]):.0f}" if opaque.any() else "none"
+            print(
+                f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {len(rx_m)} | {seconds[0]:.1f} | "
+                f"{seconds[1] / seconds[0]:.1f} | {gain} |"
+            )
+
+
+def one_wall(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+    """Print the loss of one wall of other depths, angles and turns of the grid, seen from one side and from both."""
+    print("\nLoss of one straight wall [dB], brick of 10 cm at 5 GHz, beyond that of its slab")
+    print("| turned by | angle of incidence | 1 cell | 3 cells | 8 cells | of 8 cells only the front seen |")
+    print("|---|---|---|---|---|---|")
+    for turned_deg in (0.0, 17.0, 45.0):
+        for angle_deg in (0.0, 30.0, 60.0):
+            losses = [_wall_loss_db(turned_deg, angle_deg, *case) for case in ((1, 1), (3, 3), (8, 8), (8, 2))]
+            slab = _wall_loss_db(0.0, angle_deg, 3, 3)
+            print(f"| {turned_deg:g} | {angle_deg:g} | {' | '.join(f'{each - slab:+.2f}' for each in losses)} |")
+
+
+def _wall_loss_db(turned_deg: float, angle_deg: float, cells: int, seen: int) -> float:
+    """Loss of a link through the middle of a field with a wall of so many cells, of which the robot has seen some."""
+    resolution_m, size = 0.05, 240
+    y, x = (np.indices((size, size)) + 0.5 - size / 2) * resolution_m
+    turn = np.radians(turned_deg)
+    depth = x * np.cos(turn) + y * np.sin(turn) + 0.5 * cells * resolution_m
+    state = np.zeros((size, size), dtype=np.uint8)
+    state[(depth >= 0.0) & (depth < cells * resolution_m)] = CellState.UNKNOWN
+    state[(depth >= 0.0) & (depth < seen * resolution_m)] = CellState.WALL
+    along = turn + np.radians(angle_deg)
+    tx, rx = (np.array([sign * 2.0 * np.cos(along), sign * 2.0 * np.sin(along)]) for sign in (-1, 1))
+    settings = sp.TraceSettings(5e9, 0, diffraction=False)
+    scene_settings = sp.SceneSettings(material=sp.Material(3.91, 0.031, 0.1), floor_extent="none")
+    corner = -0.5 * size * resolution_m
+    partial = sp.PartialMap(state, resolution_m, (corner, corner))
+    links = sp.trace_links(partial, [*tx, 1.5], [[*rx, 1.5]], trace_settings=settings, scene_settings=scene_settings)
+    return float(-links.gain_db[0] + 20.0 * np.log10(299792458.0 / 5e9 / (4.0 * np.pi * 4.0)))
+
+
+if __name__ == "__main__":
+    main()
