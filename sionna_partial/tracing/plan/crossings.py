@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
-from sionna_partial.cores import in_order
 from sionna_partial.planar import span_in_strip
-from sionna_partial.process import njit
+from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import Plan, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry, constants_of
 from sionna_partial.settings import TraceSettings
