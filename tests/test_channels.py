@@ -109,7 +109,7 @@ class TestTransfer:
     def test_paths_of_rays(self) -> None:
         """Sionna RT's public solver gives the same matrices."""
         exact = links_of(1)
-        settings = replace(exact.trace_settings, refraction=True, samples_per_tx=20_000)
+        settings = replace(exact.trace_settings, diffuse_reflection=True, samples_per_tx=20_000)
         shot = sp.trace_links(_room(), TX, RX, trace_settings=settings)
         found = 0
         for path in range(len(exact.a)):

@@ -112,9 +112,9 @@ class TestPredict:
     @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--material", "cheese"], "error: material = 'cheese' is not allowed: choose one of drywall, vacuum"),
-            (["--material", "2,3"], "--material '2,3' is neither an ITU name nor permittivity,conductivity,thickness"),
-            (["--material", "a,b,c"], "--material 'a,b,c' is neither an ITU name nor permittivity,conductivity"),
+            (["--material", "cheese"], "error: material = 'cheese' is not allowed: choose one of drywall, brick"),
+            (["--material", "2,3"], "--material '2,3' is neither a name nor permittivity,conductivity,thickness"),
+            (["--material", "a,b,c"], "--material 'a,b,c' is neither a name nor permittivity,conductivity"),
             (["--material", "0,0,1"], "error: relative_permittivity = 0.0 is not allowed"),
             (["--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html, .yaml."),
             (["--frequency", "1"], "error: frequency_hz = 1.0 is not allowed"),

@@ -84,7 +84,7 @@ class TestDataset:
                     *(20, 2, (0, 50)),
                     seed=3,
                     sensor=SensorSettings(0.02, 0.01, 0.1, 360.0, 8.0),
-                    scene=SceneSettings(material=Material(itu="concrete")),
+                    scene=SceneSettings(material=Material.named("concrete")),
                 ),
             ),
             (
