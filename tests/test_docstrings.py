@@ -1,7 +1,11 @@
 """The examples in the docstrings of the public names run as they stand."""
 
 import doctest
+import functools
+import pickle
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from predictor_links import QUIET
@@ -19,6 +23,31 @@ CHAINS = (
 """Names whose examples read the files that the first of them wrote."""
 
 ALONE = tuple((name,) for name in sp.__all__ if name not in {*sum(CHAINS, ()), "__version__"})
+
+
+SEARCHES = ("calibrate_materials", "place_transmitter", "place_transmitters")
+"""Names that several examples call with equal arguments, and that take seconds."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def searched_once() -> Iterator[None]:
+    """Let equal calls of a search return the same result."""
+    results: dict[bytes, Any] = {}
+
+    def once(search: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(search)
+        def call(*arguments: Any, **options: Any) -> Any:
+            key = pickle.dumps((search.__name__, arguments, options))
+            if key not in results:
+                results[key] = search(*arguments, **options)
+            return results[key]
+
+        return call
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in SEARCHES:
+            patch.setattr(sp, name, once(getattr(sp, name)))
+        yield
 
 
 @pytest.mark.parametrize("names", [*CHAINS, *ALONE], ids=lambda names: names[0])
