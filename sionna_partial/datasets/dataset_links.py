@@ -54,7 +54,7 @@ def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
         traces = _read_traces(folders[0])
         homes: dict[str, PartialMap] = {}
         for folder, table in zip(folders, tables, strict=True):
-            remedy = "give data sets that were traced alike."
+            remedy = "give data sets that were traced with the same settings."
             require_like(_read_traces(folder), traces, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
             for name, home in table.complete_maps.items():
                 if homes.setdefault(name, home) != home:

@@ -218,7 +218,7 @@ def next_views(
     count : int
         Largest number of poses.
     start : (2,) array-like, optional
-        Where the robot is [m]; by default in the middle of the free cells that hang together.
+        Where the robot is [m]; by default in the middle of the largest connected part of the free cells.
     threshold_db : float
         Path gain above which a receiver is covered [dB].
     sensor : SensorSettings, optional

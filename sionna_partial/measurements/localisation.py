@@ -25,14 +25,14 @@ Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats]]
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 """Number of positions that are compared, least distance between them, and how far they go beyond free cells [m]."""
 
-MOST_PLACES = 25
-"""Number of places with measurements from which links are traced."""
+MOST_GROUPS = 25
+"""Number of groups of neighbouring measurements, of each of which one is traced."""
 
-REACH_M = 3.0
+CORRELATION_M = 3.0
 """Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 % of the
-transmitters of procedural homes, those included that no place hears."""
+transmitters of procedural homes, also of those that no measurement received."""
 
-TRACE_STD_DB, CHANCE_OF_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
+TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
 
 OFFSETS_DB, P_POWERS, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 0.8, 40.0
@@ -102,29 +102,29 @@ def locate_transmitter(
 ) -> TransmitterPosterior:
     """Compare positions by the likelihood of gains measured of one transmitter, weighted by P(indoor).
 
-    Links are reciprocal: they are predicted from the measured places to all positions (`allowed` returns where one can
+    Links are reciprocal: they are predicted from the measured positions to all others (`allowed` returns where one can
     be). A gain has the distribution that is predicted, and noise; at or below the sensitivity it is at most that.
-    Neighbouring places err alike: the log-likelihood is divided by how many count as one.
+    Errors at neighbouring positions are correlated: the log-likelihood is divided by how many count as one.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
-    heard = measured.gain_db > measured.sensitivity_db
-    some = measured.take(grouped(measured.rx, heard, MOST_PLACES)[0])
+    received = measured.gain_db > measured.sensitivity_db
+    some = measured.take(grouped(measured.rx, received, MOST_GROUPS)[0])
     possible = np.flatnonzero(allowed(points_m))
     if not len(possible):
-        raise PositionError("a transmitter can be nowhere: no position is away from walls and measured places.")
+        raise PositionError("a transmitter can be nowhere: no position is away from walls and measurements.")
     partial.require_positions("tx", points_m[possible])
-    log_chance = np.zeros((len(OFFSETS_DB), len(possible)))
+    log_p = np.zeros((len(OFFSETS_DB), len(possible)))
     p_indoor = np.zeros(len(possible))
-    for index, place_m in enumerate(some.rx):
+    for index, each_m in enumerate(some.rx):
         report(index / len(some), "comparing positions of the transmitter")
-        prediction, indoor = predict(place_m, points_m[possible])
+        prediction, indoor = predict(each_m, points_m[possible])
         p_indoor += indoor / len(some)
-        log_chance += _log_likelihood(prediction, some.take(np.array([index])))
-    walks_m = Walks(partial, some.rx, 10.0 * REACH_M).lengths_m(some.rx)
-    log_chance *= len(some) / np.exp(-walks_m / REACH_M).sum()
-    log_chance += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
-    joint = np.exp(log_chance - logsumexp(log_chance))
+        log_p += _log_likelihood(prediction, some.take(np.array([index])))
+    walks_m = Walks(partial, some.rx, 10.0 * CORRELATION_M).lengths_m(some.rx)
+    log_p *= len(some) / np.exp(-walks_m / CORRELATION_M).sum()
+    log_p += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
+    joint = np.exp(log_p - logsumexp(log_p))
     posterior.probability.ravel()[possible] = joint.sum(axis=0)
     p_powers = np.zeros(posterior.probability.shape)
     p_powers.ravel()[possible] = joint[OFFSETS_DB != 0.0].sum(axis=0) / np.maximum(joint.sum(axis=0), 1e-300)
@@ -153,15 +153,15 @@ def _log_likelihood(prediction: LinkPrediction, measured: Measurements) -> Float
     probabilities, means_db, stds_db = prediction.by_state
     noise_db = LIKELY_NOISE_DB if measured.std_db is None else measured.std_db[0]
     spread_db = np.sqrt(stds_db**2 + noise_db**2 + TRACE_STD_DB**2)
-    heard_db = max(measured.gain_db[0], measured.sensitivity_db)
-    z = (heard_db - OFFSETS_DB[:, None, None] - means_db) / spread_db
-    if heard_db > measured.sensitivity_db:
+    received_db = max(measured.gain_db[0], measured.sensitivity_db)
+    z = (received_db - OFFSETS_DB[:, None, None] - means_db) / spread_db
+    if received_db > measured.sensitivity_db:
         log_density, anything = -0.5 * (z**2 + math.log(2.0 * math.pi)) - np.log(spread_db), 1.0 / RANGE_DB
     else:
         log_density, anything = log_ndtr(z), 0.5
     with np.errstate(divide="ignore"):
         expected = logsumexp(log_density + np.log(probabilities), axis=1)
-    return np.logaddexp(math.log1p(-CHANCE_OF_ANYTHING) + expected, math.log(CHANCE_OF_ANYTHING * anything))
+    return np.logaddexp(math.log1p(-P_ANYTHING) + expected, math.log(P_ANYTHING * anything))
 
 
 def _log_offset_prior() -> Floats:

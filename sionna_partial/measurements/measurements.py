@@ -263,9 +263,9 @@ def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDAr
     order = np.argsort(first)
     link, first, count = np.argsort(order)[link.ravel()], first[order], count[order]
     mean_db = np.bincount(link, weights=measured.gain_db) / count
-    heard = ~measured.is_outage
-    square = ((measured.gain_db - mean_db[link])[heard] ** 2).sum()
-    repeats = heard.sum() - heard[first].sum()
+    received = ~measured.is_outage
+    square = ((measured.gain_db - mean_db[link])[received] ** 2).sum()
+    repeats = received.sum() - received[first].sum()
     return (
         Measurements(measured.tx[first], measured.rx[first], mean_db),
         link,
