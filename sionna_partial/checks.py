@@ -64,6 +64,12 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
 
+def require_names(name: str, values: Sequence[str]) -> None:
+    """Raise a SettingsError unless `values` are texts for files and pictures, all different, one at least."""
+    good = len(values) == len({*values}) > 0 and all(each and each.isprintable() for each in values)
+    require(good, name, values, "give each a name of its own, of printable characters.")
+
+
 def require_bool(name: str, value: object) -> None:
     """Raise a SettingsError that names a value which is neither True nor False."""
     require(isinstance(value, bool), name, value, "give True or False.")

@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
-from sionna_partial.checks import number_of, real_array, require, require_number, shown
+from sionna_partial.checks import number_of, real_array, require, require_names, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
@@ -296,7 +296,7 @@ def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         return {"": require_coverage(coverage)}
     names = [str(name) for name in coverage["tx"].to_numpy()]
-    require(0 < len(names) == len({*names}), "coverage.tx", names, "keep at least one, each with a name of its own.")
+    require_names("coverage.tx", names)
     return {name: require_coverage(coverage.isel(tx=at)) for at, name in enumerate(names)}
 
 

@@ -6,20 +6,16 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5netcdf
-import h5py
 import numpy as np
 import xarray as xr
 import yaml
-from h5py import h5f, h5p
 from rasterio import Affine
 from rasterio.io import MemoryFile
-from xarray.backends import H5NetCDFStore
 
 from sionna_partial.constants import NO_RECEIVER
 from sionna_partial.coverage_map import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.errors import OutputError, SettingsError
-from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5
+from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5, write_netcdf
 from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
 from sionna_partial.network import VARIABLES, require_network
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
@@ -174,19 +170,9 @@ def _target(path: str | os.PathLike[str], formats: Collection[str]) -> tuple[Pat
 
 
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:
-    # to_netcdf would do the same, but lets HDF5 stamp the root group with the time of day
-    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
-    creation.set_obj_track_times(False)
-    for set_order in (creation.set_link_creation_order, creation.set_attr_creation_order):
-        set_order(h5p.CRT_ORDER_TRACKED | h5p.CRT_ORDER_INDEXED)
-    access.set_fapl_core(backing_store=False)
     encoding: dict[str, dict[str, Any]] = {name: {"_FillValue": None} for name in ("x", "y")}
     encoding |= {str(name): {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
-    with h5py.File(h5f.create(b"coverage.nc", h5f.ACC_TRUNC, creation, access)) as memory:
-        with h5netcdf.File(memory, "w") as netcdf:
-            coverage.drop_encoding().dump_to_store(H5NetCDFStore(netcdf), encoding=encoding)
-        memory.flush()
-        return bytes(memory.id.get_file_image())
+    return write_netcdf(coverage, encoding)
 
 
 def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES) -> bytes:

@@ -10,11 +10,14 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from sionna_partial.checks import shown
 from sionna_partial.errors import OutputError, SionnaPartialError
 from sionna_partial.process import own_folder, signals_held
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SCENE_FILES = ("scene.xml", "map.yaml")
 """Files by which an exported scene folder is recognised."""
@@ -43,8 +46,6 @@ _REMEDIES = {
     errno.ENOENT: "nothing can be made there; choose another folder.",
     errno.ENAMETOOLONG: "choose a shorter name.",
 }
-
-_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 
 
 def open_regular(
@@ -111,6 +112,48 @@ def require_plain_hdf5(file: Any, most: int) -> None:
         found = content.visititems_links(fault)
     if found:
         raise ValueError(found)
+
+
+def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], path: Path | None = None) -> bytes:
+    """Write a Dataset as NetCDF 4 to a new file, or return the content of one: equal Datasets give equal bytes.
+
+    `Dataset.to_netcdf` would let HDF5 stamp the root group with the time of day, and keep the order of variables.
+    """
+    import h5netcdf
+    import h5py
+    import xarray as xr
+    from h5py import h5f, h5p
+    from xarray.backends import H5NetCDFStore
+    from xarray.backends.common import ArrayWriter
+
+    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
+    creation.set_obj_track_times(False)
+    for set_order in (creation.set_link_creation_order, creation.set_attr_creation_order):
+        set_order(h5p.CRT_ORDER_TRACKED | h5p.CRT_ORDER_INDEXED)
+    if path is None:
+        access.set_fapl_core(backing_store=False)
+    of_axes = sorted(table.coords, key=lambda name: (name not in table.dims, str(name)))
+    axes = {name: table[name].variable for name in of_axes}
+    ordered = xr.Dataset(coords=axes, attrs=table.attrs).assign(table.data_vars).drop_encoding()
+    name = os.fsencode(path or "memory.nc")
+    with h5py.File(h5f.create(name, h5f.ACC_TRUNC, creation, access)) as file:
+        with h5netcdf.File(file, "w") as netcdf:
+            writer = ArrayWriter()
+            ordered.dump_to_store(H5NetCDFStore(netcdf), writer=writer, encoding=encoding)
+            _write_blocks(writer.sources, writer.targets)
+        file.flush()
+        return b"" if path else bytes(file.id.get_file_image())
+
+
+def _write_blocks(sources: list[Any], targets: list[Any]) -> None:
+    """Compute dask's arrays, of as many blocks each, block by block; `dask.array.store` has another order each time."""
+    import dask
+    from dask.array.core import slices_from_chunks
+
+    for regions in zip(*(slices_from_chunks(source.chunks) for source in sources), strict=True):
+        blocks = dask.compute(*(source[region] for source, region in zip(sources, regions, strict=True)))
+        for target, region, block in zip(targets, regions, blocks, strict=True):
+            target[region] = block
 
 
 def read_columns(

@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Progress, no_progress, real_array, require, require_choice, require_memory
+from sionna_partial.checks import (
+    Progress,
+    no_progress,
+    real_array,
+    require,
+    require_choice,
+    require_memory,
+    require_names,
+)
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.coverage_map import (
     Receivers,
@@ -291,9 +299,8 @@ def transmitter_positions(
     if positions.shape[-1:] == (2,):
         positions = np.insert(positions, 2, DEFAULT_HEIGHT_M, axis=-1)
     tx_m = partial.require_positions("tx", positions)
-    if not tx_m.size:
-        raise PositionError(f"tx has shape {tx_m.shape}: give at least one transmitter.")
     names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
+    require_names("names of tx", names)
     return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)
 
 

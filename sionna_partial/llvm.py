@@ -124,8 +124,16 @@ def _end_without_destructors() -> None:
 
 
 def _named_library(name: str) -> Path:
-    """Return a path that child processes in other folders can use; the dynamic loader finds a bare name."""
-    return Path(name).absolute() if "/" in name else Path(name)
+    """Return a path that child processes in other folders can use; the dynamic loader finds a bare name.
+
+    It would wait for the content of a pipe.
+    """
+    if "/" not in name:
+        return Path(name)
+    path = Path(name).absolute()
+    if path.exists() and not path.is_file():
+        raise OSError("it is no file")
+    return path
 
 
 def _pip_library() -> Path:

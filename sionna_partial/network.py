@@ -10,7 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
-from sionna_partial.checks import Checked, Within, real_array, require, require_whole
+from sionna_partial.checks import (
+    Checked,
+    Within,
+    number_of,
+    real_array,
+    require,
+    require_names,
+    require_type,
+    require_whole,
+)
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
 from sionna_partial.errors import SettingsError
@@ -64,6 +73,8 @@ VARIABLES = {
     "handover_margin_db": _described("mean lead of the strongest transmitter over the next", "dB"),
 }
 """Variables of a network map on (y, x), `p_best` on (tx, y, x), and their attributes."""
+
+_ATTRIBUTES = ("spacing_m", "bandwidth_hz", "load", "sinr_threshold_db")
 
 
 def network_map(
@@ -150,8 +161,14 @@ def network_map(
 
 def require_network(network: xr.Dataset) -> None:
     """Raise a SettingsError unless `network` is what `network_map` returns."""
-    is_network = isinstance(network, xr.Dataset) and "best_server" in network
-    require(is_network, "network", type(network).__name__, "give what network_map returned.")
+    remedy = "give what network_map returned."
+    require_type("network", network, xr.Dataset, remedy)
+    wanted = {name: ("tx", "y", "x")[name != "p_best" :] for name in (*VARIABLES, "cell_state", "observed")}
+    wanted |= {name: (name.partition("_")[0],) for name in ("x", "y", "tx", *TX_COORDINATES)}
+    missing = [name for name, dims in wanted.items() if name not in network or network[name].dims != dims]
+    missing += [name for name in _ATTRIBUTES if not math.isfinite(number_of(network.attrs.get(name)))]
+    require(not missing and network["cell_state"].size > 0, "network without", missing, remedy)
+    require_names("network.tx", [str(name) for name in network["tx"].to_numpy()])
 
 
 def _map_of(coverage: xr.Dataset) -> PartialMap:

@@ -1,5 +1,8 @@
 """Channel responses: against stock Sionna RT on the same paths, and against traces from antenna to antenna."""
 
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -39,6 +42,27 @@ def array_of(rows: int, columns: int, pattern: str = "iso", polarization: str = 
         lambda theta, phi, each=each: (each(theta, phi)[0] * turned, each(theta, phi)[1]) for each in iso
     ]
     return array
+
+
+MEMORY = """
+import resource, numpy as np
+from test_channels import array_of, links_of
+
+def peak_gb():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
+
+links, antennas = links_of(2), {"tx_array": array_of(32, 32), "rx_array": array_of(16, 32)}
+links.cir(tx_array=antennas["tx_array"], synthetic_array=False)
+for call in (
+    lambda: links.taps(1e8, 0, 4_000_000, memory_gb=1.0),
+    lambda: links.cfr(np.linspace(0.0, 1e6, 4_000_000), memory_gb=1.0),
+    lambda: links.cfr([0.0], **antennas, memory_gb=1.0),
+    lambda: links.beam_gains(np.eye(1024), np.eye(512), **antennas, memory_gb=1.0),
+):
+    before_gb = peak_gb()
+    call()
+    print(peak_gb() - before_gb)
+"""
 
 
 def links_of(depth: int, *, diffraction: bool = False, frequency_hz: float = 28e9) -> sp.TracedLinks:
@@ -295,8 +319,31 @@ class TestResponses:
             many.cir(**arrays)
         with pytest.raises(MemoryLimitError, match=r"x 8 frequencies, which take 524\.3 GB: give fewer"):
             many.cfr(np.arange(8), **arrays)
-        with pytest.raises(MemoryLimitError, match=r"2,000,000 links x 4096 pairs of beams, which take 32\.8 GB"):
+        with pytest.raises(MemoryLimitError, match=r"2,000,000 links x 4096 pairs of beams, which take 32\.9 GB"):
             many.beam_gains(np.eye(64), **arrays)
+
+    @pytest.mark.parametrize("synthetic_array", [True, False])
+    def test_blocks_of_values_change_nothing(
+        self, several: sp.TracedLinks, monkeypatch: pytest.MonkeyPatch, synthetic_array: bool
+    ) -> None:
+        arrays = {"tx_array": array_of(2, 2), "rx_array": array_of(1, 2, "iso", "VH")}
+        options = {**arrays, "synthetic_array": synthetic_array}
+        calls = (
+            lambda: several.cfr(np.arange(7) * 1e6, **options).h,
+            lambda: several.taps(1e8, -2, 9, **options).h,
+            lambda: several.beam_gains(np.eye(4), **arrays).gain_db,
+        )
+        whole = [call().to_numpy() for call in calls]
+        for module in ("responses", "beams"):
+            monkeypatch.setattr(f"sionna_partial.channels.{module}.WORK_BYTES", 1)
+        for before, call in zip(whole, calls, strict=True):
+            np.testing.assert_allclose(call().to_numpy(), before, rtol=1e-5, atol=1e-12)
+
+    def test_memory_of_a_process_stays_within_the_limit(self) -> None:
+        """Four million taps and frequencies, and half a million pairs of antennas; none of them needs 1 GB."""
+        done = subprocess.run([sys.executable, "-c", MEMORY], cwd=Path(__file__).parent, capture_output=True, text=True)
+        assert [line for line in done.stdout.splitlines() if float(line) >= 1.0] == []
+        assert done.stdout.count("\n") == 4, done.stderr
 
     @pytest.mark.parametrize(
         ("call", "message"),
@@ -312,7 +359,10 @@ class TestResponses:
             (lambda links: links.taps(1e6, 5, 4), r"l_max = 4 is not allowed: give a whole number in \[5"),
             (lambda links: links.taps(1e6, 0.5), "l_min = 0.5 is not allowed"),
             (lambda links: links.beam_gains(np.ones((2, 3))), r"codebook = .*\(2, 3\).* give \(beams, 1\) weights"),
-            (lambda links: links.beam_gains([[np.nan]]), "codebook = .* such as those of dft_codebook"),
+            *(
+                (lambda links, weight=weight: links.beam_gains([[weight]]), r"codebook = .* weights up to 1e\+06, one")
+                for weight in (np.nan, np.inf, 1e30, 1e308 + 1e308j)
+            ),
             (lambda links: links.beam_gains([[1]], "x"), "rx_codebook = 'x' is not numeric"),
             (lambda links: sp.dft_codebook(0, 8), "rows = 0 is not allowed"),
             (lambda links: sp.dft_codebook(80, 80), r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas"),
@@ -455,6 +505,21 @@ class TestFiles:
         np.testing.assert_array_equal(found.h[1, :, 1, :, 0], response.h[4])
         assert found.frequency.values.tolist() == [0.0, 1e6]
 
+    def test_links_in_any_order(self, several: sp.TracedLinks, tmp_path: Path) -> None:
+        channels = several.cir()
+        turned = channels.isel(link=[5, 3, 4]).assign_attrs(receivers=-1, of={}).transpose("path", ...)
+        sp.save_channels(channels, tmp_path / "all.nc")
+        sp.save_channels(turned, tmp_path / "some.nc")
+        found, every = (sp.load_channels(tmp_path / name) for name in ("some.nc", "all.nc"))
+        xr.testing.assert_equal(found, every.isel(tx=[1]))
+
+    def test_equal_bytes(self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
+        for number in range(3):
+            sp.save_channels(several, tmp_path / f"{number}.nc")
+            time.sleep(0.4)  # HDF5 writes seconds down
+        assert len({file.read_bytes() for file in tmp_path.iterdir()}) == 1
+
     def test_as_deepmimo_has_them(self, tmp_path: Path) -> None:
         links = links_of(1)
         sp.save_channels(links, tmp_path / "one.h5", layout="deepmimo", tx_array=array_of(2, 2))
@@ -508,7 +573,10 @@ class TestFiles:
         [
             (lambda path, links: sp.save_channels(links, path, layout="matlab"), "layout = 'matlab' is not allowed"),  # type: ignore[arg-type]
             (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
-            (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels = .* give links, or what their cir"),
+            (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels.tx = 'missing' .* or what their cir"),
+            (lambda path, links: sp.save_channels(links.cir()[{"link": [1, 2, 3]}], path), "3 links' is not allowed"),
+            (lambda path, links: sp.save_channels(links.cir().real, path), "channels.a = .*float32.* give links with"),
+            (lambda path, links: sp.save_channels(links.cfr([0])[{"frequency": 0}], path), "channels.h = .*give links"),
             (lambda path, links: sp.save_channels(links.cir(), path, rx_array=None), "options = 'rx_array' is not"),
             (lambda path, links: sp.save_channels(one_link(), path), "channels = '1 links' .* none has a path"),
             (lambda path, links: sp.load_channels(path), "channels.nc' cannot be read"),

@@ -163,8 +163,8 @@ class TestSeveralTransmitters:
         ("choose", "message"),
         [
             ({}, r"transmitters west, <b>east\$}\$: choose one, as by coverage\.isel\(tx=0\)"),
-            ({"tx": []}, r"coverage\.tx = \[\] is not allowed: keep at least one, each with a name of its own"),
-            ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: keep at least one, each with a"),
+            ({"tx": []}, r"coverage\.tx = \[\] is not allowed: give each a name of its own"),
+            ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: give each a name"),
         ],
     )
     def test_a_ros_map_needs_one_transmitter(self, several, tmp_path, choose, message):

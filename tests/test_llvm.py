@@ -221,6 +221,10 @@ class TestNamedByTheUser:
     def test_missing_file(self, name: str) -> None:
         assert "No such file" in self.refusal(name)
 
+    def test_pipe(self, tmp_path: Path) -> None:
+        os.mkfifo(tmp_path / "libLLVM.so")
+        assert "it is no file" in self.refusal(str(tmp_path / "libLLVM.so"))
+
     @pytest.mark.parametrize("path", OLD_LIBRARIES, ids=lambda path: path.name)
     def test_old_library_is_refused_before_it_aborts(self, path: Path) -> None:
         if not path.exists():

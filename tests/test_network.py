@@ -103,7 +103,7 @@ def test_several_are_placed_as_well_as_by_exhaustive_search(half_seen: sp.Partia
 
 
 def test_no_transmitter_is_no_network(half_seen: sp.PartialMap) -> None:
-    with pytest.raises(PositionError, match="at least one transmitter"):
+    with pytest.raises(PositionError, match="at least 1 position"):
         sp.predict_map(half_seen, np.zeros((0, 3)), spacing_m=0.4)
 
 
@@ -126,12 +126,20 @@ def test_bad_settings_of_a_network(coverage: xr.Dataset, options: dict[str, Any]
 
 
 def test_maps_that_are_no_network(coverage: xr.Dataset) -> None:
-    with pytest.raises(SettingsError, match="at least one"):
+    with pytest.raises(SettingsError, match="give each a name"):
         sp.network_map(coverage.isel(tx=[]))
     with pytest.raises(SettingsError, match="no place where a receiver"):
         sp.network_map(coverage.assign(valid=coverage.valid & False))
     turned = sp.network_map(coverage.transpose("y", "x", "tx"), n=10)
     xr.testing.assert_equal(turned, sp.network_map(coverage, n=10))
+
+
+@pytest.mark.parametrize("names", [(1, "1"), ("\0a", "b"), ("\udc80", "b"), ("", "b"), ("a\nb", "b")])
+def test_names_of_transmitters_are_texts_for_files(coverage: xr.Dataset, names: tuple[Any, Any]) -> None:
+    with pytest.raises(SettingsError, match="give each a name of its own, of printable characters"):
+        sp.predict_map(sp.make_home(7), dict(zip(names, [(3.0, 4.0, 1.5), (6.0, 3.0, 1.5)], strict=True)))
+    with pytest.raises(SettingsError, match="give each a name of its own, of printable characters"):
+        sp.network_map(coverage.assign_coords(tx=("tx", [str(name) for name in names])))
 
 
 def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
@@ -144,8 +152,12 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
         sp.save_network(network, tmp_path / "network.txt")
     with pytest.raises(SettingsError, match="no dimension tx"):
         sp.network_map(coverage.isel(tx=0))
-    with pytest.raises(SettingsError, match="network_map"):
-        sp.plot_network(coverage)
+    sp.save_network(xr.load_dataset(tmp_path / "network.nc"), tmp_path / "again.nc")
+    assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "network.nc").read_bytes()
+    others = coverage, network.drop_vars("p_best"), network.isel(x=0), network.assign_attrs(load="much")
+    for other in others:
+        with pytest.raises(SettingsError, match="give what network_map returned"):
+            sp.plot_network(other)
     with pytest.raises(SettingsError, match="place_transmitters"):
         sp.plot_network_placement(network)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="count"):

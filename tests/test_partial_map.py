@@ -186,7 +186,7 @@ def test_positions_may_be_free_or_unknown() -> None:
     assert found.dtype == np.float64
     assert found.tolist() == points
     assert PLAN.require_positions("tx", (10.75, -3.25, 1)).tolist() == [10.75, -3.25, 1.0]
-    assert PLAN.require_positions("rx", np.zeros((0, 3))).shape == (0, 3)
+    assert PLAN.require_positions("rx", np.zeros((0, 3)), least=0).shape == (0, 3)
 
 
 @pytest.mark.parametrize(

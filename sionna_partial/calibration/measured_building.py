@@ -146,8 +146,8 @@ class MeasuredBuilding:
 
 def require_positions(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
     """Check that radios can stand at the measured positions, and that there are enough."""
-    partial.require_positions("tx", measured.tx)
-    partial.require_positions("rx", measured.rx)
+    partial.require_positions("tx", measured.tx, least=0)
+    partial.require_positions("rx", measured.rx, least=0)
     distance_m, limit_m = np.linalg.norm(measured.tx - measured.rx, axis=1), nearest_m(frequency_hz)
     if (distance_m < limit_m).any():
         index = int(distance_m.argmin())

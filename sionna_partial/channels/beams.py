@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.channels.responses import ArrayPaths, labelled, require_memory
+from sionna_partial.channels.responses import WORK_BYTES, ArrayPaths, labelled, require_memory
 from sionna_partial.checks import real_array, require, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB
 from sionna_partial.errors import SettingsError
@@ -22,7 +22,13 @@ MAX_ANTENNAS = 4096
 """Largest number of antennas of a codebook."""
 
 PATHS_AT_ONCE = 20_000
-"""Number of paths whose beams are computed together, which bounds the memory."""
+"""Number of paths whose beams are computed together at most, in no more than `WORK_BYTES`."""
+
+_BEAM_BYTES, _PAIR_BYTES = 32, 48
+"""What a beam of a path, and a pair of beams of a link, take while they are computed [bytes]."""
+
+MAX_WEIGHT = 1e6
+"""Largest magnitude of a weight: powers are of single precision."""
 
 
 def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.complex128]:
@@ -73,10 +79,14 @@ def beam_gains(
     at_tx = _weights("codebook", codebook, arrays.tx)
     at_rx = _weights("rx_codebook", np.eye(len(arrays.rx)) if rx_codebook is None else rx_codebook, arrays.rx).conj()
     pairs = len(at_rx) * len(at_tx)
-    require_memory(arrays, 4 * pairs, f"{pairs} pairs of beams", memory_gb)
+    terms = 4 if len(arrays.rx.patterns) > 1 else 1
+    path_bytes = _BEAM_BYTES * terms * (len(at_rx) + len(at_tx))
+    at_once = max(1, min(PATHS_AT_ONCE, WORK_BYTES // path_bytes))
+    work_bytes = path_bytes * max(at_once, arrays.most) + _PAIR_BYTES * pairs
+    require_memory(arrays, 4 * pairs, f"{pairs} pairs of beams", memory_gb, work_bytes)
     gain_db = np.full((arrays.links, len(at_rx), len(at_tx)), GAIN_FLOOR_DB, np.float32)
     best, margin_db = np.full((arrays.links, 2), -1), np.full(arrays.links, np.nan)
-    for links, rows, first in arrays.spans(PATHS_AT_ONCE):
+    for links, rows, first in arrays.spans(at_once):
         received, sent = _factors(arrays, rows, at_rx, at_tx)
         for link, (low, high) in enumerate(itertools.pairwise(first), links.start):
             if low == high:
@@ -104,10 +114,12 @@ def beam_gains(
 def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.complex64]:
     """Weights (beams, patterns, positions) of a codebook (beams, antennas)."""
     count = len(antennas)
-    remedy = f"give (beams, {count}) weights, one for each antenna, such as those of dft_codebook."
+    remedy = f"give (beams, {count}) weights up to {MAX_WEIGHT:g}, one for each antenna, as dft_codebook does."
     weights = real_array(name, codebook, SettingsError, remedy, kinds="iufc")
-    fits = weights.ndim == 2 and weights.shape[1:] == (count,) and len(weights) and np.isfinite(weights).all()
-    require(bool(fits), name, f"array of shape {weights.shape}", remedy)
+    fits = weights.ndim == 2 and weights.shape[1:] == (count,) and len(weights) > 0
+    require(fits, name, f"array of shape {weights.shape}", remedy)
+    good = np.abs(weights.astype(np.complex128)) <= MAX_WEIGHT
+    require(bool(good.all()), name, weights[~good][:1], remedy)
     return weights.reshape(len(weights), len(antennas.patterns), -1).astype(np.complex64)
 
 

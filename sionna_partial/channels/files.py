@@ -1,5 +1,6 @@
 """Channels to files and back: NetCDF, HDF5 and Zarr, in the layouts that link simulators read."""
 
+import math
 import os
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -10,10 +11,19 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from sionna_partial.channels.responses import ArrayPaths
-from sionna_partial.checks import Progress, require, require_choice, require_type
+from sionna_partial.channels.responses import ArrayPaths, require_memory
+from sionna_partial.checks import Progress, number_of, require, require_choice, require_type
+from sionna_partial.constants import MEMORY_GB
 from sionna_partial.errors import OutputError, SettingsError
-from sionna_partial.files import atomic_files, atomic_path, input_path, open_regular, output_path, require_plain_hdf5
+from sionna_partial.files import (
+    atomic_files,
+    atomic_path,
+    input_path,
+    open_regular,
+    output_path,
+    require_plain_hdf5,
+    write_netcdf,
+)
 from sionna_partial.progress import reporting
 from sionna_partial.tracing.links import TracedLinks
 
@@ -21,6 +31,20 @@ Layout = Literal["sionna", "deepmimo"]
 """Names and axes of the arrays in a file."""
 
 SUFFIXES = (".zarr", ".nc", ".h5")
+
+_CHANNELS = "give links with paths, or what their cir, cfr or taps returned."
+
+_OF_LINKS, _OF_PATHS = ("tx", "rx", "tx_m", "rx_m"), ("a", "delay_s", "paths")
+_LINK, _POINT, _PAIR = ("link",), ("link", "axis"), ("link", "rx_ant", "tx_ant")
+_AXES: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
+    **dict.fromkeys(("tx", "rx", "paths"), ("iu", (_LINK,))),
+    **dict.fromkeys(("tx_m", "rx_m"), ("f", (_POINT,))),
+    **{"a": ("c", ((*_PAIR, "path"),)), "delay_s": ("f", (("link", "path"), (*_PAIR, "path")))},
+    "h": ("c", ((*_PAIR, "frequency"), (*_PAIR, "tap"))),
+}
+"""Kinds of dtypes, and choices of axes, of the variables of channels."""
+
+_ATTRIBUTES = ("frequency_hz", "synthetic_array", "normalize_delays", "bandwidth_hz")
 
 CHUNK_BYTES = 50_000_000
 """Size of the coefficients that are written together, which bounds the memory."""
@@ -34,6 +58,7 @@ def save_channels(
     path: str | os.PathLike[str],
     *,
     layout: Layout = "sionna",
+    memory_gb: float = MEMORY_GB,
     progress: Progress | bool | None = None,
     **options: Any,
 ) -> None:
@@ -56,6 +81,8 @@ def save_channels(
     path : path-like
         A `.zarr` folder, which must not be there yet, or a `.nc` or `.h5` file.
     layout : {"sionna", "deepmimo"}
+    memory_gb : float
+        How much memory the coefficients of a link may take [GB].
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``.
     **options
@@ -79,9 +106,11 @@ def save_channels(
         if isinstance(channels, xr.Dataset):
             table = _unstacked(channels, options)
         else:
-            require_type("channels", channels, TracedLinks, "give links, or what their cir, cfr or taps returned.")
+            require_type("channels", channels, TracedLinks, _CHANNELS)
             arrays = ArrayPaths.of(channels, **options)
             require(arrays.most > 0, "channels", f"{arrays.links} links", "none has a path: there is nothing to save.")
+            what = f"{arrays.antennas} x {arrays.most} paths at a time"
+            require_memory(arrays, 0, what, memory_gb, arrays.work_bytes)
             table = _computed_later(arrays, report)
         table = _laid_out(table, layout)
         if target.suffix == ".zarr":
@@ -93,7 +122,7 @@ def save_channels(
                 name: {"zlib": True, "complevel": 1, "chunksizes": sizes} for name, sizes in of_receiver.items()
             }
             with atomic_path(target) as file:
-                table.to_netcdf(file, engine="h5netcdf", encoding=packed)
+                write_netcdf(table, packed, file)
         report(1.0, f"wrote {target.name}")
 
 
@@ -191,18 +220,41 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
 def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
     """Return what `cir`, `cfr` or `taps` returned, with transmitters and receivers on axes of their own."""
     require(not options, "options", ", ".join(options), "these channels are computed: give them to cir, cfr or taps.")
-    needed = {"transmitters", "receivers"} <= channels.attrs.keys() and bool({"a", "h"} & {*channels.data_vars})
-    require(needed, "channels", channels.attrs, "give links, or what their cir, cfr or taps returned.")
-    shape = channels.attrs["transmitters"], channels.attrs["receivers"]
+    axes = _checked_axes(channels)
+    tx, rx = (np.unique(channels[name]) for name in ("tx", "rx"))
+    links = channels.isel(link=np.lexsort((channels["rx"], channels["tx"])))
+    full = links.sizes["link"] == len(tx) * len(rx) > 0 and bool(
+        (links["tx"] == np.repeat(tx, len(rx))).all() and (links["rx"] == np.tile(rx, len(tx))).all()
+    )
+    remedy = "give all links from some transmitters to some receivers, such as those of one."
+    require(full, "links", f"{len(tx)} transmitters, {len(rx)} receivers, {links.sizes['link']} links", remedy)
     found: dict[str, Any] = {}
-    for name, each in channels.reset_coords(["tx", "rx"], drop=True).data_vars.items():
-        values = each.to_numpy().reshape(*shape, *each.shape[1:])
-        if str(name) in ("tx_m", "rx_m"):
-            found[str(name)] = (str(name)[:2], "axis"), values[:, 0] if name == "tx_m" else values[0]
+    for name, dims in axes.items():
+        if name in ("tx", "rx"):
+            continue
+        values = links[name].transpose(*dims).to_numpy()
+        values = values.reshape(len(tx), len(rx), *values.shape[1:])
+        if name in ("tx_m", "rx_m"):
+            found[name] = (name[:2], "axis"), values[:, 0] if name == "tx_m" else values[0]
         else:
-            found[str(name)] = ("tx", "rx", *map(str, each.dims[1:])), values
-    along = {name: each for name, each in channels.coords.items() if name in ("frequency", "tap")}
-    return xr.Dataset(found, coords=along, attrs=channels.attrs)
+            found[name] = ("tx", "rx", *dims[1:]), values
+    along = {name: each.variable for name, each in links.coords.items() if name in ("frequency", "tap")}
+    kept = {name: number_of(links.attrs.get(name)) for name in _ATTRIBUTES}
+    kept = {name: value for name, value in kept.items() if math.isfinite(value)}
+    return xr.Dataset(found, coords=along, attrs=kept | {"transmitters": len(tx), "receivers": len(rx)})
+
+
+def _checked_axes(channels: xr.Dataset) -> dict[str, tuple[str, ...]]:
+    """Axes of the variables that `cir`, `cfr` or `taps` returned, or raise a SettingsError."""
+    axes = {}
+    for name in (*_OF_LINKS, *(_OF_PATHS if "a" in channels else ("h",))):
+        kinds, choices = _AXES[name]
+        found = channels[name] if name in channels else xr.DataArray("missing")
+        fits = [dims for dims in choices if found.dtype.kind in kinds and found.size and {*dims} == {*found.dims}]
+        what = f"{found.dtype} {dict(found.sizes)}" if name in channels else "missing"
+        require(bool(fits), f"channels.{name}", what, _CHANNELS)
+        axes[name] = fits[0]
+    return axes
 
 
 def _laid_out(table: xr.Dataset, layout: Layout) -> xr.Dataset:

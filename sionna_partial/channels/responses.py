@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 BLOCK_BYTES = 4_000_000
 """Size of the coefficients that are computed together, which caches hold."""
 
+WORK_BYTES = 100_000_000
+"""About the size of functions of delays, or of the beams of paths, that are computed together."""
+
 UPRIGHT = 1e-3
 """A diffraction is at a vertical edge if it changes the vertical part of the direction by less than this."""
 
@@ -89,6 +92,12 @@ class ArrayPaths:
     def most(self) -> int:
         """The largest number of paths of a link."""
         return int(np.diff(self.first).max(initial=0))
+
+    @property
+    def work_bytes(self) -> int:
+        """Size of the largest of the `blocks` while it is computed."""
+        coefficients = max(BLOCK_BYTES // 16, len(self.rx) * len(self.tx) * self.most)
+        return coefficients * (32 if self.synthetic_array else 80)
 
     def empty(self, links: int) -> tuple[NDArray[np.complex64], Floats]:
         """Return arrays for `Block.fill`: 0 and NaN."""
@@ -286,7 +295,8 @@ def cir(paths: "TracedLinks", *, memory_gb: float = MEMORY_GB, **options: Any) -
     arrays = ArrayPaths.of(paths, **options)
     pairs = len(arrays.rx) * len(arrays.tx)
     path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
-    require_memory(arrays, arrays.most * path_bytes, f"{arrays.antennas} x {arrays.most} paths", memory_gb)
+    what = f"{arrays.antennas} x {arrays.most} paths"
+    require_memory(arrays, arrays.most * path_bytes, what, memory_gb, arrays.work_bytes)
     a, delay_s = arrays.empty(arrays.links)
     for block in arrays.blocks():
         block.fill(a[block.links], delay_s[block.links])
@@ -313,8 +323,8 @@ def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = M
     inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
     require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")
 
-    def kernel(delay_s: Floats) -> NDArray[Any]:
-        return phasors(-2.0 * np.pi * delay_s[..., None] * offsets_hz)
+    def kernel(delay_s: Floats, some: slice) -> NDArray[Any]:
+        return phasors(-2.0 * np.pi * delay_s[..., None] * offsets_hz[some])
 
     h = _filtered(arrays, kernel, len(offsets_hz), "frequencies", memory_gb)
     variables = {"h": (("link", "rx_ant", "tx_ant", "frequency"), h, {"long_name": "frequency response", "units": "1"})}
@@ -341,8 +351,8 @@ def taps(
     require_whole("l_min", l_min, -1_000_000, 1_000_000)
     require_whole("l_max", l_max, l_min, 1_000_000_000)
 
-    def kernel(delay_s: Floats) -> NDArray[Any]:
-        tap = np.arange(l_min, l_max + 1)
+    def kernel(delay_s: Floats, some: slice) -> NDArray[Any]:
+        tap = np.arange(l_min + some.start, l_min + some.stop)
         return np.sinc(tap - bandwidth_hz * delay_s[..., None]).astype(np.complex64)
 
     h = _filtered(arrays, kernel, l_max - l_min + 1, "taps", memory_gb)
@@ -351,20 +361,33 @@ def taps(
     return table.assign_coords(tap=np.arange(l_min, l_max + 1)).assign_attrs(bandwidth_hz=float(bandwidth_hz))
 
 
+_VALUE_BYTES, _AXIS_BYTES = 48, 40
+"""What a value of a function of a delay takes while it is computed, and one of an axis with its index [bytes]."""
+
+
 def _filtered(
-    arrays: ArrayPaths, kernel: Callable[[Floats], NDArray[Any]], size: int, what: str, memory_gb: float
+    arrays: ArrayPaths, kernel: Callable[[Floats, slice], NDArray[Any]], size: int, what: str, memory_gb: float
 ) -> NDArray[np.complex64]:
-    """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size)."""
-    link_bytes = 8 * len(arrays.rx) * len(arrays.tx) * size
-    require_memory(arrays, link_bytes, f"{arrays.antennas} x {size} {what}", memory_gb)
+    """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size).
+
+    `kernel` returns some of the `size` values of delays (...,): (..., some).
+    """
+    pairs = len(arrays.rx) * len(arrays.tx)
+    delays = max(1, arrays.most if arrays.synthetic_array else pairs)
+    at_once = min(size, max(1, WORK_BYTES // (_VALUE_BYTES * delays)))
+    work_bytes = arrays.work_bytes + _VALUE_BYTES * delays * at_once + _AXIS_BYTES * size
+    require_memory(arrays, 8 * pairs * size, f"{arrays.antennas} x {size} {what}", memory_gb, work_bytes)
     h = np.zeros((arrays.links, len(arrays.rx), len(arrays.tx), size), np.complex64)
+    parts = [slice(start, min(start + at_once, size)) for start in range(0, size, at_once)]
     for block in arrays.blocks():
         for link, (low, high) in enumerate(zip(block.first[:-1], block.first[1:], strict=True), block.links.start):
-            if arrays.synthetic_array:
-                h[link] = np.moveaxis(block.a[low:high], 0, 2) @ kernel(block.delay_s[low:high, 0, 0])
-                continue
-            for a, delay_s in zip(block.a[low:high], block.delay_s[low:high], strict=True):
-                h[link] += a[..., None] * kernel(delay_s)
+            for part in parts:
+                if arrays.synthetic_array:
+                    values = kernel(block.delay_s[low:high, 0, 0], part)
+                    h[link, ..., part] = np.moveaxis(block.a[low:high], 0, 2) @ values
+                    continue
+                for a, delay_s in zip(block.a[low:high], block.delay_s[low:high], strict=True):
+                    h[link, ..., part] += a[..., None] * kernel(delay_s, part)
     return h
 
 
@@ -382,10 +405,10 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
     return xr.Dataset({**variables, **positions}, coords=coordinates, attrs=attributes)
 
 
-def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float) -> None:
-    """Raise a MemoryLimitError if all links would take more than `memory_gb`."""
+def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float, work_bytes: int) -> None:
+    """Raise a MemoryLimitError if all links, and what is needed to compute them, would take more than `memory_gb`."""
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
-    size_gb = arrays.links * link_bytes / 1e9
+    size_gb = (arrays.links * link_bytes + work_bytes) / 1e9
     if size_gb > memory_gb:
         raise MemoryLimitError(
             f"memory_gb = {memory_gb:g} is too little for {arrays.links:,} links x {what}, which take {size_gb:,.1f} "

@@ -143,7 +143,10 @@ class ChannelSamples(Shown):
     def _by_draw(self, found: "xr.Dataset") -> "xr.Dataset":
         """Fold links, or transmitters, into draws and those of each draw."""
         along = "link" if "link" in found.dims else "tx"
-        folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
+        if found.sizes[along]:
+            folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
+        else:
+            folded = found.expand_dims(draw=len(self))
         if along == "link":
             first = folded.isel(draw=0)
             positions = {name: first[name] for name in ("tx_m", "rx_m")}

@@ -102,7 +102,8 @@ class Baselines(Shown):
 def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
     """Return the features of the same N links on an empty map, where the distance is all that is known."""
     gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)
-    return LinkFeatures(np.full(len(phi), LinkState.LOS), phi.distance_m, phi.distance_m, gain_db)
+    state = np.full(len(phi), LinkState.LOS)
+    return LinkFeatures(state, phi.distance_m, phi.distance_m, gain_db, frequency_hz=frequency_hz)
 
 
 def indoor_los_probability(distance_m: Floats, office: str) -> Floats:
@@ -150,7 +151,7 @@ def baseline_predictions(
     """Predict N links with every baseline; the paper's predictor comes first."""
     distance = baselines.distance
     return ({} if paper is None else {"paper": paper.predict(phi)}) | {
-        "distance only": distance.predict(nothing_seen(phi, distance.settings.frequency_hz)),
+        "distance only": distance.predict(nothing_seen(phi, frequency_hz)),
         "majority": baselines.majority.predict(phi),
         "partial trace": LinkPrediction.of_trace(phi),
         **{f"TR 38.901 {office} office": tr38901_indoor(phi, frequency_hz, office) for office in OFFICES},

@@ -182,16 +182,16 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             freest = np.minimum(freest, _RANK[padded[row, column]])
         return _FREEST[freest]
 
-    def require_positions(self, name: str, points_m: object) -> Floats:
+    def require_positions(self, name: str, points_m: object, *, least: int = 1) -> Floats:
         """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
 
         Raises
         ------
         PositionError
-            For another shape, a value that is not finite, or a point outside the map, inside a wall, or not between
-            floor and ceiling. Unknown cells are allowed (the paper asks for them).
+            For another shape, fewer than `least`, a value that is not finite, or a point outside the map, inside a
+            wall, or not between floor and ceiling. Unknown cells are allowed (the paper asks for them).
         """
-        points = position_array(name, points_m)
+        points = position_array(name, points_m, least=least)
         flat = points.reshape(-1, 3)
         for fault, what, remedy in self._position_faults(flat):
             if fault.any():
@@ -233,11 +233,13 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         ]
 
 
-def position_array(name: str, points_m: object) -> Floats:
+def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:
     """Return positions (3,) or (N, 3) [m] as a float64 array, or raise a PositionError that names them."""
     points = real_array(name, points_m, PositionError, "give x, y, z in metres.").astype(np.float64)
     if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
         raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
+    if points.size < 3 * least:
+        raise PositionError(f"{name} has shape {points.shape}: give at least {least} position.")
     return points
 
 

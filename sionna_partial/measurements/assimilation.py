@@ -349,7 +349,7 @@ class Assimilation(Shown):
             For arguments of another kind.
         """
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
-        rx_m = np.atleast_2d(position_array("rx_m", rx_m))
+        rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
         prior = self._shadowed(rx_m, prior)
         across = self._links.correlation(rx_m, self._kind)
         explained = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)

@@ -375,7 +375,7 @@ def _measured(
         message = "%d of %d measurements are not used: their receivers are in walls or at the transmitter"
         _log.warning(message, int((~usable).sum()), len(usable))
     measured = measured.take(usable)
-    partial.require_positions("rx of the measurements", measured.rx)
+    partial.require_positions("rx of the measurements", measured.rx, least=0)
     return measured
 
 

@@ -88,7 +88,7 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
 def measurements_from_bag(
     path: str | os.PathLike[str],
     topic: str,
-    tx: ArrayLike,
+    tx: ArrayLike | None = None,
     *,
     tx_power_dbm: float,
     field: str = "data",
@@ -108,8 +108,8 @@ def measurements_from_bag(
         The recording: .bag, .mcap, .db3, or a folder.
     topic : str
         Topic of the received powers [dBm].
-    tx : (3,) array-like
-        Transmitter position [m].
+    tx : (3,) array-like, optional
+        Transmitter position [m]; None, and NaN in the table, where it is not known.
     tx_power_dbm : float
         What the receiver would report without path loss: transmit power and antenna gains less cable losses [dBm].
     field : str

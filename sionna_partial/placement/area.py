@@ -98,7 +98,13 @@ class PlacementArea:
         return seen.reshape(len(positions_m), len(self.rx_m))
 
 
-def placement_area(partial: PartialMap, height_m: float, rx_height_m: float, model: Predictor | None) -> PlacementArea:
+def placement_area(
+    partial: PartialMap,
+    height_m: float,
+    rx_height_m: float,
+    model: Predictor | None,
+    frequency_hz: float | None = None,
+) -> PlacementArea:
     """Find where a transmitter may stand, and receivers wherever `predict_map` has valid ones.
 
     `model` predicts which unknown cells are indoors; without one, as on a complete map, all are outdoors. A
@@ -110,7 +116,7 @@ def placement_area(partial: PartialMap, height_m: float, rx_height_m: float, mod
     rx_m = grid_positions((x0 + spacing_m / 2, x1), (y0 + spacing_m / 2, y1), spacing_m, rx_height_m)
     rx_m = rx_m[clear_of_walls(partial, rx_m)]
     area = PlacementArea(partial, height_m, _room(partial), rx_m, np.ones(len(rx_m)), spacing_m)
-    weight = _weights(area, model)
+    weight = _weights(area, model, frequency_hz)
     kept = weight > NEGLIGIBLE
     if not kept.any():
         raise PositionError(
@@ -138,7 +144,7 @@ def _room(partial: PartialMap) -> PartialMap:
     return PartialMap(room, cell_m, partial.origin_m, partial.wall_height_m)
 
 
-def _weights(area: PlacementArea, model: Predictor | None) -> Floats:
+def _weights(area: PlacementArea, model: Predictor | None, frequency_hz: float | None) -> Floats:
     """Weight (N,) of each receiver: 1 in free cells, else the mean P(indoor) over some transmitter positions."""
     weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
     if model is None or weight.all():
@@ -151,6 +157,7 @@ def _weights(area: PlacementArea, model: Predictor | None) -> Floats:
         unobserved_distance_m=np.minimum(unobserved_m, distance_m),
         distance_m=distance_m,
         gain_db=np.full(len(distance_m), GAIN_FLOOR_DB),
+        frequency_hz=frequency_hz,
     )
     weight[weight == 0.0] = model.predict_indoor(phi).reshape(len(some_m), -1).mean(axis=0)
     return weight

@@ -235,7 +235,9 @@ class Search:
         for name in ("tx_height_m", "rx_height_m"):
             require_height(model.partial, name, getattr(settings, name))
         heights_m = float(settings.tx_height_m), float(settings.rx_height_m)
-        return cls(settings, model, placement_area(model.partial, *heights_m, model.predictor_of_map))
+        frequency_hz = model.simulation.trace_settings.frequency_hz
+        area = placement_area(model.partial, *heights_m, model.predictor_of_map, frequency_hz)
+        return cls(settings, model, area)
 
     def starts(self, area: PlacementArea, count: int) -> Floats:
         """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""

@@ -395,7 +395,8 @@ class LinkFeatures(Shown):
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
         frequencies_hz = {part.frequency_hz for part in parts}
         if len(frequencies_hz) > 1:
-            raise PredictorError(f"parts are of several frequency_hz ({frequencies_hz}): give links of one frequency.")
+            given = ", ".join(sorted(f"{each:g}" if each else "none" for each in frequencies_hz))
+            raise PredictorError(f"parts have the frequency_hz {given}: give links of one frequency together.")
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
         columns = {name: np.concatenate([getattr(part, name).ravel() for part in parts]) for name in _PAPER}

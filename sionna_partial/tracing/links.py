@@ -122,7 +122,7 @@ class TracedLinks(Shown):
         normalize_delays : bool
             Count delays from the shortest path of each link.
         memory_gb : float
-            How much memory the result may take [GB].
+            How much memory the result, and the work for it, may take [GB].
 
         Returns
         -------

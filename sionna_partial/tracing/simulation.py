@@ -462,7 +462,7 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
 def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats]:
     """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
     tx_m, rx_m = partial.require_positions("tx", tx), _receivers(rx)
-    partial.require_positions("rx", rx_m)
+    partial.require_positions("rx", rx_m, least=0)
     tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
     for source_m in tx_m:
         distance_m = np.linalg.norm(rx_m - source_m, axis=1)
@@ -485,4 +485,4 @@ def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz:
 def _receivers(rx: ArrayLike) -> Floats:
     with suppress(ValueError):  # nested lists of unequal lengths have no size
         rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
-    return position_array("rx", rx).reshape(-1, 3)
+    return position_array("rx", rx, least=0).reshape(-1, 3)
