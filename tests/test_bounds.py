@@ -6,7 +6,19 @@ from extruded import ROOM, SPLINTERS, drawn, extrude
 
 import sionna_partial as sp
 from sionna_partial.constants import LinkState
-from sionna_partial.tracing.bounds import LEVELS, dropped_power, level_of, levels_needed, strengths_of, utd_terms
+from sionna_partial.tracing.bounds import (
+    LEVELS,
+    at_edge,
+    dropped_power,
+    level_of,
+    levels_needed,
+    most_at_edge,
+    strengths_of,
+    utd_term,
+    utd_terms,
+    wedge_angle,
+    wedge_constants,
+)
 from sionna_partial.tracing.slab import reflection_coefficients
 
 DRYWALL = np.array([2.94, 0.1226, 0.1])
@@ -20,24 +32,45 @@ def _indirect_power(links: sp.TracedLinks) -> np.ndarray:
 class TestReflection:
     def test_no_angle_reflects_more_than_its_bound(self) -> None:
         cosine = np.random.default_rng(0).uniform(0.0, 1.0, 20_000)
-        table = strengths_of([DRYWALL], 28e9, 1).reflection[0]
+        table = strengths_of([DRYWALL], 28e9, 1).largest[0]
+        te, tm = reflection_coefficients(*DRYWALL, 28e9, cosine)
         bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
-        for coefficient in reflection_coefficients(*DRYWALL, 28e9, cosine):
-            assert (np.abs(coefficient) ** 2 <= bound).all()
-
-    def test_it_is_not_far_above(self) -> None:
-        cosine = np.linspace(0.0, 1.0, 1000)
-        table = strengths_of([DRYWALL], 28e9, 1).reflection[0]
-        bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
-        largest = np.max([np.abs(each) for each in reflection_coefficients(*DRYWALL, 28e9, cosine)], axis=0) ** 2
-        assert np.median(bound / np.maximum(largest, 1e-9)) < 1.1
+        found = np.abs([te, tm, te + tm, te]).T
+        assert (found <= bound).all()
+        assert np.median(bound[:, :3] / np.maximum(found[:, :3], 1e-9), axis=0).max() < 1.05
+        assert (np.diff(table[:, 3]) <= 0.0).all()
 
 
-def test_a_term_is_at_most_half_the_incident_field_at_its_shadow_boundary() -> None:
-    terms = np.empty(4)
-    utd_terms(1.5 * np.pi, 0.7, 0.7 + np.pi, 3.0, terms)
-    assert terms[1] == pytest.approx(3.0)
-    assert (terms < 3.0 + 1e-9).all()
+def _diffracted(arrival: float, departure: float, exterior: float = 1.5 * np.pi, boundary: float = 20.0) -> complex:
+    """Sum of the terms of a wedge that absorbs no field and reflects none: the diffracted incident field alone."""
+    strengths, terms = strengths_of([DRYWALL], 28e9, 1), np.empty((4, 3))
+    wedge = wedge_constants(np.array([exterior]))[0]
+    utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
+    return sum(utd_term(strengths.transition, terms, k, boundary) for k in (0, 1))
+
+
+class TestDiffraction:
+    def test_at_its_shadow_boundary_a_term_is_half_the_incident_field(self) -> None:
+        """That is n sqrt(2 pi kL) / 2 n in either direction, and terms change little beside it."""
+        half, step = 0.5 * np.sqrt(np.pi) * 20.0, 1e-6
+        for side in (step, -step):
+            assert abs(_diffracted(0.7, 0.7 + np.pi + side)) == pytest.approx(half, rel=0.05)
+
+    def test_the_transition_function_is_continuous_where_its_series_takes_over(self) -> None:
+        strengths = strengths_of([DRYWALL], 28e9, 1)
+        term = np.array([[1.0, 1.0, 1.0]])
+        inside, outside = (utd_term(strengths.transition, term, 0, y) for y in (3.0 - 1e-9, 3.0 + 1e-9))
+        assert inside == pytest.approx(outside, abs=1e-3)
+
+    def test_the_rough_bound_is_no_less(self) -> None:
+        rng, terms, exterior = np.random.default_rng(3), np.empty((4, 3)), 1.7 * np.pi
+        table, wedge = strengths_of([DRYWALL], 28e9, 1), wedge_constants(np.array([exterior]))[0]
+        for arrival, departure in rng.uniform(0.0, exterior, (300, 2)):
+            utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
+            for boundary in (1.0, 10.0, 100.0):
+                level = 1.0, 0.0, (1.0, 0.0, 1.0)
+                exact = at_edge(table.faces[0], table.transition, terms, boundary, -1.0, -1.0, *level)
+                assert exact[0] <= 1.03 * most_at_edge(terms, boundary, 1.0, 1.0)
 
 
 class TestLevels:

@@ -119,7 +119,8 @@ class TestOpenEnds:
         assert 8 in asked.interactions
 
     def test_a_wall_that_ends_in_free_space_does(self) -> None:
-        links = trace_links(drawn("...... ...... ###... ...... ......", 1.0), (1.5, 0.5, 1.5), [[0.5, 4.5, 1.5]])
+        partial = drawn("...... ...... ###... ...... ......", 1.0)
+        links = trace_links(partial, (1.5, 0.5, 1.5), [[0.5, 4.5, 1.5]], trace_settings=all_paths())
         edges = links.vertices_m[links.interactions == 8][:, :2]
         np.testing.assert_allclose(edges, np.full((5, 2), 2.5), atol=1e-3)  # directly, and with 1 or 2 bounces
 

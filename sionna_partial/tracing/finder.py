@@ -188,7 +188,7 @@ def _strong_paths(
     for _, fraction, _ in listed(bounds._replace(first=nothing, last=nothing)):
         report(0.4 * fraction, "listing paths")
     power, done = np.zeros(len(rx_m)), bounds.first
-    expected = expected_power(bounds.power, bounds.reflected)
+    expected = expected_power(bounds.power)
     for low, high in ((0.4, 0.9), (0.9, 1.0)):
         needed = levels_needed(bounds.power, dropped_power(expected, tolerance_db))
         more = needed > done

@@ -37,7 +37,7 @@ _log = logging.getLogger(__name__)
 SHORTEST_M = 0.011
 """Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
 
-RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 6_000, 50_000
+RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 8_000, 50_000
 """Number of receivers whose paths are found together, which bounds the memory. A mesh has fewer paths, and costs rays
 each time."""
 

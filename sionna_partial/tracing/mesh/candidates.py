@@ -270,14 +270,13 @@ def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best
             face[count, k] = face_at(bins, p, x, y, z)
             if face[count, k] < 0:
                 break
-            power *= reflected_power(strengths.reflection[material[face[count, k]]], (behind - before) / length)
+            power *= reflected_power(strengths.largest[material[face[count, k]]], (behind - before) / length)
             at, k = parent[at], k - 1
         if k < 0:
             level = level_of(power)
             best[node] = min(best[node], level)
             if len(strengths.power):
                 strengths.power[target, level] += power
-                strengths.reflected[target] += power
             if not strengths.first[target] <= level < strengths.last[target]:
                 continue
             rx[count] = target

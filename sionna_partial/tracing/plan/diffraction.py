@@ -15,7 +15,20 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power, utd_terms
+from sionna_partial.tracing.bounds import (
+    LEVELS,
+    NEGLIGIBLE,
+    Strengths,
+    at_edge,
+    at_flats,
+    at_wall,
+    level_of,
+    most_at_edge,
+    most_at_wall,
+    utd_terms,
+    wedge_angle,
+    wedge_constants,
+)
 from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
 from sionna_partial.tracing.plan.specular import (
@@ -54,8 +67,8 @@ class _Arrivals(NamedTuple):
 
     `start` (E + 1,) gives the first of each edge, `reflections` (J,) their number, `length_m` (J,) the length in
     the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them, `cosine` (J, R) of the
-    angles of incidence there, `angle_rad` (J,) the direction of arrival, counted from the 0-face, and `lit` (J,)
-    whether that face is lit.
+    angles of incidence there, `angle` (J, 4) the direction of arrival as `wedge_angle` gives it, `faces` (J, 2) the
+    cosines of the angles of incidence at 0-face and n-face, -1 in the shadow, and `lit` (J,) whether the 0-face is lit.
     """
 
     start: NDArray[np.int64]
@@ -64,17 +77,22 @@ class _Arrivals(NamedTuple):
     walls: NDArray[np.int64]
     points: Floats
     cosine: Floats
-    angle_rad: Floats
+    angle: Floats
+    faces: Floats
     lit: Bools
 
 
 class _Edges(NamedTuple):
-    """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4)."""
+    """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4).
+
+    `utd` (E, 5) are the `wedge_constants`.
+    """
 
     position_m: Floats
     face_rad: Floats
     exterior_rad: Floats
     normals: Floats
+    utd: Floats
 
 
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
@@ -155,7 +173,7 @@ def _edges_of(wedges: Wedges) -> _Edges:
     face_rad, end_rad = np.arctan2(-normals[:, 0, 0], normals[:, 0, 1]), np.arctan2(normals[:, 1, 0], -normals[:, 1, 1])
     exterior_rad = (end_rad - face_rad) % (2 * np.pi)
     exterior_rad[exterior_rad < _FLAT_RAD] = 2 * np.pi  # the free end of a wall
-    return _Edges(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4))
+    return _Edges(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4), wedge_constants(exterior_rad))
 
 
 def _arrivals(plan: Plan, edges: _Edges, room: Room, reflections: int) -> _Arrivals:
@@ -174,10 +192,12 @@ def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no
     good, count = np.empty(len(node), np.bool_), np.empty(len(node), np.int64)
     length, walls = np.empty(len(node)), np.empty((len(node), reflections), np.int64)
     points, cosine = np.empty((len(node), reflections, 3)), np.empty((len(node), reflections))
-    angle, lit = np.empty(len(node)), np.empty(len(node), np.bool_)
+    angle, faces, lit = np.empty((len(node), 4)), np.empty((len(node), 2)), np.empty(len(node), np.bool_)
     for i in range(len(node)):
         target = edges.position_m[edge[i]]
-        count[i], length[i], good[i] = unfold(beams, node[i], room.walls_m, target, walls[i], points[i])
+        count[i], length[i], good[i] = unfold(
+            beams.parent, beams.segment, beams.source, node[i], room.walls_m, target, walls[i], points[i]
+        )
         if not good[i]:
             continue
         x, y = room.tx_m[0], room.tx_m[1]
@@ -187,8 +207,12 @@ def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no
         x, y = x - target[0], y - target[1]
         lit[i], outside = _outside(edges.normals[edge[i]], x, y)
         good[i] = outside and np.hypot(x, y) > _NEAR_M
-        angle[i] = _angle_rad(edges, edge[i], x, y)
-    return good, count, length, walls, points, cosine, angle, lit
+        exterior = edges.exterior_rad[edge[i]]
+        from_0 = _angle_rad(edges.face_rad[edge[i]], exterior, x, y)
+        angle[i, 0], angle[i, 1], angle[i, 2], angle[i, 3] = wedge_angle(from_0, exterior)
+        for k, from_face in enumerate((from_0, exterior - from_0)):
+            faces[i, k] = max(0.0, np.sin(from_face)) if from_face <= np.pi else -1.0
+    return good, count, length, walls, points, cosine, angle, faces, lit
 
 
 @njit(cache=True)
@@ -207,57 +231,54 @@ def _outside(normals, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _angle_rad(edges, edge, x, y):  # type: ignore[no-untyped-def]
+def _angle_rad(face_rad, exterior_rad, x, y):  # type: ignore[no-untyped-def]
     """Angle of a direction from an edge, counted from its 0-face, where rounding may turn 0 into 2 pi."""
-    angle = (np.arctan2(y, x) - edges.face_rad[edge]) % (2 * np.pi)
-    return 0.0 if angle > 0.5 * edges.exterior_rad[edge] + np.pi else angle
+    angle = (np.arctan2(y, x) - face_rad) % (2 * np.pi)
+    return 0.0 if angle > 0.5 * exterior_rad + np.pi else angle
 
 
 @njit(cache=True, nogil=True)
 def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):  # type: ignore[no-untyped-def]
-    """Join arrivals at edges and departures from them: receivers, wedges, surfaces and vertices of candidates."""
-    size = reflections + 1
+    """Join arrivals at edges and departures from them: receivers, wedges, surfaces and vertices of candidates.
+
+    Loops take arrays out of tuples before they begin: numba counts references at every access, on all cores.
+    """
+    size, first, last = reflections + 1, strengths.first, strengths.last
     rx, wedge = np.empty(1024, np.int32), np.empty(1024, np.int32)
     surface, vertices, used = np.empty((1024, size), np.int32), np.empty((1024, size, 3)), np.int64(0)
     walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
-    all_walls, all_points, terms, flat = np.empty(size, np.int64), np.empty((size, 3)), np.empty(4), np.empty(2)
-    for i in range(len(beams.pair_node)):
-        here = beams.pair_rx[i]
-        if best[i] >= strengths.last[here]:
+    all_walls, all_points, terms = np.empty(size, np.int64), np.empty((size, 3)), np.empty((4, 3))
+    start, pair_rx, pair_node, parent = arrivals.start, beams.pair_rx, beams.pair_node, beams.parent
+    segment, source, walls_m, rx_m, edge_m = beams.segment, beams.source, room.walls_m, room.rx_m, edges.position_m
+    normals, face_rad, exterior_rad, utd = edges.normals, edges.face_rad, edges.exterior_rad, edges.utd
+    heights = _heights(room, size)
+    highest = heights.max()
+    most = _most_of_arrivals(strengths.largest[0], arrivals, highest)
+    level = np.empty((np.diff(start).max(), size, 2), np.int64)
+    for i in range(len(pair_node)):
+        here = pair_rx[i]
+        if best[i] >= last[here]:
             continue
         best[i] = LEVELS
-        edge = group[_root(beams.parent, beams.pair_node[i]) // 4]
-        target, origin = room.rx_m[here], edges.position_m[edge]
-        after, onward, good = unfold(beams, beams.pair_node[i], room.walls_m, target, walls, points)
+        edge = group[_root(parent, pair_node[i]) // 4]
+        target, origin = rx_m[here], edge_m[edge]
+        after, onward, good = unfold(parent, segment, source, pair_node[i], walls_m, target, walls, points)
         ox, oy = (points[0, 0], points[0, 1]) if after > 0 else (target[0], target[1])
         ox, oy = ox - origin[0], oy - origin[1]
-        if not good or np.hypot(ox, oy) < _NEAR_M or not _outside(edges.normals[edge], ox, oy)[1]:
+        if not good or np.hypot(ox, oy) < _NEAR_M or not _outside(normals[edge], ox, oy)[1]:
             continue
-        incidence(room.walls_m, origin, target, walls[:after], points, cosine)
-        departure = _angle_rad(edges, edge, ox, oy)
-        for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
-            before = arrivals.reflections[j]
-            left = reflections - before - after
-            if left < 0:
-                continue
-            length = arrivals.length_m[j]
-            _diffract(strengths, edges.exterior_rad[edge], arrivals, j, departure, onward, terms, flat)
-            for bounces in range(left + 1):
-                for first in (FLOOR, CEILING):
-                    if not can_bounce(bounces, first, room):
-                        continue
-                    height = unfolded_height(room, target, bounces, first)
-                    power = _diffracted_power(strengths, terms, flat, length, onward, height, bounces)
-                    sine = (length + onward) / np.hypot(length + onward, height)
-                    for k in range(before):
-                        power *= reflected_power(strengths.reflection[0], arrivals.cosine[j, k] * sine)
-                    for k in range(after):
-                        power *= reflected_power(strengths.reflection[0], cosine[k] * sine)
-                    level = level_of(power)
-                    if len(strengths.power):
-                        strengths.power[here, level] += power
-                    best[i] = min(best[i], level)
-                    if not strengths.first[here] <= level < strengths.last[here]:
+        incidence(walls_m, origin, target, walls[:after], points, cosine)
+        departure = wedge_angle(_angle_rad(face_rad[edge], exterior_rad[edge], ox, oy), exterior_rad[edge])
+        pair = here, start[edge], start[edge + 1], reflections - after, onward
+        best[i] = _bound(
+            strengths, arrivals, most, pair, utd[edge], departure, cosine[:after], heights[here], level, terms
+        )
+        if not first[here] < last[here] or best[i] >= last[here]:
+            continue
+        for j in range(start[edge], start[edge + 1]):
+            for bounces in range(size):
+                for down in (1, 0):
+                    if not first[here] <= level[j - start[edge], bounces, down] < last[here]:
                         continue
                     rx, wedge = grow(rx, used + 1), grow(wedge, used + 1)
                     surface, vertices = grow(surface, used + 1), grow(vertices, used + 1)
@@ -265,40 +286,101 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
                     clear(surface[used], vertices[used])
                     count = _join(arrivals, j, origin, walls[:after], points, onward, all_walls, all_points)
                     whole = all_walls[:count], all_points[:count]
-                    merge_heights(*whole, room, target, bounces, first, surface[used], vertices[used])
+                    merge_heights(*whole, room, target, bounces, CEILING + down, surface[used], vertices[used])
                     used += 1
     return rx[:used].copy(), wedge[:used].copy(), surface[:used].copy(), vertices[:used].copy()
 
 
 @njit(cache=True)
-def _diffract(strengths, exterior, arrivals, j, departure, onward, terms, flat):  # type: ignore[no-untyped-def]
-    """Write the UTD terms of a path over an edge, and the cosines of incidence at its two faces.
-
-    Angles count from the face that is lit.
-    """
-    arrival, length = arrivals.angle_rad[j], arrivals.length_m[j]
-    if not arrivals.lit[j]:
-        arrival, departure = exterior - arrival, exterior - departure
-    most = 0.5 * np.sqrt(4.0 * np.pi**2 / strengths.wavelength_m * length * onward / (length + onward))
-    utd_terms(exterior, arrival, departure, most, terms)
-    flat[0] = np.sin(arrival)
-    flat[1] = np.sin(exterior - arrival)
-    if exterior > np.pi + arrival:
-        flat[1] = 2.0  # the other face is in the shadow: Sionna RT takes it for a perfect mirror
+def _heights(room, size):  # type: ignore[no-untyped-def]
+    """Heights [m] that paths to each receiver cover (N, bounces, 2), off ceiling or floor first; -1 where none can."""
+    heights = np.empty((len(room.rx_m), size, 2))
+    for rx in range(len(room.rx_m)):
+        for bounces in range(size):
+            for first in (CEILING, FLOOR):
+                possible = can_bounce(bounces, first, room)
+                height = unfolded_height(room, room.rx_m[rx], bounces, first) if possible else -1.0
+                heights[rx, bounces, first - CEILING] = height
+    return heights
 
 
 @njit(cache=True)
-def _diffracted_power(strengths, terms, flat, length, onward, height, bounces):  # type: ignore[no-untyped-def]
-    """Upper bound of the power over an edge, without the reflections at walls."""
-    total = np.hypot(length + onward, height)
-    sine = (length + onward) / total
-    first = np.sqrt(reflected_power(strengths.reflection[0], flat[0] * sine))
-    last = 1.0 if flat[1] > 1.0 else np.sqrt(reflected_power(strengths.reflection[0], flat[1] * sine))
-    field = (first * (terms[0] + terms[3]) + last * (terms[1] + terms[2])) / sine
-    wavelength = strengths.wavelength_m
-    spread = sine * sine / (length * onward * total)  # 1 / (s s' (s + s'))
-    power = (wavelength / (4.0 * np.pi)) ** 2 * spread * field**2 * wavelength / (4.0 * np.pi**2)
-    return power * reflected_power(strengths.reflection[0], height / total) ** bounces if bounces > 0 else power
+def _bound(strengths, arrivals, most, pair, wedge, departure, cosine, heights, level, terms):  # type: ignore[no-untyped-def]
+    """Write the levels of all paths of a pair, one for each arrival, number of bounces and first flat; the lowest.
+
+    Paths that are negligible by a rough bound count with it, in the last level; `most` is what that takes. A pair is
+    (receiver, first arrival, end of the arrivals, reflections that remain, length onward [m]).
+    """
+    largest, faces, transition = strengths.largest[0], strengths.faces[0], strengths.transition
+    power, reflected, wavelength = strengths.power, strengths.reflected, strengths.wavelength_m
+    lengths, reflections, angle, lit, before = (
+        arrivals.length_m,
+        arrivals.reflections,
+        arrivals.angle,
+        arrivals.faces,
+        arrivals.cosine,
+    )
+    here, start, stop, remain, onward = pair
+    constants = wedge[0], wedge[1], wedge[2], wedge[3], wedge[4]
+    most_after = _most_at_walls(largest, cosine, len(cosine), onward, heights.max())
+    lowest, adds = LEVELS, len(power) > 0
+    rough = NEGLIGIBLE * reflected[here] if strengths.last[here] < LEVELS else 0.0
+    level[: stop - start] = LEVELS
+    for j in range(start, stop):
+        left, length = remain - reflections[j], lengths[j]
+        if left < 0:
+            continue
+        utd_terms(constants, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), departure, terms)
+        spread = wavelength**3 / (64.0 * np.pi**4 * length * onward)
+        boundary = 4.0 * np.pi / wavelength * length * onward / (length + onward)
+        amplitude = most_after * most[j, 0] * most_at_edge(terms, np.sqrt(boundary), most[j, 1], most[j, 2])
+        weak = (2 * left + 1) * amplitude**2 * spread / (length + onward)
+        if weak < rough:
+            if adds:
+                power[here, LEVELS - 1] += weak
+            continue
+        for bounces in range(left + 1):
+            for down in (1, 0):
+                height = heights[bounces, down]
+                if height < 0.0:
+                    continue
+                total = np.sqrt((length + onward) ** 2 + height**2)
+                sine, slope, field = (length + onward) / total, height / total, (1.0, 0.0, 1.0)
+                for k in range(reflections[j]):
+                    field = at_wall(largest, before[j, k], sine, slope, field)
+                edge = np.sqrt(boundary * sine)
+                field = at_edge(faces, transition, terms, edge, lit[j, 0], lit[j, 1], sine, slope, field)
+                for k in range(len(cosine)):
+                    field = at_wall(largest, cosine[k], sine, slope, field)
+                strength = at_flats(largest, slope, bounces, field) ** 2 * spread / total
+                at = level_of(strength)
+                level[j - start, bounces, down] = at
+                lowest = min(lowest, at)
+                if adds:
+                    power[here, at] += strength
+    return lowest
+
+
+@njit(cache=True)
+def _most_of_arrivals(largest, arrivals, highest):  # type: ignore[no-untyped-def]
+    """Bounds (J, 3) of what walls leave of fields that arrive at edges, and of what the two faces there reflect."""
+    most = np.empty((len(arrivals.lit), 3))
+    for j in range(len(most)):
+        length = arrivals.length_m[j]
+        most[j, 0] = _most_at_walls(largest, arrivals.cosine[j], arrivals.reflections[j], length, highest)
+        for k in range(2):
+            lit = arrivals.faces[j, k] >= 0.0
+            most[j, 1 + k] = _most_at_walls(largest, arrivals.faces[j, k : k + 1], 1, length, highest) if lit else 1.0
+    return most
+
+
+@njit(cache=True)
+def _most_at_walls(largest, cosine, count, length, highest):  # type: ignore[no-untyped-def]
+    """Bound of what walls leave of a field whose path has some length in the plan, and rises by `highest` at most."""
+    most, sine = 1.0, length / np.sqrt(length * length + highest * highest)
+    for k in range(count):
+        most *= most_at_wall(largest, cosine[k] * sine)
+    return most
 
 
 @njit(cache=True)

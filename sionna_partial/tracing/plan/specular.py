@@ -14,7 +14,7 @@ from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power
+from sionna_partial.tracing.bounds import LEVELS, Strengths, at_flats, at_wall, level_of
 from sionna_partial.tracing.candidates import EDGE, Candidates
 from sionna_partial.tracing.plan.beams import trace_beams
 
@@ -80,32 +80,45 @@ def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.
 @njit(cache=True, nogil=True)
 def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # type: ignore[no-untyped-def]
     """Every order of wall, floor and ceiling reflections of some pairs; pairs without any asked for are skipped."""
+    parent, segment, source, pair_node, pair_rx = (
+        beams.parent,
+        beams.segment,
+        beams.source,
+        beams.pair_node,
+        beams.pair_rx,
+    )
+    walls_m, tx_m, rx_m, first_level, last_level = room.walls_m, room.tx_m, room.rx_m, strengths.first, strengths.last
+    all_power, reflected, largest, wavelength = (
+        strengths.power,
+        strengths.reflected,
+        strengths.largest[0],
+        strengths.wavelength_m,
+    )
     size = max(1, max_depth)
     walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
     out_rx, surface, vertices = np.empty(1024, np.int32), np.empty((1024, size), np.int32), np.empty((1024, size, 3))
     count = np.int64(0)
     for i in range(start, stop):
-        rx = beams.pair_rx[i]
-        if best[i] >= strengths.last[rx]:
+        rx = pair_rx[i]
+        if best[i] >= last_level[rx]:
             continue
-        target, best[i] = room.rx_m[rx], LEVELS
-        k, length, good = unfold(beams, beams.pair_node[i], room.walls_m, target, walls, points)
+        target, best[i] = rx_m[rx], LEVELS
+        k, length, good = unfold(parent, segment, source, pair_node[i], walls_m, target, walls, points)
         if not good:
             continue
-        incidence(room.walls_m, room.tx_m, target, walls[:k], points, cosine)
+        incidence(walls_m, tx_m, target, walls[:k], points, cosine)
         for bounces in range(max_depth - k + 1):
             for first in (FLOOR, CEILING):
                 if not can_bounce(bounces, first, room):
                     continue
                 height = unfolded_height(room, target, bounces, first)
-                power = _specular_power(strengths, cosine[:k], length, height, bounces)
+                power = _specular_power(wavelength, largest, cosine, k, length, height, bounces)
                 level = level_of(power) if k + bounces > 0 else 0
-                if len(strengths.power):
-                    strengths.power[rx, level] += power
+                if len(all_power):
+                    all_power[rx, level] += power
+                    reflected[rx] += power if level > 0 else 0.0
                 best[i] = min(best[i], level)
-                if bounces == 0 and k > 0:
-                    strengths.reflected[rx] += power
-                if not strengths.first[rx] <= level < strengths.last[rx]:
+                if not first_level[rx] <= level < last_level[rx]:
                     continue
                 out_rx, surface, vertices = grow(out_rx, count + 1), grow(surface, count + 1), grow(vertices, count + 1)
                 out_rx[count] = rx
@@ -151,15 +164,13 @@ def incidence(all_walls, start, end, walls, points, cosine):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _specular_power(strengths, cosine, length, height, bounces):  # type: ignore[no-untyped-def]
+def _specular_power(wavelength, largest, cosine, count, length, height, bounces):  # type: ignore[no-untyped-def]
     """Upper bound of the power of a path of some length in the plan, with reflections at walls, floor and ceiling."""
     total = np.hypot(length, height)
-    power = (strengths.wavelength_m / (4.0 * np.pi * total)) ** 2
-    for k in range(len(cosine)):
-        power *= reflected_power(strengths.reflection[0], cosine[k] * length / total)
-    if bounces > 0:
-        power *= reflected_power(strengths.reflection[0], height / total) ** bounces
-    return power
+    sine, slope, field = length / total, height / total, (1.0, 0.0, 1.0)
+    for k in range(count):
+        field = at_wall(largest, cosine[k], sine, slope, field)
+    return (wavelength / (4.0 * np.pi * total) * at_flats(largest, slope, bounces, field)) ** 2
 
 
 @njit(cache=True)
@@ -173,12 +184,12 @@ def can_bounce(bounces, first, room):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def unfold(beams, node, all_walls, target, walls, points):  # type: ignore[no-untyped-def]
+def unfold(parent, segment, source, node, all_walls, target, walls, points):  # type: ignore[no-untyped-def]
     """Write the walls of one pair, and where each reflects: (x, y, fraction of the path's length), in path order.
 
-    Returns the number of reflections, the length in the plan and whether all points exist.
+    The first arguments are columns of `Beams`. Returns the number of reflections, the length in the plan and whether
+    all points exist.
     """
-    parent, segment, source = beams.parent, beams.segment, beams.source
     k, above = 0, node
     while parent[above] >= 0:
         k, above = k + 1, parent[above]
