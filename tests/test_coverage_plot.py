@@ -158,7 +158,7 @@ def test_several_transmitters_have_a_row_each(coverage, several):
         np.testing.assert_array_equal(at_receivers(row[1], one), expected)
         assert [star.get_xdata()[0] for star in row[1].lines] == [one["tx_x"]]
         assert row[1].images[0].get_clim() == (-150, -60)
-    assert figure.get_suptitle() == "Coverage: 2 transmitters, 28 GHz"
+    assert figure.get_suptitle() == "Coverage: 2 transmitters, 28 GHz, opaque walls"
     assert legend(figure) == legend(plot_coverage(coverage))
 
 
