@@ -220,7 +220,8 @@ class TraceSettings(Checked):
         Whether a wall of a floor plan diffracts also where it ends because observation did.
     power_tolerance_db : float
         By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
-        every path. Bounds of the power of all candidates, before any is verified, guarantee it.
+        every path. The power of all candidates is computed before any is verified, and is at least what Sionna RT finds
+        but for rounding.
     refraction : bool or None
         Whether paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
         below. On meshes such paths are found by shooting rays.
