@@ -29,9 +29,9 @@ def tx(maps):
 
 
 def half_open(cell):
-    """A room of 6 x 6 m in walls, the last row of its cells of one kind, and a row of unknown cells beyond the wall."""
+    """A room of 6 x 6 m in walls, a third of its cells of one kind, and rows of unknown cells beyond the wall."""
     state = np.pad(np.zeros((60, 60), dtype=np.uint8), 1, constant_values=sp.CellState.WALL)
-    state[60, 1:61] = cell
+    state[41:61, 1:61] = cell
     return sp.PartialMap(np.pad(state, ((0, 20), (0, 0)), constant_values=sp.CellState.UNKNOWN), 0.1)
 
 

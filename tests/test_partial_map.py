@@ -273,3 +273,36 @@ def test_mesh_is_compared() -> None:
 def test_mesh_of_another_kind() -> None:
     with pytest.raises(MapError, match=r"mesh is of type str: give a SceneMesh, or None for a plan\."):
         replace(PLAN, mesh="room.ply")  # type: ignore[arg-type]
+
+
+def furnished() -> np.ndarray:
+    """A room of 4 m x 4 m, cells of 10 cm, with a cabinet: 80 x 50 cm that nobody saw, behind a slit of one cell."""
+    state = np.full((60, 60), UNKNOWN)
+    state[9:51, 9:51] = WALL
+    state[10:50, 10:50] = FREE
+    state[20:27, 20:30] = WALL
+    state[21:26, 21:29] = UNKNOWN
+    state[20, 24] = FREE
+    return state
+
+
+@pytest.mark.parametrize(
+    ("where", "kind", "nearly"),
+    [
+        (np.s_[0:0, 0:0], FREE, True),
+        (np.s_[21:40, 21:29], UNKNOWN, True),  # the cabinet is open, no disc of 60 cm fits in
+        (np.s_[24:45, 24:45], UNKNOWN, False),
+        (np.s_[49:52, 30:34], FREE, True),  # a slit in the outer wall
+        (np.s_[49:60, 30:34], FREE, False),  # through which a robot has seen what is free outside
+        (np.s_[49:52, 30:40], FREE, False),
+        (np.s_[49:60, 30:40], FREE, False),
+        (np.s_[:, :], FREE, False),
+    ],
+)
+def test_is_nearly_complete(where: tuple[slice, slice], kind: int, nearly: bool) -> None:
+    state = furnished()
+    state[where] = kind
+    partial = PartialMap(state, 0.1)
+    assert not partial.is_complete
+    assert partial.is_nearly_complete == nearly
+    assert PartialMap(state[::-1].T, 0.1).is_nearly_complete == nearly

@@ -10,7 +10,9 @@ import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.evaluation.evaluate import WITH_INDOOR, Evaluation
-from sionna_partial.prediction.map_networks import LEAST_NOISE, SEEN_WIDENING, WIDENING
+from sionna_partial.prediction.features import LEAST_NOISE
+from sionna_partial.prediction.map_networks import SEEN_WIDENING, WIDENING
+from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.resources import scenes_folder
 
 pytestmark = QUIET
@@ -79,3 +81,31 @@ def test_seen_links_are_right_at_any_frequency(name: str, frequency_hz: float) -
     seen = (coverage.partial_link_state == sp.LinkState.LOS) & (coverage.unobserved_distance_m == 0.0)
     error_db = (coverage.gain_los_mean_db - coverage.partial_gain_db).where(seen & coverage.observed)
     assert abs(error_db).max() < 0.5
+
+
+CABINET = (slice(20, 24), slice(20, 24))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5, 1.0])
+def test_on_a_nearly_complete_map_the_trace_counts_with_its_errors(noise: float) -> None:
+    """Both ends seen, the mean is close to the trace, and never certain; otherwise the networks predict alone."""
+    state = np.full((50, 80), sp.CellState.WALL)
+    state[1:-1, 1:-1] = sp.CellState.FREE
+    state[CABINET] = sp.CellState.UNKNOWN
+    state[1:38, 40:42] = sp.CellState.WALL
+    partial = sp.PartialMap(state, 0.1)
+    vars(partial)["wall_noise"] = noise
+    rx_m = [(1.0, 4.5, 1.5), (6.0, 1.0, 1.5), (7.5, 4.8, 1.5), (7.9, 0.4, 1.5), (2.2, 2.2, 1.5)]
+    phi = sp.link_features(partial, sp.trace_links(partial, (1.0, 1.0, 1.5), rx_m))
+    assert phi.context.nearly_complete.tolist() == [True, True, True, True, False]
+    alone = replace(phi, context=replace(phi.context, nearly_complete=np.zeros(5, dtype=bool)))
+    ours, networks = (sp.Predictor.load().predict(each) for each in (phi, alone))
+    np.testing.assert_allclose(ours.p_los + ours.p_nlos + ours.p_outage, 1.0)
+    assert (ours.gain_std_db[:4] > 0.1).all()
+    assert ours.gain_mean_db[4] == networks.gain_mean_db[4]
+    if noise == 0.0:
+        assert (abs(ours.gain_mean_db - phi.gain_db)[:4] < 3.0).all()
+        assert (ours.gain_std_db[:4] < 8.0).all()
+    exact = LinkPrediction.of_nearly_complete(replace(phi, context=replace(phi.context, wall_noise=np.zeros(5))), 28e9)
+    rough = LinkPrediction.of_nearly_complete(phi, 28e9)
+    assert (rough.gain_std_db >= exact.gain_std_db).all()

@@ -2,7 +2,7 @@
 
 Paths and their derivatives come from `tracing`, a `tf.custom_gradient` hands both to TensorFlow, and everything from
 there on, features and networks, is TensorFlow. At the position where links were traced the distribution is that of
-`Predictor.predict`.
+`Predictor.predict`; on a nearly complete map it is that of the networks alone.
 
 What gradients include, and what they do not:
 

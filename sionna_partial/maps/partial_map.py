@@ -1,6 +1,7 @@
 """PartialMap: what has been observed of a floor plan, cell by cell."""
 
 import itertools
+import math
 import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -26,6 +27,9 @@ MAX_INTERIOR_CELLS = 2**53
 
 ODD_CELLS = 1000
 """Number of cells from which a map has free and wall cells."""
+
+ROOM_M, BODY_M = 0.6, 0.3
+"""Radius of the largest disc in an unknown region from which it may be a room, and of what gets into one [m]."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
@@ -135,6 +139,15 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         out of a larger one. A map without free cells is not complete.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
+
+    @cached_property
+    def is_nearly_complete(self) -> bool:
+        """Whether no unknown room can be entered: unknown are pockets in furniture, shelves and thick walls alone.
+
+        An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
+        gets into it from free cells without touching a wall. Meshes are never nearly complete.
+        """
+        return self.is_complete or (self.mesh is None and not _has_unknown_room(self.state, self.resolution_m))
 
     @cached_property
     def wall_noise(self) -> float:
@@ -260,6 +273,22 @@ def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
     step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(step == 1)
     return row, start, np.nonzero(step == -1)[1]
+
+
+def _has_unknown_room(state: States, resolution_m: float) -> bool:
+    """Whether there is an unknown region as in `PartialMap.is_nearly_complete`, or there are no walls."""
+    state = np.pad(state, math.ceil(BODY_M / resolution_m) + 1, constant_values=CellState.UNKNOWN)
+    unknown, opened = state == CellState.UNKNOWN, state != CellState.WALL
+    if opened.all():
+        return True
+    clear = ndimage.distance_transform_edt(opened) * resolution_m > BODY_M
+    parts, count = ndimage.label(clear, np.ones((3, 3), dtype=bool))
+    from_free = np.zeros(count + 1, dtype=bool)
+    from_free[parts[clear & (state == CellState.FREE)]] = True
+    regions, _ = ndimage.label(unknown)
+    entered = np.unique(regions[unknown & from_free[parts]])
+    radii_m = ndimage.maximum(ndimage.distance_transform_edt(unknown), regions, entered) * resolution_m
+    return bool(((entered == regions[0, 0]) | (radii_m >= ROOM_M)).any())
 
 
 def frontier_cells(state: States) -> Bools:

@@ -64,6 +64,8 @@ class LinkContext(Shown):
         Whether they are in observed cells.
     complete : (N,) bool array
         Whether the map is complete, and one of the ends is in an observed cell: then the trace is the truth.
+    nearly_complete : (N,) bool array
+        Whether the map is nearly complete, and both ends are in observed cells: then the trace is close to the truth.
     walled_m : (N,) float64 array
         Length of the direct line in cells of known walls [m]: outlines of walls may leave them open.
     wall_noise : (N,) float64 array
@@ -86,6 +88,7 @@ class LinkContext(Shown):
     tx_seen: Bools
     rx_seen: Bools
     complete: Bools
+    nearly_complete: Bools
     walled_m: Floats
     wall_noise: Floats
     possible: Bools
@@ -116,18 +119,19 @@ class LinkContext(Shown):
         `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`.
         """
         count = len(map_index)
-        tx_seen, rx_seen, complete = (np.zeros(count, dtype=bool) for _ in range(3))
+        tx_seen, rx_seen, complete, nearly = (np.zeros(count, dtype=bool) for _ in range(4))
         walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
         for number in np.unique(map_index):
             here, partial = map_index == number, maps[number]
             ends = tx_m[here], rx_m[here]
             tx_seen[here], rx_seen[here] = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in ends)
             complete[here] = is_enclosed(partial, *ends)
+            nearly[here] = tx_seen[here] & rx_seen[here] & partial.is_nearly_complete
             walled_m[here] = walled_lengths_m(partial, *ends)
             wall_noise[here] = 0.0 if complete[here].all() else partial.wall_noise
             seen = unobserved_distance_m[here] == 0.0
             possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
-        found = (tx_seen, rx_seen, complete, walled_m, wall_noise, possible)
+        found = (tx_seen, rx_seen, complete, nearly, walled_m, wall_noise, possible)
         _, window_index = transmitters(map_index, tx_m)
         return cls(tx_m, rx_m, *found, indirect_gain_db, strongest_unobserved_m, window_index)
 
@@ -410,6 +414,11 @@ class LinkFeatures(Shown):
 
 
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in ("context", "frequency_hz"))
+
+
+def excess_noise(wall_noise: Floats) -> Floats:
+    """Return how much of the noise of walls is more than that of exact maps, 0 to 1."""
+    return np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE)
 
 
 def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:

@@ -21,7 +21,7 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import LEAST_NOISE, LinkContext, LinkFeatures
+from sionna_partial.prediction.features import LinkContext, LinkFeatures, excess_noise
 from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
@@ -214,8 +214,9 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
     `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not possible have probability 0. On maps with
     range noise, which the networks do not notice, standard deviations are larger.
     """
-    noise = np.maximum(context.wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE)
-    widening = 1.0 + noise * np.where(context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING)
+    widening = 1.0 + excess_noise(context.wall_noise) * np.where(
+        context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
+    )
     states = tf.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
     outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
     log_probabilities, gains_db, log_variances = decode(outputs, free_db)

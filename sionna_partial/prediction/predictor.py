@@ -6,7 +6,7 @@ from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,9 +17,11 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states, require_each
+from sionna_partial.prediction.features import LinkFeatures, excess_noise, link_numbers, link_states, require_each
+from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
+    context_of,
     evaluate_context_networks,
     fit_context_networks,
     reads_maps,
@@ -44,6 +46,51 @@ if TYPE_CHECKING:
 
 SHIPPED = ("map", "paper")
 """Their names; the first is the default."""
+
+
+class TraceErrors(NamedTuple):
+    """How the trace of a nearly complete map differs from that of the building.
+
+    The depth of a link is how much weaker than free space it is traced [dB].
+
+    Parameters
+    ----------
+    p_missed, missed_db, missed_std_db : float
+        P(NLOS) of a traced outage, which falls to 1/e of this in `MISSED_RANGE_M`; mean and standard deviation of its
+        gain over that of an outage [dB].
+    p_blocked, blocked_db, blocked_std_db : float
+        P(NLOS) of traced LOS; mean and standard deviation of the change of the gain [dB].
+    p_opened : float
+        P(LOS) of traced NLOS, which falls to 1/e of this in a depth of `OPENED_DB`.
+    p_lost : float
+        P(outage) of traced NLOS, which grows from 0 to this over the depths `LOST_DB`.
+    los_std_db, nlos_std_db, nlos_std_slope, nlos_slope : float
+        Standard deviation of the gain where the link state is as traced, and its growth with the depth; growth of the
+        gain with the depth from the first of `LOST_DB` on.
+    """
+
+    p_missed: float
+    missed_db: float
+    missed_std_db: float
+    p_blocked: float
+    blocked_db: float
+    blocked_std_db: float
+    p_opened: float
+    p_lost: float
+    los_std_db: float
+    nlos_std_db: float
+    nlos_std_slope: float
+    nlos_slope: float
+
+
+EXACT = TraceErrors(0.03, 18.0, 10.0, 0.001, -12.0, 7.0, 0.01, 0.08, 0.2, 2.2, 0.03, 0.0)
+NOISY = TraceErrors(0.35, 25.0, 16.0, 0.02, -12.0, 7.0, 0.75, 0.16, 0.5, 3.5, 0.15, 0.5)
+"""On maps without and with full noise, measured on procedural homes."""
+
+MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
+
+NOISY_TRUST = 0.5
+"""Weight of the trace beside the networks on nearly complete maps of full noise; it is 1 on exact ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +174,31 @@ class LinkPrediction(Shown):
         probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
+    @classmethod
+    def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> "LinkPrediction":
+        """Return the trace on a nearly complete map, with its uncertainty (`TraceErrors`), of links with a context.
+
+        Known walls exclude LOS as everywhere. The regions that they separate do not make outages certain.
+        """
+        context, traced = context_of(phi), phi.link_state
+        exact, noisy = np.array([EXACT, NOISY])[..., None]
+        of = TraceErrors(*(exact + (noisy - exact) * excess_noise(context.wall_noise)))
+        free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
+        depth_db, (low_db, high_db) = np.maximum(free_db - phi.gain_db, 0.0), LOST_DB
+        deep = np.clip((depth_db - low_db) / (high_db - low_db), 0.0, 1.0)
+        cases = [traced == state for state in LinkState]
+        outage = np.select(cases, [1.0 - of.p_missed * np.exp(-phi.distance_m / MISSED_RANGE_M), 0.0, of.p_lost * deep])
+        los = np.select(cases, [0.0, 1.0 - of.p_blocked, of.p_opened * np.exp(-depth_db / OPENED_DB)])
+        los = los * context.possible[:, LinkState.LOS]
+        rise_db = of.nlos_slope * np.maximum(depth_db - low_db, 0.0)
+        nlos_db = phi.gain_db + np.select(cases, [of.missed_db, of.blocked_db, rise_db])
+        spread_db = of.nlos_std_db + of.nlos_std_slope * depth_db
+        nlos_std_db = np.select(cases, [of.missed_std_db, of.blocked_std_db, spread_db])
+        los_db, nothing = np.where(cases[LinkState.LOS], phi.gain_db, free_db), np.zeros_like(free_db)
+        means_db = np.stack([nothing + GAIN_FLOOR_DB, los_db, nlos_db])
+        stds_db = np.stack([nothing, of.los_std_db, nlos_std_db])
+        return cls.of_parts(np.stack([outage, los, 1.0 - outage - los]), np.maximum(means_db, GAIN_FLOOR_DB), stds_db)
+
     def probability_above(self, threshold_db: float) -> Floats:
         """Return the probability (N,) that the path gain exceeds a threshold t [dB], an outage counting -150 dB.
 
@@ -154,13 +226,14 @@ class LinkPrediction(Shown):
 
     @classmethod
     def mixture(cls, parts: Sequence["LinkPrediction"], weights: Floats) -> "LinkPrediction":
-        """Return the mixture of several distributions of the same links, given their weights, which sum to 1."""
+        """Return the mixture of K distributions of the same links, given weights (K,) or (K, N), which sum to 1."""
         if len(parts) == 1:
             return parts[0]
         p_all, means_db, stds_db = (np.stack(each) for each in zip(*(part.by_state for part in parts), strict=True))
-        joint = weights[:, None, None] * p_all
+        weights = weights.reshape(len(parts), 1, -1)
+        joint = weights * p_all
         probabilities = joint.sum(axis=0)
-        fractions = np.where(probabilities > 0.0, joint, weights[:, None, None])
+        fractions = np.where(probabilities > 0.0, joint, weights)
         fractions = fractions / fractions.sum(axis=0)
         mean_db = (fractions * means_db).sum(axis=0)
         variance = (fractions * (stds_db**2 + (means_db - mean_db) ** 2)).sum(axis=0)
@@ -385,8 +458,14 @@ class Predictor(Shown):
             return LinkPrediction.of_parts(*evaluate_paper(networks, features, self.settings.frequency_hz))
         if self.reads_maps:
             _require_windows(features)
-        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings.frequency_hz))
-        return prediction.where(features.context.complete, LinkPrediction.of_trace(features))
+        frequency_hz, context = self.settings.frequency_hz, context_of(features)
+        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, frequency_hz))
+        if context.nearly_complete.any():
+            traced = LinkPrediction.of_nearly_complete(features, frequency_hz)
+            trust = 1.0 - (1.0 - NOISY_TRUST) * excess_noise(context.wall_noise)
+            mixed = LinkPrediction.mixture([traced, prediction], np.stack([trust, 1.0 - trust]))
+            prediction = prediction.where(context.nearly_complete, mixed)
+        return prediction.where(context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
         """Predict the probability that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
