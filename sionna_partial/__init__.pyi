@@ -25,6 +25,8 @@ from sionna_partial.export import load_coverage as load_coverage
 from sionna_partial.export import save_coverage as save_coverage
 from sionna_partial.export import save_network as save_network
 from sionna_partial.link_model import LinkModel as LinkModel
+from sionna_partial.live.coverage import LiveCoverage as LiveCoverage
+from sionna_partial.live.coverage import LiveSettings as LiveSettings
 from sionna_partial.maps.bags import map_from_bag as map_from_bag
 from sionna_partial.maps.bags import map_from_occupancy as map_from_occupancy
 from sionna_partial.maps.drawings import map_from_drawing as map_from_drawing

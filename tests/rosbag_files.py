@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
@@ -39,11 +40,13 @@ class Messages:
         turn = self.new("geometry_msgs/Quaternion", 0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
         return self.new("geometry_msgs/Pose", point, turn)
 
-    def grid(self, cells: Sequence[Sequence[int]], origin: tuple[float, float, float] = (1.0, 2.0, 0.0)) -> Any:
-        """A map with cells of 0.5 m."""
+    def grid(
+        self, cells: ArrayLike, origin: tuple[float, float, float] = (1.0, 2.0, 0.0), resolution_m: float = 0.5
+    ) -> Any:
+        """A map."""
         data, header = np.array(cells, dtype=np.int8), self.header(START_S, "map")
         ny, nx = data.shape
-        info = self.new("nav_msgs/MapMetaData", header.stamp, 0.5, nx, ny, self.pose(*origin))
+        info = self.new("nav_msgs/MapMetaData", header.stamp, resolution_m, nx, ny, self.pose(*origin))
         return self.new("nav_msgs/OccupancyGrid", header, info, data.ravel())
 
     def pose_stamped(self, time_s: float, x: float, y: float, yaw: float, frame: str = "map") -> Any:

@@ -52,6 +52,7 @@ ROOMS = {
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
     "exploration": ("next_views", "explore"),
+    "live": ("coverage", "topics", "bags"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training", "path_training"),

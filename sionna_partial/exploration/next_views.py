@@ -154,6 +154,10 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         """Return a pose, 0 being the best."""
         return self.views[index]
 
+    def poses(self) -> list[dict[str, dict[str, float]]]:
+        """Return the poses as `geometry_msgs/Pose`, in nested dictionaries."""
+        return [_pose(view) for view in self]
+
     def to_yaml(self) -> str:
         """Return the poses as YAML: `header` and `poses` of a geometry_msgs/PoseArray, and what is expected of each.
 
@@ -168,7 +172,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         expected = ("heading_deg", "path_length_m", "gain", "gain_per_m")
         record = {
             "header": {"frame_id": "map"},
-            "poses": [_pose(view) for view in self],
+            "poses": self.poses(),
             "goal": self.goal,
             "views": [{name: round(float(getattr(view, name)), 3) for name in expected} for view in self],
         }

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import BAG_SUFFIXES, DEFAULT_WALL_HEIGHT_M
@@ -34,16 +34,20 @@ _MCAP_MAGIC, _MCAP_SCHEMA, _MCAP_CHUNK = b"\x89MCAP0\r\n", 3, 6
 MAX_TILT_RAD = 0.01
 """Largest roll and pitch of a map's origin that pass for level [rad]."""
 
+OCCUPIED_PERCENT = 65
+"""Occupancy from which a cell is wall (the default of nav2's map_saver) [percent]."""
+
 GRID = "OccupancyGrid"
 """Type of messages with a map."""
 
 
 class Message(NamedTuple):
-    """A message of a recording: seconds since its start, the header's stamp (None without one), and the content."""
+    """A message of a recording: seconds since its start, the header's stamp (None without one), content and topic."""
 
     time_s: float
     stamp_s: float | None
     content: Any
+    topic: str
 
 
 class Recording:
@@ -76,25 +80,25 @@ class Recording:
 
     def messages(self, *topics: str, until_s: float = math.inf) -> Iterator[Message]:
         """Decode the messages of some topics, in the order in which they were recorded."""
-        for time_s, raw, kind in self.raw(*topics, until_s=until_s):
-            yield self.decoded(time_s, raw, kind)
+        for each in self.raw(*topics, until_s=until_s):
+            yield self.decoded(*each)
 
-    def raw(self, *topics: str, until_s: float = math.inf) -> Iterator[tuple[float, bytes, str]]:
-        """Yield time, bytes and type of messages."""
+    def raw(self, *topics: str, until_s: float = math.inf) -> Iterator[tuple[float, bytes, str, str]]:
+        """Yield time, bytes, type and topic of messages."""
         links = [link for link in self._reader.connections if link.topic in topics]
         start = self._reader.start_time
         stop = None if until_s > self.duration_s else start + round(until_s * 1e9) + 1
         for link, time_ns, raw in self._reader.messages(links, stop=stop) if links else ():
-            yield (time_ns - start) / 1e9, raw, link.msgtype
+            yield (time_ns - start) / 1e9, raw, link.msgtype, link.topic
 
-    def decoded(self, time_s: float, raw: bytes, kind: str) -> Message:
+    def decoded(self, time_s: float, raw: bytes, kind: str, topic: str) -> Message:
         """Decode a message."""
         if len(raw) > MAX_MESSAGE_BYTES:
             size = f"a {kind} of {len(raw):,} bytes, more than {MAX_MESSAGE_BYTES:,}"
             raise self.error(f"path = '{self.path}' holds {size}: record a coarser map.")
         content = self._reader.deserialize(raw, kind)
         stamp = getattr(getattr(content, "header", None), "stamp", None)
-        return Message(time_s, None if stamp is None else stamp.sec + stamp.nanosec / 1e9, content)
+        return Message(time_s, None if stamp is None else stamp.sec + stamp.nanosec / 1e9, content, topic)
 
 
 @contextmanager
@@ -188,7 +192,7 @@ def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time
         for message in recording.raw(name, until_s=limit):
             last = message
         if last is None:
-            first_s = next((time for time, _, _ in recording.raw(name)), math.inf)
+            first_s = next((time for time, *_ in recording.raw(name)), math.inf)
             what = "is empty" if first_s == math.inf else f"has its first map {first_s:g} s after the start"
             given = "" if time_s is None else f" up to time_s = {limit:g}"
             remedy = "name another topic." if first_s == math.inf else "give a later time_s."
@@ -206,7 +210,7 @@ def map_from_occupancy(
     *,
     origin_m: tuple[float, float] | None = None,
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
-    occupied_percent: float = 65,
+    occupied_percent: float = OCCUPIED_PERCENT,
     free_percent: float = 25,
 ) -> PartialMap:
     """Make a map of a ROS `nav_msgs/OccupancyGrid`: of the message itself, or of its array.
@@ -245,10 +249,24 @@ def map_from_occupancy(
     if hasattr(data, "info") and hasattr(data, "data"):
         if resolution_m is not None or origin_m is not None:
             raise MapError("resolution_m and origin_m are those of the message: leave them out.")
-        data, resolution_m, (x, y, yaw) = _message_parts(data)
+        data, resolution_m, (x, y, yaw) = occupancy_parts(data)
         origin_m = (x, y)
     elif resolution_m is None:
         raise MapError("resolution_m is missing: give the edge of a cell in metres, or an OccupancyGrid message.")
+    corner_m = (0.0, 0.0) if origin_m is None else origin_m
+    return map_of_percent(data, resolution_m, corner_m, yaw, wall_height_m, occupied_percent, free_percent)
+
+
+def map_of_percent(
+    data: ArrayLike,
+    resolution_m: float,
+    origin_m: tuple[float, float],
+    yaw: float,
+    wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
+    occupied_percent: float = OCCUPIED_PERCENT,
+    free_percent: float = 25,
+) -> PartialMap:
+    """Make a map of occupancies in percent, x and y of its lower-left corner [m], and its yaw [rad]."""
     values = grid_array("data", data, "iu")
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
@@ -258,13 +276,13 @@ def map_from_occupancy(
         given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
         raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
     state = states_from_percent(values, occupied, free)
-    partial = PartialMap(state, resolution_m, (0.0, 0.0) if origin_m is None else origin_m, wall_height_m)
+    partial = PartialMap(state, resolution_m, origin_m, wall_height_m)
     if not yaw:
         return partial
     return PartialMap(*turn_grid(partial.state, partial.resolution_m, (*partial.origin_m, yaw)), wall_height_m)
 
 
-def _message_parts(message: Any) -> tuple[ArrayLike, float, tuple[float, float, float]]:
+def occupancy_parts(message: Any) -> tuple[NDArray[Any], float, tuple[float, float, float]]:
     """Cells (height, width), their edge, and x, y and yaw of the origin of an OccupancyGrid."""
     try:
         info, origin = message.info, message.info.origin

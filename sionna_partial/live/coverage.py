@@ -1,0 +1,446 @@
+"""LiveCoverage: messages of a robot -> the coverage of its newest map, first coarse and then fine; no transport."""
+
+import functools
+import logging
+import math
+import re
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
+
+from sionna_partial.arrays import Floats
+from sionna_partial.checks import Checked, Within, number_of, real_array, require, settings_or_default, shown
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
+from sionna_partial.coverage_map import probability_above
+from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
+from sionna_partial.exploration.next_views import NextViews, next_views
+from sionna_partial.link_model import LinkModel
+from sionna_partial.maps.bags import OCCUPIED_PERCENT, map_of_percent, occupancy_parts
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.settings import SceneSettings, TraceSettings
+
+COARSER = 4
+"""Distance between the receivers of the first answer, in those of the final one."""
+
+LATE_S = 30.0
+"""A map whose stamp is older than that of the last one by less is late and is dropped; by more, the robot's clock has
+started again [s]."""
+
+POSE_AGE_S = 2.0
+"""Time for which the last pose of the robot counts as where it is [s]."""
+
+POWER_CELL_M = 0.25
+"""Edge of the squares in each of which the newest power of a transmitter is kept [m]."""
+
+MOST_POWERS = 500
+"""Number of powers of a transmitter that are kept, the newest ones."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LiveSettings(Checked):
+    """How live coverage is computed.
+
+    Parameters
+    ----------
+    frame : str
+        Frame in which the transmitters are given and maps are taken; "" is that of the first map.
+    threshold_db : float
+        Path gain up to which a cell counts as not covered [dB].
+    spacing_m, rx_height_m : float
+        Distance between the receivers of the final answer, and their height [m].
+    tx_power_dbm : float
+        Subtracted from measured powers [dBm]; 0 where it is not known: a common offset is estimated.
+    refresh_s : float
+        Shortest time between two answers for one map, as measured powers come in [s].
+    views_every_s : float
+        Time between two lists of next views [s]; 0 lists them on request alone.
+    """
+
+    frame: str = ""
+    threshold_db: Annotated[float, Within(GAIN_FLOOR_DB, 0.0)] = -100.0
+    spacing_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = 0.15
+    rx_height_m: Annotated[float, Within(0.0, 100.0)] = DEFAULT_HEIGHT_M
+    tx_power_dbm: Annotated[float, Within(-200.0, 200.0)] = 0.0
+    refresh_s: Annotated[float, Within(0.1, 1e6)] = 10.0
+    views_every_s: Annotated[float, Within(0.0, 1e6)] = 0.0
+
+
+class LiveGrid(NamedTuple):
+    """The coverage of one transmitter on one map.
+
+    Parameters
+    ----------
+    name : str
+        The transmitter's.
+    map_number : int
+        How many maps had been taken, with this one.
+    is_final : bool
+        False of the coarse answer, true of the fine one.
+    coverage : xarray.Dataset
+        As `predict_map` returns it.
+    cost : (ny, nx) int8 array
+        P(path gain <= threshold) in percent, -1 in walls and where nothing is known; on the cells of the message.
+    header, info : dict
+        Those of the map, as `nav_msgs/OccupancyGrid` has them.
+    age_s : float
+        Time since the map was taken [s].
+    """
+
+    name: str
+    map_number: int
+    is_final: bool
+    coverage: xr.Dataset
+    cost: NDArray[np.int8]
+    header: dict[str, Any]
+    info: dict[str, Any]
+    age_s: float
+
+    def message(self) -> dict[str, Any]:
+        """Return the fields of a `nav_msgs/OccupancyGrid`."""
+        return {"header": self.header, "info": self.info, "data": self.cost.ravel().tolist()}
+
+
+class LiveViews(NamedTuple):
+    """The best next views on one map."""
+
+    views: NextViews
+    header: dict[str, Any]
+
+    def message(self) -> dict[str, Any]:
+        """Return the fields of a `geometry_msgs/PoseArray`."""
+        return {"header": self.header, "poses": self.views.poses()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """An OccupancyGrid that has been checked."""
+
+    percent: NDArray[np.integer[Any]]
+    resolution_m: float
+    origin: tuple[float, float, float]
+    frame: str
+    stamp: tuple[int, int]
+    partial: PartialMap
+    number: int
+    came_s: float
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """What tells maps apart."""
+        return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
+
+    @property
+    def header(self) -> dict[str, Any]:
+        return {"stamp": dict(zip(("sec", "nanosec"), self.stamp, strict=True)), "frame_id": self.frame}
+
+    @property
+    def info(self) -> dict[str, Any]:
+        x, y, yaw = self.origin
+        position, turn = (
+            {"x": x, "y": y, "z": 0.0},
+            {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)},
+        )
+        sizes = {"resolution": self.resolution_m, "width": self.percent.shape[1], "height": self.percent.shape[0]}
+        return {"map_load_time": self.header["stamp"], **sizes, "origin": {"position": position, "orientation": turn}}
+
+    def cost(self, coverage: xr.Dataset, threshold_db: float) -> NDArray[np.int8]:
+        """Return the percentage of outage at the nearest receiver of each cell, -1 in walls and further away."""
+        valid = coverage["valid"].to_numpy() == 1
+        percent = np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db)))
+        apart, nearest = distance_transform_edt(~valid, return_indices=True)
+        known = np.where(valid.any() & (apart < 2.0), percent[tuple(nearest)], -1.0)
+        x, y, yaw = self.origin
+        rows, columns = ((np.arange(n) + 0.5) * self.resolution_m for n in self.percent.shape)
+        x_m = x + math.cos(yaw) * columns - math.sin(yaw) * rows[:, None]
+        y_m = y + math.sin(yaw) * columns + math.cos(yaw) * rows[:, None]
+        at = []
+        for name, each_m in (("y", y_m), ("x", x_m)):
+            index = np.rint((each_m - float(coverage[name][0])) / float(coverage.attrs["spacing_m"])).astype(int)
+            at.append(np.clip(index, 0, coverage.sizes[name] - 1))
+        wall = (self.percent >= OCCUPIED_PERCENT) & (self.percent <= 100)
+        return np.where(wall, -1, np.nan_to_num(known, nan=-1.0)[tuple(at)]).astype(np.int8)
+
+
+def _refusing(method: Callable[..., None]) -> Callable[..., None]:
+    """Log what a message is refused for, whatever it holds: a robot's message never ends the program."""
+
+    @functools.wraps(method)
+    def take(self: "LiveCoverage", *given: Any, **named: Any) -> None:
+        what = method.__name__.removeprefix("on_").replace("_", " ")
+        try:
+            method(self, *given, **named)
+        except SionnaPartialError as error:
+            self.report(f"{what} refused: {error}")
+        except Exception as error:  # messages may hold anything
+            self.report(f"{what} refused: it is ill-formed ({type(error).__name__}: {shown(str(error))}).")
+
+    return take
+
+
+class LiveCoverage:
+    """Coverage that keeps up with the map of a robot, under any transport.
+
+    Messages are taken in any thread; while one map is computed, newer ones replace each other. `run` computes in a
+    thread of its own, `step` in the caller's. Messages that are refused are logged, by name.
+
+    Parameters
+    ----------
+    tx : (3,) array-like, or mapping of names to them
+        Transmitter positions [m], in the frame of the map.
+    publish : callable
+        Takes each `LiveGrid` and `LiveViews`.
+    settings : LiveSettings, optional
+    **model
+        `predictor`, `trace_settings` and `scene_settings` of `LinkModel`.
+
+    Raises
+    ------
+    PositionError, SettingsError
+        For positions that are none, and names that no topic can have.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> from types import SimpleNamespace as Message
+    >>> grids = []
+    >>> live = sp.LiveCoverage((1.5, 1.5, 1.5), grids.append, sp.LiveSettings(spacing_m=0.5))
+    >>> origin = Message(position=Message(x=0.0, y=0.0), orientation=Message(x=0.0, y=0.0, z=0.0, w=1.0))
+    >>> info = Message(resolution=1.0, width=4, height=3, origin=origin)
+    >>> live.on_map(Message(info=info, data=[100, 100, 100, 100, 100, 0, 0, 100, 100, 100, 100, 100]))
+    >>> live.step()
+    True
+    >>> grids[-1].is_final, grids[-1].cost.tolist()
+    (True, [[-1, -1, -1, -1], [-1, 0, 0, -1], [-1, -1, -1, -1]])
+    """
+
+    def __init__(
+        self,
+        tx: ArrayLike | Mapping[str, ArrayLike],
+        publish: Callable[[LiveGrid | LiveViews], None],
+        settings: LiveSettings | None = None,
+        **model: Any,
+    ) -> None:
+        self.settings = settings_or_default("settings", settings, LiveSettings)
+        self.tx_m = _named_positions(tx)
+        self._publish, self._model_settings = publish, model
+        for name, kind in (("trace_settings", TraceSettings), ("scene_settings", SceneSettings)):
+            settings_or_default(name, model.get(name), kind)
+        self._model: LinkModel | None = None
+        self._changed = threading.Condition()
+        self._closed = False
+        self._newest: _Grid | None = None
+        self._waiting: _Grid | None = None
+        self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
+        self.frame = self.settings.frame.lstrip("/")
+        self._pose: tuple[float, float, float] | None = None
+        self._powers: dict[str, dict[tuple[int, int], tuple[float, float, float]]] = {name: {} for name in self.tx_m}
+        self._new_powers, self._views_wanted, self._views_s = False, False, -math.inf
+        self._last_line = ""
+
+    @_refusing
+    def on_map(self, message: Any) -> None:
+        """Take a `nav_msgs/OccupancyGrid`, in place of one that waits."""
+        values, resolution_m, origin = occupancy_parts(message)
+        self._take(message, values, resolution_m, origin)
+
+    @_refusing
+    def on_map_update(self, message: Any) -> None:
+        """Take a `map_msgs/OccupancyGridUpdate` of the newest map."""
+        last = self._newest
+        if last is None:
+            raise MapError("no map has come before it: it is waited for.")
+        x, y, width, height = (int(getattr(message, name)) for name in ("x", "y", "width", "height"))
+        ny, nx = last.percent.shape
+        if min(x, y) < 0 or min(width, height) < 1 or x + width > nx or y + height > ny:
+            raise MapError(f"{width} x {height} cells at ({x}, {y}) are not on the map of {nx} x {ny} cells.")
+        values = last.percent.copy()
+        values[y : y + height, x : x + width] = np.asarray(message.data).reshape(height, width)
+        self._take(message, values, last.resolution_m, last.origin)
+
+    @_refusing
+    def on_pose(self, x_m: float, y_m: float, time_s: float) -> None:
+        """Take the position of the robot in the frame of the map [m], and when it was there [s]."""
+        values = tuple(map(number_of, (x_m, y_m, time_s)))
+        if not all(map(math.isfinite, values)):
+            raise PositionError(f"({shown(x_m)}, {shown(y_m)}) m at {shown(time_s)} s is no position.")
+        self._pose = values  # type: ignore[assignment]
+
+    @_refusing
+    def on_power(self, power_dbm: float, time_s: float, name: str | None = None) -> None:
+        """Take a received power [dBm], or path gain [dB], of a transmitter where the robot is."""
+        name = next(iter(self.tx_m)) if name is None and len(self.tx_m) == 1 else name
+        if name not in self._powers:
+            raise MeasurementError(f"of {shown(name)}: the transmitters are {', '.join(self.tx_m)}.")
+        gain_db, pose = number_of(power_dbm) - self.settings.tx_power_dbm, self._pose
+        if pose is None or not 0.0 <= time_s - pose[2] <= POSE_AGE_S:
+            raise MeasurementError("the robot's position is not known: it is read from the transforms.")
+        z_m = self.settings.rx_height_m
+        if not Measurements(None, [(*pose[:2], z_m)], [gain_db]).is_outage.any():  # type: ignore[arg-type, list-item]
+            with self._changed:
+                kept, cell = self._powers[name], (int(pose[0] // POWER_CELL_M), int(pose[1] // POWER_CELL_M))
+                kept.pop(cell, None)
+                kept[cell] = (*pose[:2], gain_db)
+                for oldest in [*kept][:-MOST_POWERS]:
+                    del kept[oldest]
+                self._new_powers = True
+
+    def request_views(self) -> None:
+        """Ask for the best next views, once."""
+        with self._changed:
+            self._views_wanted = True
+            self._changed.notify_all()
+
+    def run(self) -> None:
+        """Compute what comes, until `close` and nothing waits."""
+        while self.step() or not self._closed:
+            with self._changed:
+                if self._waiting is None and not self._closed:
+                    self._changed.wait(0.2)
+
+    def start(self) -> threading.Thread:
+        """Call `run` in a thread of its own."""
+        thread = threading.Thread(target=self.run, name="live coverage", daemon=True)
+        thread.start()
+        return thread
+
+    def close(self) -> None:
+        """End `run` after what it computes and what waits."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def step(self) -> bool:
+        """Compute and publish for the newest map, if it or its measured powers are new; return whether."""
+        with self._changed:
+            now_s, grid = time.monotonic(), self._waiting
+            if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
+                grid = self._newest
+            self._waiting, every_s = None, self.settings.views_every_s
+            views = self._newest is not None and (self._views_wanted or 0.0 < every_s <= now_s - self._views_s)
+        if grid is not None:
+            self._new_powers = False
+            self._guarded("map", self._compute, grid)
+            self._stepped_s = time.monotonic()
+        if views and self._model is not None:
+            self._views_wanted, self._views_s = False, now_s
+            self._guarded("next views", self._compute_views)
+        return grid is not None or views
+
+    def report(self, line: str) -> None:
+        """Log what was refused, and nothing where that is repeated."""
+        if line != self._last_line:
+            self._last_line = line
+            _log.warning("%s", line)
+
+    def _take(
+        self, message: Any, values: NDArray[Any], resolution_m: float, origin: tuple[float, float, float]
+    ) -> None:
+        """Check a map, and let it wait in place of an older one, unless it is the same as the newest."""
+        frame, stamp = _frame_and_stamp(message)
+        if self.frame and frame != self.frame:
+            raise MapError(f"frame_id = {shown(frame)}: the transmitters are given in {shown(self.frame)}.")
+        last = self._newest
+        age_s = 0.0 if last is None or not any(stamp) else _seconds(last.stamp) - _seconds(stamp)
+        if 0.0 < age_s < LATE_S:
+            raise MapError(f"it is {age_s:.2f} s older than the last one.")
+        partial = map_of_percent(values, resolution_m, origin[:2], origin[2])
+        number = 1 if last is None else last.number + 1
+        grid = _Grid(values.astype(np.int16), resolution_m, origin, frame, stamp, partial, number, time.monotonic())
+        if last is None or grid.key != last.key:
+            with self._changed:
+                self.frame, self._newest, self._waiting = frame, grid, grid
+                self._changed.notify_all()
+
+    def _guarded(self, what: str, compute: Callable[..., None], *given: Any) -> None:
+        try:
+            compute(*given)
+        except (SionnaPartialError, OSError, MemoryError) as error:
+            self.report(f"{what} not answered: {error}")
+
+    def _compute(self, grid: _Grid) -> None:
+        if self._model is None:
+            self._model = LinkModel(grid.partial, **self._model_settings)
+        self._model.update(grid.partial)
+        spacing_m = self.settings.spacing_m
+        if grid.number != self._answered:
+            self._each(grid, COARSER * spacing_m)
+        self._answered = grid.number
+        self._gave_way = self._waiting is not None and not self._gave_way
+        if not self._gave_way:  # else a newer map comes first; once, so that there is a fine answer now and then
+            self._each(grid, spacing_m)
+
+    def _each(self, grid: _Grid, spacing_m: float) -> None:
+        for name, tx_m in self.tx_m.items():
+            self._guarded(f"map for {name}", self._answer, grid, name, tx_m, spacing_m)
+
+    def _answer(self, grid: _Grid, name: str, tx_m: Floats, spacing_m: float) -> None:
+        assert self._model is not None
+        height_m = self.settings.rx_height_m
+        measured = self._measured(name)
+        coverage = self._model.coverage(tx_m, spacing_m=spacing_m, rx_height_m=height_m, measurements=measured)
+        cost, is_final = grid.cost(coverage, self.settings.threshold_db), spacing_m == self.settings.spacing_m
+        age_s = time.monotonic() - grid.came_s
+        self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, grid.header, grid.info, age_s))
+
+    def _measured(self, name: str) -> Measurements | None:
+        """Return the powers that were measured of a transmitter where no wall is mapped now."""
+        with self._changed:
+            rows = np.array([*self._powers[name].values()]).reshape(-1, 3)
+        if not len(rows):
+            return None
+        assert self._model is not None
+        rx_m = np.column_stack([rows[:, :2], np.full(len(rows), self.settings.rx_height_m)])
+        usable = self._model.partial.radios_can_stand(rx_m)
+        tx_m = self.tx_m[name]
+        return Measurements(tx_m, rx_m[usable], rows[usable, 2]) if usable.any() else None
+
+    def _compute_views(self) -> None:
+        assert self._model is not None
+        grid = self._newest
+        assert grid is not None
+        tx_m = np.stack([*self.tx_m.values()])
+        start = None if self._pose is None else self._pose[:2]
+        views = next_views(self._model, tx_m, start=start, threshold_db=self.settings.threshold_db)
+        self._publish(LiveViews(views, grid.header))
+
+
+def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Floats]:
+    """Transmitters by name [m]; a single one is "tx"."""
+    given = tx if isinstance(tx, Mapping) else {"tx": tx}
+    require(bool(given), "tx", tx, "give at least one transmitter.")
+    found = {}
+    for name, position in given.items():
+        if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,60}", name)):
+            raise SettingsError(f"tx has the name {shown(name)}: give a letter, then letters, digits or _.")
+        values = real_array(f"tx {name}", position, PositionError, "give x, y and z in metres.").astype(np.float64)
+        if values.shape == (2,):
+            values = np.append(values, DEFAULT_HEIGHT_M)
+        if values.shape != (3,) or not np.isfinite(values).all():
+            raise PositionError(f"tx {name} = {shown(position)} is no position: give x, y and z in metres.")
+        found[name] = values
+    return found
+
+
+def _frame_and_stamp(message: Any) -> tuple[str, tuple[int, int]]:
+    """Frame of a message, as "map", and its stamp as seconds and nanoseconds; both may be missing."""
+    header = getattr(message, "header", None)
+    stamp = getattr(header, "stamp", None)
+    seconds, nanoseconds = (
+        next((int(getattr(stamp, name)) for name in names if hasattr(stamp, name)), 0)
+        for names in (("sec", "secs"), ("nanosec", "nsecs"))
+    )
+    return str(getattr(header, "frame_id", "")).lstrip("/"), (seconds, nanoseconds)
+
+
+def _seconds(stamp: tuple[int, int]) -> float:
+    return stamp[0] + stamp[1] / 1e9

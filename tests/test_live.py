@@ -1,0 +1,292 @@
+"""LiveCoverage: newest map first, coarse and then fine, and nothing that a robot sends ends it."""
+
+import logging
+import math
+from pathlib import Path
+from types import SimpleNamespace as Fields
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbag_files import Messages, write_bag
+
+import sionna_partial as sp
+from sionna_partial.live.bags import replay
+from sionna_partial.live.coverage import LiveGrid, LiveViews
+from sionna_partial.live.topics import Listener, Topics
+
+ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
+TX = (1.5, 1.5, 1.5)
+
+
+def message(cells: Any = ROOM, *, yaw: float = 0.0, at: tuple[float, float] = (0.0, 0.0), **header: Any) -> Fields:
+    data = np.array(cells)
+    turn = Fields(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+    origin = Fields(position=Fields(x=at[0], y=at[1], z=0.0), orientation=turn)
+    info = Fields(width=data.shape[1], height=data.shape[0], resolution=1.0, origin=origin)
+    stamp = Fields(sec=header.get("sec", 0), nanosec=0)
+    return Fields(header=Fields(stamp=stamp, frame_id=header.get("frame", "map")), info=info, data=data.ravel())
+
+
+class Heard(list[Any]):
+    """A live coverage, and what it published."""
+
+    def __init__(self, tx: Any = TX, **settings: Any) -> None:
+        self.live = sp.LiveCoverage(tx, self.append, sp.LiveSettings(**{"spacing_m": 0.2, **settings}))
+
+    def step(self) -> list[tuple[int, bool]]:
+        self.clear()
+        self.live.step()
+        return [(each.map_number, each.is_final) for each in self if isinstance(each, LiveGrid)]
+
+
+def grown(cells: Any = ROOM) -> list[list[int]]:
+    return [[100 if value == -1 else value for value in row] for row in cells]
+
+
+class TestOrder:
+    def test_coarse_then_fine_as_predict_map(self) -> None:
+        heard = Heard()
+        heard.live.on_map(message())
+        assert heard.step() == [(1, False), (1, True)]
+        assert heard[0].coverage.attrs["spacing_m"] == 0.8
+        expected = sp.predict_map(sp.map_from_occupancy(message()), TX, spacing_m=0.2)
+        assert heard[-1].coverage.identical(expected)
+        assert heard.step() == []
+
+    def test_queue_of_one(self) -> None:
+        heard = Heard()
+        for cells in (ROOM, grown(), ROOM[::-1]):
+            heard.live.on_map(message(cells))
+        assert heard.step() == [(3, False), (3, True)]
+
+    def test_newer_map_comes_before_a_fine_answer_but_not_forever(self) -> None:
+        heard, rooms = Heard(), [ROOM, grown(), ROOM, grown()]
+        heard.live.on_map(message(rooms[0]))
+        published = heard.live._publish
+
+        def publish(answer: LiveGrid) -> None:  # while the coarse answer is computed the next map comes
+            published(answer)
+            if not answer.is_final and answer.map_number < len(rooms):
+                heard.live.on_map(message(rooms[answer.map_number]))
+
+        heard.live._publish = publish  # type: ignore[assignment]
+        assert [heard.step() for _ in rooms] == [
+            [(1, False)],
+            [(2, False), (2, True)],
+            [(3, False)],
+            [(4, False), (4, True)],
+        ]
+
+    def test_the_same_map_again_is_not_computed(self) -> None:
+        heard = Heard()
+        heard.live.on_map(message(sec=5))
+        heard.step()
+        heard.live.on_map(message(sec=6))
+        assert heard.step() == []
+
+    def test_thread_finishes_what_waits(self) -> None:
+        heard = Heard()
+        thread = heard.live.start()
+        heard.live.on_map(message())
+        heard.live.close()
+        thread.join(60)
+        assert heard[-1].is_final
+
+
+class TestMaps:
+    def test_costs_lie_on_the_cells_of_the_message(self) -> None:
+        heard = Heard(threshold_db=-60.0)
+        heard.live.on_map(message(grown()))
+        heard.step()
+        cost, sent = heard[-1].cost, heard[-1].message()
+        assert cost.shape == (4, 5)
+        assert (cost == -1).tolist() == (np.array(grown()) == 100).tolist()
+        assert (sent["info"]["width"], sent["info"]["height"], len(sent["data"])) == (5, 4, 20)
+
+    @pytest.mark.parametrize("yaw", [0.0, 0.5, math.pi / 2, -2.5])
+    def test_costs_of_turned_maps_are_those_at_the_cells(self, yaw: float) -> None:
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        heard = Heard((*turn @ TX[:2], 1.5), threshold_db=-62.0)
+        heard.live.on_map(message(grown(), yaw=yaw))
+        heard.step()
+        p_above = heard[-1].coverage.radio.probability_above(-62.0)
+        for row, column in np.argwhere(np.array(grown()) == 0):
+            x, y = turn @ (column + 0.5, row + 0.5)
+            expected = 100.0 * (1.0 - float(p_above.sel(x=x, y=y, method="nearest")))
+            at_transmitter = bool(np.isnan(expected))  # where the nearest receiver counts
+            assert at_transmitter or heard[-1].cost[row, column] == pytest.approx(expected, abs=0.51)
+        assert {0, 100} <= {*heard[-1].cost.ravel().tolist()}
+
+    def test_map_shrinks_and_moves(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        heard.live.on_map(message(np.pad(np.array(ROOM), 3, constant_values=-1), at=(-3.0, -3.0)))
+        assert len(heard.step()) == 2
+        heard.live.on_map(message())
+        assert heard.step() == [(2, False), (2, True)]
+        heard.live.on_map(message(at=(50.0, 50.0)))
+        assert heard.step() == []
+        assert "map for tx not answered: tx = (1.5, 1.5, 1.5) is outside the map" in caplog.text
+
+    def test_update(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        update = Fields(header=message().header, x=4, y=1, width=1, height=2, data=[100, 100])
+        heard.live.on_map_update(update)
+        heard.live.on_map(message())
+        heard.live.on_map_update(update)
+        assert heard.step() == [(2, False), (2, True)]
+        assert heard[-1].coverage.attrs["map_complete"] == 1
+        for faulty in (Fields(**{**vars(update), "x": 5}), Fields(**{**vars(update), "data": [100]}), Fields()):
+            heard.live.on_map_update(faulty)
+        assert heard.step() == []
+        assert "no map has come before it" in caplog.text
+        assert "1 x 2 cells at (5, 1) are not on the map of 5 x 4 cells" in caplog.text
+
+    @pytest.mark.parametrize(
+        ("faulty", "line"),
+        [
+            (message(frame="odom"), "frame_id = 'odom': the transmitters are given in 'map'"),
+            (message(sec=99), "it is 1.00 s older than the last one"),
+            (message([[100, 7, 120]]), "data holds 120"),
+            (message(yaw=math.nan), "is not level"),
+            (message(at=(math.nan, 0.0)), "origin_m"),
+            (Fields(**{**vars(message(grown())), "data": [0] * 7}), "7 values for 4 x 5 cells"),
+            (Fields(info=None, data=None), "data is no OccupancyGrid"),
+            (None, "data is no OccupancyGrid"),
+        ],
+    )
+    def test_refused_by_name(self, faulty: Any, line: str, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        heard.live.on_map(message(sec=100))
+        heard.step()
+        heard.live.on_map(faulty)
+        assert heard.step() == []
+        assert line in caplog.text
+
+    def test_clock_that_starts_again_is_a_restart(self) -> None:
+        heard = Heard()
+        heard.live.on_map(message(sec=1000))
+        heard.live.on_map(message(grown(), sec=3))
+        assert heard.step() == [(2, False), (2, True)]
+
+
+class TestTransmitters:
+    def test_by_name(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard({"desk": TX, "door": (3.4, 2.4, 2.0), "far": (90.0, 1.0, 1.0)})
+        heard.live.on_map(message())
+        heard.step()
+        assert [each.name for each in heard] == ["desk", "door"] * 2
+        assert "map for far not answered" in caplog.text
+
+    @pytest.mark.parametrize("tx", [(1.0, math.nan, 1.0), (1.0,), {}, {"a b": TX}, {"/up": TX}, "here"])
+    def test_refused(self, tx: Any) -> None:
+        with pytest.raises(sp.SionnaPartialError, match="tx"):
+            sp.LiveCoverage(tx, print)
+
+    def test_powers(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard(refresh_s=0.1)
+        heard.live.on_power(-60.0, 1.0)
+        heard.live.on_map(message(grown()))
+        heard.step()
+        for faulty in ((math.nan, 1.0, 1.0), (None, 1.0, 1.0)):
+            heard.live.on_pose(*faulty)
+        heard.live.on_pose(3.2, 2.2, 10.0)
+        heard.live.on_power(math.nan, 10.0)
+        heard.live.on_power(-60.0, 10.0, "other")
+        heard.live.on_power(-60.0, 99.0)
+        heard.live._stepped_s = -math.inf
+        assert heard.step() == []
+        heard.live.on_power(-60.0, 10.5)
+        assert heard.step() == [(1, True)]
+        assert heard[-1].coverage.attrs["measured_links"] == 1
+        for line in ("the robot's position is not known", "is no position", "the transmitters are tx"):
+            assert line in caplog.text
+
+
+class TestListener:
+    @staticmethod
+    def transform(parent: str, child: str, x: float, yaw: float = 0.0) -> Fields:
+        turn = Fields(x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2))
+        transform = Fields(translation=Fields(x=x, y=0.0, z=0.0), rotation=turn)
+        return Fields(header=Fields(frame_id=parent), child_frame_id=child, transform=transform)
+
+    def test_pose_from_transforms(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        listener = Listener(heard.live, Topics())
+        listener.take("/map", message())
+        links = [self.transform("/map", "odom", 2.0, math.pi / 2), self.transform("odom", "base_link", 1.0)]
+        listener.take("/tf_static", Fields(transforms=links[:1]))
+        listener.take("/tf", Fields(transforms=links[1:]), 7.0)
+        assert heard.live._pose == pytest.approx((2.0, 1.0, 7.0))
+        cycle = [self.transform("base_link", "odom", math.inf), self.transform("base_link", "odom", 0.0)]
+        for each in cycle:
+            listener.take("/tf", Fields(transforms=[each]))
+        listener.take("/tf", Fields())
+        assert heard.live._pose[2] == 7.0  # type: ignore[index]
+        assert "is not finite" in caplog.text
+
+    def test_powers_and_views(self) -> None:
+        heard = Heard({"desk": (5.5, 5.5, 1.5), "door": (9.4, 9.4, 2.0)})
+        listener = Listener(heard.live, Topics(powers={"/rssi": "door"}, key_values="/wifi"))
+        listener.take("/map", message(np.kron(ROOM, np.ones((4, 4), dtype=int))))
+        heard.step()
+        heard.live.on_pose(6.5, 6.5, 1.0)
+        listener.take("/rssi", Fields(data=-60.0), 1.0)
+        listener.take("/wifi", Fields(key="desk", value="-50.5"), 1.0)
+        listener.take("/wifi", Fields(key="desk", value="loud"), 1.0)
+        assert {name: next(iter(each.values()))[2] for name, each in heard.live._powers.items()} == {
+            "desk": -50.5,
+            "door": -60.0,
+        }
+        listener.take("/radio/request_views", Fields())
+        heard.step()
+        assert isinstance(heard[0], LiveViews)
+        assert [*heard[0].message()["poses"][0]] == ["position", "orientation"]
+        assert listener.topics.topic_of(heard[0]) == "/radio/next_views"
+
+
+class TestRecordings:
+    def test_200_steps_with_a_restart_end_as_predict_map(self, tmp_path: Path) -> None:
+        home, make = sp.make_home(3), Messages(2)
+        seen = [each for seed in (0, 1) for each in sp.explore(home, steps=range(1, 101), seed=seed)]
+        percent = np.array([0, 100, -1])  # of FREE, WALL and UNKNOWN
+        x, y = home.origin_m
+        grids = [make.grid(percent[each.state], (x, y, 0.0), home.resolution_m) for each in seen]
+        path = write_bag(tmp_path / "drive_mcap", [("/map", float(at), grid) for at, grid in enumerate(grids)])
+        row, column = np.argwhere(seen[-1].state == sp.CellState.FREE)[0]
+        tx = (x + (column + 0.5) * home.resolution_m, y + (row + 0.5) * home.resolution_m, 1.5)
+        heard = Heard(tx, spacing_m=0.5)
+        thread = heard.live.start()
+        replay(Listener(heard.live, Topics()), path, rate=math.inf)
+        heard.live.close()
+        thread.join(100)
+        numbers = [each.map_number for each in heard]
+        assert numbers == sorted(numbers)
+        assert heard[-1].is_final
+        expected = sp.predict_map(sp.map_from_bag(path), tx, spacing_m=0.5)
+        sp.save_coverage(expected, tmp_path / "expected.nc")
+        sp.save_coverage(heard[-1].coverage, tmp_path / "heard.nc")
+        assert (tmp_path / "heard.nc").read_bytes() == (tmp_path / "expected.nc").read_bytes()
+
+    def test_each_map_is_waited_for(self, tmp_path: Path) -> None:
+        make = Messages(2)
+        rows = [
+            ("/map", 1.0, make.grid(ROOM, (0.0, 0.0, 0.0), 1.0)),
+            ("/map", 2.0, make.grid(grown(), resolution_m=1.0)),
+        ]
+        heard = Heard((2.5, 3.5, 1.5))
+        replay(Listener(heard.live, Topics()), write_bag(tmp_path / "drive_mcap", rows))
+        assert [(each.map_number, each.is_final) for each in heard] == [(2, False), (2, True)]
+
+    def test_no_map(self, tmp_path: Path) -> None:
+        path = write_bag(tmp_path / "drive_mcap", [("/other", 0.0, Messages(2).grid(ROOM))])
+        with pytest.raises(sp.SionnaPartialError, match="name one of its topics: /other"):
+            replay(Listener(Heard().live, Topics()), path)
+
+
+def test_lines_are_not_repeated(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    heard = Heard()
+    for _ in range(5):
+        heard.live.on_pose(math.nan, 0.0, 0.0)
+    assert len(caplog.records) == 1
