@@ -64,6 +64,12 @@ class LiveSettings(Checked):
         Shortest time between two answers for one map, as measured powers come in [s].
     views_every_s : float
         Time between two lists of next views [s]; 0 lists them on request alone.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.LiveSettings(threshold_db=-95.0).spacing_m
+    0.15
     """
 
     frame: str = ""
