@@ -172,7 +172,9 @@ def _target(path: str | os.PathLike[str], formats: Collection[str]) -> tuple[Pat
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:
     encoding: dict[str, dict[str, Any]] = {name: {"_FillValue": None} for name in ("x", "y")}
     encoding |= {str(name): {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
-    return write_netcdf(coverage, encoding)
+    stream = io.BytesIO()
+    write_netcdf(coverage, encoding, stream)
+    return stream.getvalue()
 
 
 def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES) -> bytes:

@@ -8,7 +8,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -114,38 +114,87 @@ def require_plain_hdf5(file: Any, most: int) -> None:
         raise ValueError(found)
 
 
-def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], path: Path | None = None) -> bytes:
-    """Write a Dataset as NetCDF 4 to a new file, or return the content of one: equal Datasets give equal bytes.
+def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], stream: Any) -> None:
+    """Write a Dataset as NetCDF 4 to an unbuffered stream, which is read, too: equal Datasets give equal bytes.
 
     `Dataset.to_netcdf` would let HDF5 stamp the root group with the time of day, and keep the order of variables.
     """
     import h5netcdf
     import h5py
     import xarray as xr
-    from h5py import h5f, h5p
+    from h5py import h5f, h5fd, h5p
     from xarray.backends import H5NetCDFStore
     from xarray.backends.common import ArrayWriter
 
-    creation, access = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS)
+    creation, access, writer = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS), ArrayWriter()
     creation.set_obj_track_times(False)
     for set_order in (creation.set_link_creation_order, creation.set_attr_creation_order):
         set_order(h5p.CRT_ORDER_TRACKED | h5p.CRT_ORDER_INDEXED)
-    if path is None:
-        access.set_fapl_core(backing_store=False)
+    sink = _Sink(stream)
+    access.set_fileobj_driver(h5fd.fileobj_driver, sink)
     of_axes = sorted(table.coords, key=lambda name: (name not in table.dims, str(name)))
     axes = {name: table[name].variable for name in of_axes}
     ordered = xr.Dataset(coords=axes, attrs=table.attrs).assign(table.data_vars).drop_encoding()
-    name = os.fsencode(path or "memory.nc")
-    with h5py.File(h5f.create(name, h5f.ACC_TRUNC, creation, access)) as file:
-        with h5netcdf.File(file, "w") as netcdf:
-            writer = ArrayWriter()
-            ordered.dump_to_store(H5NetCDFStore(netcdf), writer=writer, encoding=encoding)
-            _write_blocks(writer.sources, writer.targets)
-        file.flush()
-        return b"" if path else bytes(file.id.get_file_image())
+    file_id = h5f.create(b"stream", h5f.ACC_TRUNC, creation, access)
+    with h5py.File(file_id) as file, h5netcdf.File(file, "w") as netcdf:
+        ordered.dump_to_store(H5NetCDFStore(netcdf), writer=writer, encoding=encoding)
+        for _ in _blocks_written(writer.sources, writer.targets):
+            sink.require_written()
+    sink.require_written()
 
 
-def _write_blocks(sources: list[Any], targets: list[Any]) -> None:
+class _Sink(io.RawIOBase):
+    """A raw stream for HDF5, which crashes where a disk fails: the error waits for `require_written`.
+
+    What is written after it is kept in memory.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self._stream, self._at, self._end = stream, 0, 0
+        self._error: tuple[Any, ...] = ()
+        self._kept: list[tuple[int, bytes]] = []
+
+    def require_written(self) -> None:
+        """Raise what went wrong."""
+        if self._error:
+            raise OSError(*self._error)
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        self._at = self._end if whence == io.SEEK_END else offset
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        self._stream.seek(self._at)
+        self._stream.readinto(view)
+        for at, content in self._kept:
+            first, last = max(at, self._at), min(at + len(content), self._at + len(view))
+            if first < last:
+                view[first - self._at : last - self._at] = content[first - at : last - at]
+        return len(view)
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        try:
+            self.require_written()
+            self._stream.seek(self._at)
+            done = 0
+            while done < len(view):
+                done += self._stream.write(view[done:])
+        except OSError as error:
+            self._error = self._error or error.args  # its frames would keep memory that HDF5 frees
+            self._kept.append((self._at, bytes(view)))
+        self._end = max(self._end, self._at + len(view))
+        return len(view)
+
+    def truncate(self, size: int | None = None) -> int:
+        self._end = self._end if size is None else size
+        with suppress(OSError):
+            self._stream.truncate(self._end)
+        return self._end
+
+
+def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
     """Compute dask's arrays, of as many blocks each, block by block; `dask.array.store` has another order each time."""
     import dask
     from dask.array.core import slices_from_chunks
@@ -154,6 +203,7 @@ def _write_blocks(sources: list[Any], targets: list[Any]) -> None:
         blocks = dask.compute(*(source[region] for source, region in zip(sources, regions, strict=True)))
         for target, region, block in zip(targets, regions, blocks, strict=True):
             target[region] = block
+        yield
 
 
 def read_columns(
@@ -316,7 +366,11 @@ def temporary_folder() -> Iterator[Path]:
             "temporary files, or set TMPDIR to one that you may write to."
         )
 
-    with _own_folder(Path(tempfile.gettempdir()), TEMPORARY, failed) as folder:
+    try:
+        parent = Path(tempfile.gettempdir())
+    except OSError as error:
+        raise failed(error) from error
+    with _own_folder(parent, TEMPORARY, failed) as folder:
         yield folder
 
 

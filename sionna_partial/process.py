@@ -176,9 +176,16 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def _outdated_by_others(compiled: Any) -> Any:
     """Let cached code be of no use after a change of any compiled module: numba looks at the function's own alone.
 
-    It would call what other modules have been, and fail where a type that it takes has moved.
+    It would call what other modules have been, and fail where a type that it takes has moved. Code that a full disk
+    does not take is not cached.
     """
+
+    def save_overload(*arguments: Any) -> None:
+        with suppress(OSError):
+            saved(*arguments)
+
     with suppress(AttributeError):
+        saved, compiled._cache.save_overload = compiled._cache.save_overload, save_overload
         compiled._cache._cache_file._version += f" {_compiled_sources()}"
     return compiled
 

@@ -340,6 +340,43 @@ def test_full_temporary_folder_is_named() -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+LIMITED = """
+import resource, sys
+sys.path.insert(0, "tests")
+from pathlib import Path
+import numpy as np
+import sionna_partial as sp
+
+room = np.pad(np.zeros((20, 20), np.uint8), 1, constant_values=1)
+partial, folder = sp.PartialMap(room, 0.1), Path(sys.argv[1])
+links = sp.trace_links(partial, (1.0, 1.0, 1.5), [(1.5, 1.5, 1.5)], progress=False)
+calls = {
+    "npz": lambda path: sp.save_map(partial, path),
+    "yaml": lambda path: sp.save_map(partial, path),
+    "nc": lambda path: sp.save_channels(links, path, progress=False),
+    "zarr": lambda path: sp.save_channels(links.cir(), path, progress=False),
+    "scene": lambda path: sp.export_scene(partial, path),
+}
+for size in (0, 150, 1000, 4000, 9000):
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+    for name, call in calls.items():
+        try:
+            call(folder / f"{size}.{name}")
+        except sp.SionnaPartialError:
+            pass
+"""
+
+
+def test_file_size_limit_leaves_whole_files_and_no_words(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", LIMITED, str(tmp_path)]
+    done = subprocess.run(words, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert not {name for name in names if name.startswith(".")}
+    assert {f"{size}.nc" for size in (0, 150, 1000, 4000)}.isdisjoint(names)
+    assert {path.stem for path in tmp_path.glob("*.pgm")} == {path.stem for path in tmp_path.glob("*.yaml")}
+
+
 LOCK = """
 import sys
 from sionna_partial.files import locked_folder

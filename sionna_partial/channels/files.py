@@ -121,8 +121,8 @@ def save_channels(
             packed: dict[Any, Any] = {
                 name: {"zlib": True, "complevel": 1, "chunksizes": sizes} for name, sizes in of_receiver.items()
             }
-            with atomic_path(target) as file:
-                write_netcdf(table, packed, file)
+            with atomic_path(target) as file, file.open("w+b", buffering=0) as stream:
+                write_netcdf(table, packed, stream)
         report(1.0, f"wrote {target.name}")
 
 

@@ -166,10 +166,12 @@ def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[flo
 
 def write_ros_files(path: Path, text: str, pixels: NDArray[np.uint8]) -> None:
     """Write a YAML, and the PGM beside it whose pixels (ny, nx) begin with the smallest y, or neither."""
-    with atomic_write(path, "w") as sheet, atomic_write(path.with_suffix(".pgm")) as picture:
+    with atomic_write(path, "w") as sheet:
         sheet.write(text)
-        picture.write(b"P5\n%d %d\n255\n" % pixels.shape[::-1])
-        picture.write(np.flipud(pixels).tobytes())
+        sheet.flush()  # a full disk fails here, not after the picture is there
+        with atomic_write(path.with_suffix(".pgm")) as picture:
+            picture.write(b"P5\n%d %d\n255\n" % pixels.shape[::-1])
+            picture.write(np.flipud(pixels).tobytes())
 
 
 def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
