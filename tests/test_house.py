@@ -52,7 +52,7 @@ ROOMS = {
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
     "exploration": ("next_views", "explore"),
-    "live": ("coverage", "topics", "bags"),
+    "live": ("coverage", "topics", "bags", "dds", "rosbridge"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training", "path_training"),
@@ -61,7 +61,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "cli": ("options", "prediction", "links", "learning", "planning", "app"),
+    "cli": ("options", "prediction", "links", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""

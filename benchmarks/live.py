@@ -1,0 +1,103 @@
+"""Time from a map message to the first, coarse grid and to the final one, and memory over many updates.
+
+    .venv/bin/python benchmarks/live.py --updates 1000
+
+prints the table of docs/live.md: the shipped apartment, and a hall of 30 x 15 m that is half seen.
+"""
+
+import argparse
+import resource
+import statistics
+from pathlib import Path
+from types import SimpleNamespace as Fields
+
+import numpy as np
+
+import sionna_partial as sp
+from sionna_partial.constants import CellState
+
+APARTMENT = Path(__file__).resolve().parents[1] / "scenes/apartment"
+PERCENT = np.array([0, 100, -1])
+
+
+def message(partial: sp.PartialMap) -> Fields:
+    """Return a map as an OccupancyGrid."""
+    ny, nx = partial.shape
+    x, y = partial.origin_m
+    turn = Fields(x=0.0, y=0.0, z=0.0, w=1.0)
+    origin = Fields(position=Fields(x=x, y=y, z=0.0), orientation=turn)
+    info = Fields(width=nx, height=ny, resolution=partial.resolution_m, origin=origin)
+    return Fields(info=info, data=PERCENT[partial.state].ravel())
+
+
+def half_seen_hall(fraction: float) -> sp.PartialMap:
+    """Return a hall of 30 x 15 m with columns, of which the left part has been seen."""
+    state = np.full((300, 600), int(CellState.FREE), dtype=np.uint8)
+    state[[0, -1]] = state[:, [0, -1]] = CellState.WALL
+    for x in range(60, 600, 60):
+        state[100:106, x : x + 6] = state[200:206, x : x + 6] = CellState.WALL
+    state[150:153, 120:480] = CellState.WALL
+    state[:, int(fraction * 600) :] = CellState.UNKNOWN
+    return sp.PartialMap(state, 0.05)
+
+
+def free_position(partial: sp.PartialMap) -> tuple[float, float, float]:
+    """Return a free position in the middle of the free cells."""
+    cells = np.argwhere(partial.state == CellState.FREE)
+    row, column = cells[np.argmin(np.linalg.norm(cells - cells.mean(axis=0), axis=1))]
+    x, y = np.add(partial.origin_m, (np.array([column, row]) + 0.5) * partial.resolution_m)
+    return float(x), float(y), 1.5
+
+
+def latencies(maps: list[sp.PartialMap], rounds: int, spacing_m: float) -> tuple[float, float]:
+    """Return the median times to the coarse and the final grid [s], of a warm process."""
+    ages: dict[bool, list[float]] = {False: [], True: []}
+    tx = free_position(maps[0])
+    live = sp.LiveCoverage(
+        tx, lambda grid: ages[grid.is_final].append(grid.age_s), sp.LiveSettings(spacing_m=spacing_m)
+    )
+    for number in range(rounds * len(maps)):
+        live.on_map(message(maps[number % len(maps)]))
+        live.step()
+    return statistics.median(ages[False][1:]), statistics.median(ages[True][1:])
+
+
+def memory_mb() -> float:
+    """Return the resident memory of this process [MB]."""
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+    return pages * resource.getpagesize() / 1e6
+
+
+def growth_mb(maps: list[sp.PartialMap], updates: int) -> tuple[float, float]:
+    """Return the memory after a fifth of the updates, and after all of them [MB]."""
+    live = sp.LiveCoverage(free_position(maps[0]), lambda _: None, sp.LiveSettings(spacing_m=0.6))
+    early = 0.0
+    for number in range(updates):
+        live.on_map(message(maps[number % len(maps)]))
+        live.step()
+        if number == updates // 5:
+            early = memory_mb()
+    return early, memory_mb()
+
+
+def main() -> None:
+    """Measure, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--updates", type=int, default=1000)
+    parser.add_argument("--rounds", type=int, default=2)
+    given = parser.parse_args()
+    apartment = [sp.load_map(APARTMENT / f"step{step:03d}/map.yaml") for step in (50, 100, 150)]
+    large = [half_seen_hall(fraction) for fraction in (0.5, 0.6, 0.7)]
+    print("| map | cells | first grid [s] | final grid [s] |\n|---|---|---|---|")
+    for name, maps in (("apartment", apartment), ("hall of 30 x 15 m", large)):
+        first_s, final_s = latencies(maps, given.rounds, 0.15)
+        ny, nx = maps[0].shape
+        print(f"| {name} | {nx} x {ny} | {first_s:.1f} | {final_s:.1f} |", flush=True)
+    if given.updates:
+        early_mb, late_mb = growth_mb(apartment, given.updates)
+        after = f"{early_mb:.0f} MB after {given.updates // 5} updates, {late_mb:.0f} MB after {given.updates}"
+        print(f"\nmemory: {after}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""The subcommand that keeps up with a robot: live."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+import sionna_partial as sp
+import sionna_partial.cli.options as opt
+from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.files import atomic_files, require_writable
+from sionna_partial.process import cleaned_up
+
+_POWER_HELP = "Topic of std_msgs/Float32 with received powers, NAME=TOPIC of several transmitters; may be repeated."
+
+
+def _topics(
+    map_topic: Annotated[str, typer.Option(help="Topic of the map.")] = "/map",
+    prefix: Annotated[str, typer.Option(help="Beginning of the topics that are published.")] = "/radio",
+    robot_frame: Annotated[str, typer.Option(help="Frame of the robot.")] = "base_link",
+    power: Annotated[list[str], typer.Option(metavar="TOPIC", help=_POWER_HELP, show_default=False)] = [],  # noqa: B006
+    key_values: Annotated[str, typer.Option(help="Topic of diagnostic_msgs/KeyValue: name, power.")] = "",
+) -> Any:
+    from sionna_partial.live.topics import Topics
+
+    parts = [each.rpartition("=") for each in power]
+    return Topics(map_topic, prefix, robot_frame, {topic: name or None for name, _, topic in parts}, key_values)
+
+
+def _live_settings(
+    frame: Annotated[str, typer.Option(help="Frame of the transmitters. Default: that of the first map.")] = "",
+    threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
+    spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
+    tx_power: Annotated[float, typer.Option(help="Subtracted from received powers [dBm].")] = 0.0,
+    views_every: Annotated[float, typer.Option(help="Time between lists of next views [s]; 0: on request.")] = 0.0,
+) -> sp.LiveSettings:
+    return sp.LiveSettings(frame, threshold, spacing, rx_height, tx_power, views_every_s=views_every)
+
+
+@opt.with_options
+def live(
+    *,
+    tx: Annotated[list[str], typer.Option(metavar="X Y [Z]", help="Transmitter [m]; once for each.")],
+    name: Annotated[list[str], typer.Option(help="Name of each transmitter.", show_default=False)] = [],  # noqa: B006
+    domain: Annotated[
+        int | None, typer.Option(help="DDS domain. Default: ROS_DOMAIN_ID, or 0.", show_default=False)
+    ] = None,
+    rosbridge: Annotated[str, typer.Option(metavar="URL", help="rosbridge in place of DDS: ws://robot:9090.")] = "",
+    bag: Annotated[Path | None, typer.Option(help="A recording in place of a robot.", show_default=False)] = None,
+    rate: Annotated[float, typer.Option(min=0.0, help="Its speed; 0 waits for each map's answer.")] = 1.0,
+    out: Annotated[Path | None, typer.Option(help="Of a recording: folder for the last grids.")] = None,
+    topics: Annotated[Any, _topics],
+    settings: Annotated[sp.LiveSettings, _live_settings],
+    model: opt.Settings,
+    predictor: opt.PredictorName = "",
+) -> None:
+    """Keep up with a robot's map: coverage as cost grids for its planner, until Ctrl-C."""
+    names = name or (["tx"] if len(tx) == 1 else [f"tx{number}" for number in range(len(tx))])
+    if len(names) != len(tx) or len({*names}) < len(names):
+        raise typer.BadParameter(f"{len(names)} --name for {len(tx)} --tx: give each its own.")
+    positions = dict(zip(names, map(opt.parse_position, tx), strict=True))
+    last: dict[str, Any] = {}
+    robot: Any = None
+    if bag is None and rosbridge:
+        from sionna_partial.live.rosbridge import Rosbridge
+
+        robot = Rosbridge(rosbridge, topics, positions)
+    elif bag is None:
+        from sionna_partial.live.dds import Dds
+
+        robot = Dds(topics, positions, domain)
+
+    def publish(answer: Any) -> None:
+        if robot:
+            robot.publish(answer)
+        if hasattr(answer, "cost"):
+            last[answer.name] = answer
+            kind = "final" if answer.is_final else "coarse"
+            typer.echo(f"map {answer.map_number}, {answer.name}: {kind} after {answer.age_s:.1f} s")
+        else:
+            typer.echo(f"next views: {len(answer.views)}")
+
+    coverage = sp.LiveCoverage(positions, publish, settings, predictor=predictor or None, **model)
+    if robot:
+        with cleaned_up(getattr(robot, "close", lambda: None)):
+            coverage.start()
+            robot.listen(coverage)
+    else:
+        assert bag is not None
+        _replay(coverage, topics, bag, rate)
+        _save(last, out)
+
+
+def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
+    from sionna_partial.live.bags import replay
+    from sionna_partial.live.topics import Listener
+
+    thread = coverage.start() if rate else None
+    replay(Listener(coverage, topics), bag, rate)
+    coverage.close()
+    if thread:
+        thread.join()
+
+
+def _save(last: dict[str, Any], out: Path | None) -> None:
+    if out and last:
+        require_writable(out)
+        with atomic_files(out) as folder:
+            for name, answer in last.items():
+                sp.save_coverage(answer.coverage, folder / f"{name}.nc")
+        opt.print_files(out, [f"{name}.nc" for name in last])

@@ -1,0 +1,118 @@
+"""rosbridge, for ROS 1 and where DDS does not pass: topics as JSON over a WebSocket that is opened again."""
+
+import json
+import logging
+import re
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any
+
+from sionna_partial.checks import shown
+from sionna_partial.errors import SettingsError
+from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
+from sionna_partial.live.topics import Listener, Topics
+
+MAX_BYTES = 100_000_000
+"""Largest message that is taken [bytes]."""
+
+RETRY_S = 1.0
+"""Time after which a server that is gone is looked for again [s]."""
+
+_log = logging.getLogger(__name__)
+
+
+class Rosbridge:
+    """The topics of a rosbridge server.
+
+    Parameters
+    ----------
+    url : str
+        Such as "ws://robot:9090".
+    topics : Topics
+    names : mapping
+        Transmitters, by name.
+
+    Raises
+    ------
+    SettingsError
+        For another kind of address.
+    """
+
+    def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
+        if not re.fullmatch(r"wss?://[^/\s]+(/\S*)?", url):
+            raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
+        try:
+            import websockets.sync.client  # noqa: F401
+        except ImportError as error:
+            raise SettingsError("rosbridge needs websockets: pip install 'sionna-partial[live]'.") from error
+        self.url, self.topics, self._names = url, topics, names
+        self._socket: Any = None
+        self._last: dict[str, str] = {}
+
+    def publish(self, answer: LiveGrid | LiveViews) -> None:
+        """Publish an answer; a server that starts again gets the last ones."""
+        topic = self.topics.topic_of(answer)
+        self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": answer.message()})
+        self._send(self._last[topic])
+
+    def listen(self, live: LiveCoverage) -> None:
+        """Hand messages to a `LiveCoverage`, for ever."""
+        listener = Listener(live, self.topics)
+        while True:
+            self.connect(listener)
+            time.sleep(RETRY_S)
+
+    def connect(self, listener: Listener) -> None:
+        """Hand over messages until the connection ends, and log why."""
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
+        try:
+            with connect(self.url, max_size=MAX_BYTES, open_timeout=5.0) as self._socket:
+                _log.info("connected to %s", self.url)
+                self._greet()
+                for text in self._socket:
+                    self._take(listener, text)
+                reason = "it ended the connection"
+        except (OSError, WebSocketException) as error:
+            reason = str(error)
+        finally:
+            self._socket = None
+        listener.live.report(f"{self.url}: {reason}; it is tried again every {RETRY_S:g} s.")
+
+    def _greet(self) -> None:
+        for topic, kind in self.topics.published(self._names).items():
+            self._send(json.dumps({"op": "advertise", "topic": topic, "type": _old(kind), "latch": True}))
+        for topic, kind in self.topics.types().items():
+            depth = 1 if topic == self.topics.map else 0
+            request = {"op": "subscribe", "topic": topic, "type": _old(kind), "queue_length": depth}
+            self._send(json.dumps(request))
+        for text in [*self._last.values()]:
+            self._send(text)
+
+    def _send(self, text: str) -> None:
+        from websockets.exceptions import WebSocketException
+
+        socket = self._socket
+        if socket is not None:
+            with suppress(OSError, WebSocketException):  # the listening side logs it
+                socket.send(text)
+
+    def _take(self, listener: Listener, text: str | bytes) -> None:
+        try:
+            message = json.loads(text, object_hook=lambda fields: SimpleNamespace(**fields))
+            operation, topic = getattr(message, "op", None), getattr(message, "topic", None)
+            if operation == "publish" and topic in self.topics.types():
+                listener.take(topic, message.msg)
+            elif operation == "status":
+                listener.live.report(f"{self.url}: {shown(message.msg)}")
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            listener.live.report(f"{self.url}: a message is dropped ({type(error).__name__}: {error}).")
+
+
+def _old(kind: str) -> str:
+    """Return a type as rosbridge of ROS 1 and 2 takes it: without "msg"."""
+    package, _, name = kind.split("/")
+    return f"{package}/{name}"

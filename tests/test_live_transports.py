@@ -1,0 +1,218 @@
+"""A robot in another process, by real DDS on the loopback interface; a rosbridge server of a few lines; the command."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbag_files import Messages, write_bag
+from rosbags.typesys import Stores, get_typestore
+from typer.testing import CliRunner
+
+import sionna_partial as sp
+from sionna_partial import cli
+from sionna_partial.live.topics import GRID_TYPE, UPDATE_TYPE, VIEWS_TYPE, Listener, Topics
+
+pytest.importorskip("cyclonedds")
+pytest.importorskip("websockets")
+
+from sionna_partial.live import dds, rosbridge
+
+CELLS = [[100, 100, 100, 100], [100, 0, 0, -1], [100, 100, 100, 100]]
+POSE = {"position": dict.fromkeys("xyz", 0.0), "orientation": {**dict.fromkeys("xyz", 0.0), "w": 1.0}}
+HEADER = {"stamp": {"sec": 7, "nanosec": 8}, "frame_id": "map"}
+INFO = {"map_load_time": HEADER["stamp"], "resolution": 1.0, "width": 4, "height": 3, "origin": POSE}
+GRID = {"header": HEADER, "info": INFO, "data": np.ravel(CELLS).tolist()}
+LOOPBACK = (
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    "<Peers><Peer Address='localhost'/></Peers></Discovery></Domain></CycloneDDS>"
+)
+LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25"]
+
+ROBOT = """
+import sys, time
+from test_live_transports import GRID, GRID_TYPE
+from sionna_partial.live import dds
+from sionna_partial.live.topics import Topics
+robot = dds.Dds(Topics(map="/unused"), {})
+writer = robot._writer("/map", GRID_TYPE)
+writer.write(dds.filled(GRID_TYPE, GRID))
+reader = robot._reader("/radio/tx", GRID_TYPE, True)
+for _ in range(3000):
+    for each in reader.take(1):
+        print(each.header.frame_id, each.info.width, *each.data, flush=True)
+    time.sleep(0.02)
+"""
+
+
+@pytest.fixture
+def domain(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Environment of a DDS domain of the test's own."""
+    number = str(100 + os.getpid() % 100)
+    monkeypatch.setenv("CYCLONEDDS_URI", LOOPBACK)
+    monkeypatch.setenv("ROS_DOMAIN_ID", number)
+    return {**os.environ, "PYTHONPATH": f"{Path(__file__).parent}{os.pathsep}{Path(__file__).parents[1]}"}
+
+
+class TestDds:
+    @pytest.mark.parametrize(
+        ("kind", "values"),
+        [
+            (GRID_TYPE, GRID),
+            (VIEWS_TYPE, {"header": HEADER, "poses": [POSE, POSE]}),
+            (UPDATE_TYPE, {"header": HEADER, "x": 1, "y": 2, "width": 1, "height": 1, "data": [-1]}),
+        ],
+    )
+    def test_wire_format_is_that_of_ros(self, kind: str, values: dict[str, Any]) -> None:
+        store = get_typestore(Stores.ROS2_HUMBLE) if kind != UPDATE_TYPE else dds._store()
+        message = store.deserialize_cdr(dds.filled(kind, values).serialize(), kind)
+        assert message.header.frame_id == "map"
+        assert message.header.stamp.nanosec == 8
+        if kind == GRID_TYPE:
+            assert message.data.tolist() == GRID["data"]
+        assert dds.struct(kind).deserialize(bytes(store.serialize_cdr(message, kind))) == dds.filled(kind, values)
+
+    def test_robot_in_another_process(self, domain: dict[str, str]) -> None:
+        command = [sys.executable, "-m", "sionna_partial", "live", *LIVE]
+        pipes: dict[str, Any] = {"env": domain, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        with (
+            subprocess.Popen([sys.executable, "-c", ROBOT], **pipes) as robot,
+            subprocess.Popen(command, **pipes) as live,
+        ):
+            try:
+                frame, width, *cost = robot.stdout.readline().split()
+                assert (frame, width, len(cost)) == ("map", "4", 12)
+                assert [int(each) for each in cost][:5] == [-1] * 5
+                robot.kill()  # a robot that disappears
+                live.send_signal(signal.SIGINT)
+                output, errors = live.communicate(timeout=30)
+            finally:
+                robot.kill()
+                live.kill()
+        assert live.returncode == 130, errors
+        assert "map 1, tx: coarse after" in output
+
+    def test_bytes_that_are_no_message(self, domain: dict[str, str], caplog: pytest.LogCaptureFixture) -> None:
+        class Reader:
+            def take(self, _: int) -> Any:
+                raise ValueError("cut short")
+
+        grids: list[Any] = []
+        live = sp.LiveCoverage((1.5, 1.5, 1.5), grids.append)
+        robot = dds.Dds(Topics(), {"tx": None})
+        robot._readers = [("/map", Reader())]
+        robot.poll(Listener(live, Topics()))
+        robot.close()
+        assert caplog.text.count("a message of /map cannot be decoded (ValueError: cut short)") == 1
+
+    @pytest.mark.parametrize("number", [-1, 233, "map"])
+    def test_refused_domain(self, number: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+        with pytest.raises(sp.SionnaPartialError, match=r"domain|ROS_DOMAIN_ID"):
+            dds.Dds(Topics(), {})
+
+
+class Server:
+    """A rosbridge server that sends texts to who subscribes to /map, and keeps what it gets."""
+
+    def __init__(self, texts: list[str]) -> None:
+        from websockets.sync.server import serve
+
+        self.texts, self.got = texts, list[Any]()
+        self._server = serve(self._serve, "127.0.0.1", 0)
+        self.url = f"ws://127.0.0.1:{self._server.socket.getsockname()[1]}"
+        threading.Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def _serve(self, connection: Any) -> None:
+        for text in connection:
+            message = json.loads(text)
+            self.got.append(message)
+            if message["op"] == "subscribe" and message["topic"] == "/map":
+                for each in self.texts:
+                    connection.send(each)
+            if message["op"] == "publish":
+                return
+
+    def close(self) -> None:
+        self._server.shutdown()
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    hostile = [
+        "{",
+        "[]",
+        "7",
+        '{"op": "publish", "topic": "/map", "msg": {"data": null}}',
+        '{"op": "status", "msg": "x"}',
+    ]
+    server = Server([*hostile, json.dumps({"op": "publish", "topic": "/map", "msg": GRID})])
+    yield server
+    server.close()
+
+
+class TestRosbridge:
+    def test_server_that_starts_again(self, server: Server, caplog: pytest.LogCaptureFixture) -> None:
+        topics = Topics()
+        robot = rosbridge.Rosbridge(server.url, topics, {"tx": None})
+        live = sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish, sp.LiveSettings(spacing_m=0.25))
+        thread = live.start()
+        for _ in range(2):  # the second time it gets the last answer at once
+            robot.connect(Listener(live, topics))
+        live.close()
+        thread.join(60)
+        published = [each for each in server.got if each["op"] == "publish"]
+        assert len(published) >= 2
+        assert published[0]["topic"] == "/radio/tx"
+        assert published[0]["msg"]["info"]["width"] == 4
+        advertised = {each["topic"]: each["type"] for each in server.got if each["op"] == "advertise"}
+        assert advertised["/radio/tx"] == "nav_msgs/OccupancyGrid"
+        assert "a message is dropped (JSONDecodeError" in caplog.text
+        assert "it ended the connection; it is tried again every 1 s" in caplog.text
+
+    def test_too_large(self, server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+        monkeypatch.setattr(rosbridge, "MAX_BYTES", 100)
+        server.texts = ["x" * 200]
+        robot = rosbridge.Rosbridge(server.url, Topics(), {})
+        robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
+        assert "1009 (message too big)" in caplog.text
+
+    def test_no_server(self, caplog: pytest.LogCaptureFixture) -> None:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            url = f"ws://127.0.0.1:{free.getsockname()[1]}"
+        robot = rosbridge.Rosbridge(url, Topics(), {})
+        robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
+        assert "it is tried again" in caplog.text
+
+    def test_refused_address(self) -> None:
+        with pytest.raises(sp.SionnaPartialError, match="give for example ws://robot:9090"):
+            rosbridge.Rosbridge("robot:9090", Topics(), {})
+
+
+@pytest.mark.usefixtures("command_line")
+class TestCommand:
+    def test_recording(self, tmp_path: Path) -> None:
+        path = write_bag(tmp_path / "drive_mcap", [("/map", 0.0, Messages(2).grid(CELLS, (0.0, 0.0, 0.0), 1.0))])
+        out = tmp_path / "out"
+        result = CliRunner().invoke(cli.app, ["live", *LIVE, "--bag", str(path), "--rate", "0", "--out", str(out)])
+        assert result.exit_code == 0, result.output
+        assert [line.partition(" after")[0] for line in result.stdout.splitlines()] == [
+            "map 1, tx: coarse",
+            "map 1, tx: final",
+            f"wrote {out / 'tx.nc'}",
+        ]
+        expected = sp.predict_map(sp.map_from_bag(path), (1.5, 1.5, 1.5), spacing_m=0.25)
+        assert sp.load_coverage(out / "tx.nc").equals(expected)
+
+    def test_refused(self, tmp_path: Path) -> None:
+        result = CliRunner().invoke(cli.app, ["live", *LIVE, "--name", "a", "--name", "b"])
+        assert (result.exit_code, "2 --name for 1 --tx" in result.stderr) == (2, True)
