@@ -22,7 +22,14 @@ SECTIONS = {
     "Start": ["docs/install", "docs/usage"],
     "Guides": [
         *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/channels", "docs/transmitters"),
-        *("docs/measured_powers", "docs/calibration", "docs/placement", "docs/next_views", "docs/differentiable"),
+        *(
+            "docs/measured_powers",
+            "docs/calibration",
+            "docs/placement",
+            "docs/next_views",
+            "docs/live",
+            "docs/differentiable",
+        ),
         *("docs/training", "docs/cluster"),
     ],
     "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],

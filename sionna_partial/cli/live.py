@@ -34,7 +34,7 @@ def _live_settings(
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     tx_power: Annotated[float, typer.Option(help="Subtracted from received powers [dBm].")] = 0.0,
     views_every: Annotated[float, typer.Option(help="Time between lists of next views [s]; 0: on request.")] = 0.0,
-) -> sp.LiveSettings:
+) -> Any:
     return sp.LiveSettings(frame, threshold, spacing, rx_height, tx_power, views_every_s=views_every)
 
 
@@ -51,7 +51,7 @@ def live(
     rate: Annotated[float, typer.Option(min=0.0, help="Its speed; 0 waits for each map's answer.")] = 1.0,
     out: Annotated[Path | None, typer.Option(help="Of a recording: folder for the last grids.")] = None,
     topics: Annotated[Any, _topics],
-    settings: Annotated[sp.LiveSettings, _live_settings],
+    settings: Annotated[Any, _live_settings],
     model: opt.Settings,
     predictor: opt.PredictorName = "",
 ) -> None:
