@@ -146,7 +146,8 @@ def own_imports(module: str) -> set[str]:
 
 def declared(kind: str) -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    lines = project["dependencies"] if kind == "run" else project["optional-dependencies"][kind]
+    extras = project["optional-dependencies"]
+    lines = [*project["dependencies"], *extras["live"]] if kind == "run" else extras[kind]
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
