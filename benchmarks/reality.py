@@ -31,7 +31,6 @@ NUMBERS, DRAWS, POINTS = (5, 10, 20), 20, 60
 EXPONENT, EXPONENT_STD, NOISE_DB, OFFSET_STD_DB = 2.0, 0.5, 6.0, 8.0
 COLUMNS = "tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "power_dbm"
 WITHIN_90 = 1.6449
-P_POWERS = 0.5
 
 
 def main() -> None:
@@ -74,6 +73,7 @@ class Floor:
     def __init__(self, partial: sp.PartialMap, links: dict[str, Floats], simulation: sp.Simulation) -> None:
         self.partial, self.links, self.simulation = partial, links, simulation
         self.frequency_hz = simulation.trace_settings.frequency_hz
+        self.through_walls = simulation.trace_settings.through_walls
         self.free_db, self.walls, self.prior = {}, {}, {}
         for tx, rows in links.items():
             tx_m, rx_m = rows[0, :3], rows[:, 3:6]
@@ -131,7 +131,12 @@ class Floor:
         guesses = {name: each[rest] + offset(power[known] - each[known], offset_db) for name, each in shifts.items()}
         measured = sp.Measurements(rows[0, :3], rx_m[known], power[known])
         fitted = Assimilation.fit(
-            self.partial, rows[0, :3], measured, prior.take(known), frequency_hz=self.frequency_hz, p_powers=P_POWERS
+            self.partial,
+            rows[0, :3],
+            measured,
+            prior.take(known),
+            frequency_hz=self.frequency_hz,
+            through_walls=self.through_walls,
         )
         ours = fitted.update(rx_m[rest], prior.take(rest))
         mean, std = ours.gain_mean_db + fitted.offset_db, ours.gain_std_db

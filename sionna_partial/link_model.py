@@ -407,10 +407,9 @@ def _transmitter_of(
     if measured is not None:
         for each_m, each_p in zip(tx_m, p_powers, strict=True):
             prior, _ = _prior(model, each_m, measured.rx, at_once)
-            frequency_hz = model.simulation.trace_settings.frequency_hz
-            assimilations.append(
-                Assimilation.fit(model.partial, each_m, measured, prior, frequency_hz=frequency_hz, p_powers=each_p)
-            )
+            settings = model.simulation.trace_settings
+            of_trace: Any = {"frequency_hz": settings.frequency_hz, "through_walls": settings.through_walls}
+            assimilations.append(Assimilation.fit(model.partial, each_m, measured, prior, p_powers=each_p, **of_trace))
     return _Transmitter(tx_m, weights, assimilations, position_m)
 
 

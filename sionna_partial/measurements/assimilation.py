@@ -1,7 +1,7 @@
 """Predictions that measurements correct: a Gaussian process on the residuals, correlated over the length of walks."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
@@ -45,9 +45,10 @@ NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 1
 deviation of its logarithm [dB]."""
 
 
-P_POWERS, UNSEEN_P_POWERS = 0.01, 0.0001
+P_POWERS, UNSEEN_P_POWERS, P_POWERS_THROUGH_WALLS = 0.01, 0.0001, 0.95
 """Prior probability that powers were measured and no path gains, where the transmitter is in a cell that was seen, and
-where it is not: what all measurements have in common may then be a wall that was not seen, too."""
+where it is not: what all measurements have in common may then be a wall that was not seen, too. The third where paths
+go through walls, at the frequencies of radios whose offset is seldom known."""
 
 
 class Kind(NamedTuple):
@@ -69,9 +70,15 @@ class Kind(NamedTuple):
     """Where it is decided what was measured, residuals below minus this count as this: walls that were not seen make
     single links deeper without bound [1]."""
 
+    exact: bool
+    """Whether what is certain without measurements stays so, as no trace is for a real radio."""
 
-KINDS = (Kind(2.0, (1.0, 0.0), 0.8, 1.0, 3.0), Kind(40.0, (0.5, 0.2), 4.0, 3.0, math.inf))
+
+KINDS = (Kind(2.0, (1.0, 0.0), 0.8, 1.0, 3.0, True), Kind(40.0, (0.5, 0.2), 4.0, 3.0, math.inf, True))
 """Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
+
+KINDS_THROUGH_WALLS = tuple(Kind(offset_db, (1.0, 0.4), 4.0, 5.0, math.inf, False) for offset_db in (2.0, 40.0))
+"""Gains and powers that a real radio received through walls, whose losses are known to 40 %."""
 
 MOST_POINTS = 500
 """Number of measured positions from which on neighbours are averaged."""
@@ -196,12 +203,14 @@ class _Hypothesis(NamedTuple):
     noise: Floats
 
 
-def _hypotheses(sample: _Sample, links: _Links, prior: LinkPrediction, p_powers: float) -> Iterator[_Hypothesis]:
+def _hypotheses(
+    sample: _Sample, links: _Links, prior: LinkPrediction, kinds: Sequence[Kind], p_powers: float
+) -> Iterator[_Hypothesis]:
     """Yield all hypotheses with the logarithms of their posterior probability, but for a constant."""
     measured, received = sample.measured, sample.received
     above_db = np.maximum(measured.gain_db, measured.sensitivity_db) - prior.gain_mean_db
     below_db = prior.gain_mean_db - links.free_space_db(measured.rx)
-    for kind, p_kind in zip(KINDS, (1.0 - p_powers, p_powers), strict=True):
+    for kind, p_kind in zip(kinds, (1.0 - p_powers, p_powers), strict=True):
         scale_db = sample.averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
         factor, spread = kind.shadow
         residual = sample.averaged(above_db - (factor - 1.0) * below_db) / scale_db
@@ -267,6 +276,7 @@ class Assimilation(Shown):
         *,
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
         p_powers: float | None = None,
+        through_walls: bool = False,
     ) -> "Assimilation":
         """Fit the process to measurements.
 
@@ -282,6 +292,9 @@ class Assimilation(Shown):
         frequency_hz : float
         p_powers : float, optional
             Prior probability that powers were measured, with an unknown offset, and no path gains.
+        through_walls : bool
+            Whether the prior comes from a trace through walls. Measurements are then taken for those of a real radio:
+            the loss of walls is inferred with them, and no trace is certain.
 
         Returns
         -------
@@ -308,11 +321,13 @@ class Assimilation(Shown):
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
         sample = _Sample.of(measured)
-        longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in KINDS))
+        kinds = KINDS_THROUGH_WALLS if through_walls else KINDS
+        longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in kinds))
         links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
         if p_powers is None:
             p_powers = P_POWERS if links.tx_seen else UNSEEN_P_POWERS
-        hypotheses = _hypotheses(sample, links, prior, min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P))
+            p_powers = P_POWERS_THROUGH_WALLS if through_walls else p_powers
+        hypotheses = _hypotheses(sample, links, prior, kinds, min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P))
         best = max(hypotheses, key=lambda each: each.log_p)
         weights, precision = _posterior(best.covariance, best.residual, sample.received, best.noise)
         in_common, kind = best.common @ weights, best.kind
@@ -366,8 +381,10 @@ class Assimilation(Shown):
         weights = np.exp(logs - logs.max(axis=0))
         pull = np.where(np.arange(3)[:, None] == LinkState.OUTAGE, 0.0, variance / total)
         means_db = np.clip(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB, 0.0)
-        stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, variance * (1.0 - pull)), 0.0))
-        return prior.where(informed, LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db))
+        left = variance * (1.0 - pull)
+        stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, left) if self._kind.exact else left, 0.0))
+        updated = LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db)
+        return prior.where(informed, updated) if self._kind.exact else updated
 
     def _shadowed(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
         """Scale what is predicted of gains below free space."""
