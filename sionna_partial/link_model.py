@@ -41,6 +41,7 @@ from sionna_partial.measurements.measurements import Measurements, measurements_
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.prediction.unobserved import is_enclosed
+from sionna_partial.prediction.wall_losses import WALL_LOSSES, predict_through_walls, wall_loss_db
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.simulation import Simulation, checked_positions, clear_of_walls, nearest_m, simulation_of
@@ -148,8 +149,16 @@ class LinkModel:
     def predictor(self) -> Predictor:
         """The predictor, which is read when it is first needed."""
         model = warm_predictor(self.asked)
-        _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
+        if self._by_wall_losses:
+            _log.warning("paths go through walls, which no network was trained for: %s predicts", WALL_LOSSES)
+        else:
+            _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
+
+    @property
+    def _by_wall_losses(self) -> bool:
+        """Whether the mean loss of walls predicts: networks of opaque walls do not know what is behind them."""
+        return self.asked is None and self.simulation.trace_settings.through_walls
 
     @property
     def predictor_of_map(self) -> Predictor | None:
@@ -215,7 +224,12 @@ class LinkModel:
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
         """Predict links from their features; the trace is the prediction of those that are complete."""
         trace = LinkPrediction.of_trace(phi)
-        return trace if complete.all() else self.predictor.predict(phi).where(complete, trace)
+        if complete.all():
+            return trace
+        if self._by_wall_losses:
+            settings, material = self.simulation.trace_settings, self.simulation.scene_settings.material
+            return predict_through_walls(phi, wall_loss_db(material, settings.frequency_hz)).where(complete, trace)
+        return self.predictor.predict(phi).where(complete, trace)
 
     def links(self, tx_m: Floats, rx_m: Floats, report: Progress = no_progress) -> PredictedLinks:
         """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept."""
@@ -277,6 +291,7 @@ class LinkModel:
                 complete = all(self._complete(each_m, grids[0].rx_m).all() for each_m in positions_m)
                 where = {"transmitter_m": source.position_m, **attributes}
                 of_all = provenance(self.simulation, None if complete else self.predictor) | where
+                of_all |= {"predictor": WALL_LOSSES} if self._by_wall_losses and not complete else {}
                 of_all |= {} if measured is None else _measurement_attributes(measured, source)
                 coverage = coverage_map(self.partial, grid, values, of_all)
                 maps.append(coverage if posterior is None else with_posterior(coverage, posterior))

@@ -39,7 +39,7 @@ ROOMS = {
     ),
     "prediction": (
         *("unobserved", "windows", "features", "inputs"),
-        *("paper_networks", "map_networks", "predictor_files", "predictor"),
+        *("paper_networks", "map_networks", "predictor_files", "predictor", "wall_losses"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("coverage_map", "link_model", "coverage"),

@@ -1,0 +1,83 @@
+"""Where paths go through walls, unobserved space takes the mean loss of walls, and no network predicts."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sionna_partial as sp
+from sionna_partial.constants import LinkState
+from sionna_partial.prediction.wall_losses import WALL_LOSSES, predict_through_walls, wall_loss_db
+
+WIFI = sp.TraceSettings(5e9, max_depth=2)
+
+
+def half_seen() -> sp.PartialMap:
+    """Two rooms behind each other, of which the robot saw the first and the door."""
+    state = np.zeros((40, 80), dtype=np.uint8)
+    state[[0, -1]], state[:, [0, -1]], state[:15, 40] = 1, 1, 1
+    state[:, 45:] = 2
+    return sp.PartialMap(state, 0.1)
+
+
+def test_loss_of_a_wall() -> None:
+    losses = [wall_loss_db(sp.Material.named("drywall"), 1e9 * band) for band in (2.4, 5.0, 28.0)]
+    assert losses == sorted(losses)
+    assert 2.0 < losses[0] < 4.0
+    assert wall_loss_db(sp.Material.named("metal"), 5e9) == pytest.approx(160.0)
+
+
+def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
+    model = sp.LinkModel(half_seen(), trace_settings=WIFI)
+    phi = model.features((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
+    found = predict_through_walls(phi, 4.0)
+    assert phi.unobserved_distance_m[0] == 0.0
+    assert found.p_los[0] == 1.0
+    assert found.gain_mean_db[0] == pytest.approx(phi.gain_db[0])
+    assert (np.diff(found.p_los) < 0.0).all()
+    assert (np.diff(found.gain_mean_db) < 0.0).all()
+    assert (np.diff(found.gain_std_db) > 0.0).all()
+    np.testing.assert_allclose(found.p_los + found.p_nlos + found.p_outage, 1.0)
+
+
+def test_outages_stay() -> None:
+    phi = sp.LinkModel(half_seen(), trace_settings=WIFI).features((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
+    lost = replace(phi, gain_db=np.array([-150.0]), link_state=np.array([LinkState.OUTAGE], dtype=np.uint8))
+    found = predict_through_walls(lost, 4.0)
+    assert (found.p_outage.item(), found.gain_mean_db.item(), found.gain_std_db.item()) == (1.0, -150.0, 0.0)
+
+
+def test_the_default_through_walls(caplog: pytest.LogCaptureFixture) -> None:
+    """The default predictor below 24 GHz, named in the coverage; a predictor that was asked for predicts."""
+    tx, options = (1.0, 2.0, 1.5), {"spacing_m": 0.5, "trace_settings": WIFI}
+    with caplog.at_level(logging.WARNING):
+        coverage = sp.predict_map(half_seen(), tx, **options)
+    assert any("no network was trained for" in message for message in caplog.messages)
+    assert coverage.attrs["predictor"] == WALL_LOSSES
+    assert coverage.attrs["walls"] == "through walls"
+    assert float(coverage.p_outage.max()) == 0.0
+    opaque = sp.predict_map(half_seen(), tx, spacing_m=0.5, trace_settings=replace(WIFI, refraction=False))
+    assert opaque.attrs["predictor"] == "map"
+    assert sp.predict_map(half_seen(), tx, predictor="paper", **options).attrs["predictor"] == "paper"
+
+
+def test_measured_powers_through_walls() -> None:
+    """Offset and loss of walls are found with them, and links that are certain without are so no more."""
+    state = np.where(half_seen().state == 2, 0, half_seen().state).astype(np.uint8)
+    state[[0, -1]], state[:, -1] = 1, 1
+    home = sp.PartialMap(state, 0.1)
+    tx, rng = (1.0, 2.0, 1.5), np.random.default_rng(0)
+    rx = np.column_stack([rng.uniform(0.5, 7.5, 60), rng.uniform(0.5, 3.5, 60), np.full(60, 1.4)])
+    rx = rx[(np.abs(rx[:, 0] - 4.05) > 0.2) & (np.linalg.norm(rx - tx, axis=1) > 0.3)]
+    model = sp.LinkModel(home, trace_settings=WIFI)
+    power_dbm = model.predict(tx, rx).gain_mean_db + 17.0 + 2.0 * rng.standard_normal(len(rx))
+    prior = model.predict(tx, rx[:20])
+    assert (prior.gain_std_db == 0.0).any()
+    measured = sp.Measurements(tx, rx[:20], power_dbm[:20])
+    fitted = sp.Assimilation.fit(home, tx, measured, prior, frequency_hz=5e9, through_walls=True)
+    assert fitted.offset_db == pytest.approx(17.0, abs=2.0)
+    found = fitted.update(rx[20:], model.predict(tx, rx[20:]))
+    error_db = found.gain_mean_db + fitted.offset_db - power_dbm[20:]
+    assert np.sqrt(np.mean(error_db**2)) < 4.0
+    assert (found.gain_std_db > 0.5).all()
