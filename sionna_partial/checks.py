@@ -87,7 +87,9 @@ def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return a scalar of NumPy as a number of Python, and anything else as it is."""
+    """Return a scalar of NumPy as a number of Python, times as texts, and anything else as it is."""
+    if getattr(getattr(value, "dtype", None), "kind", "") in tuple("mM"):
+        return str(value)
     return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
 
 
@@ -122,7 +124,8 @@ def real_array(
 
 def is_whole(value: object, low: int = 0) -> bool:
     """Whether `value` is a whole number of `low` or more."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= low
+    number = plain(value)
+    return isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= low
 
 
 def are_stages(value: Any) -> bool:

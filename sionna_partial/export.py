@@ -173,7 +173,7 @@ def _encode_netcdf(coverage: xr.Dataset) -> bytes:
     encoding: dict[str, dict[str, Any]] = {name: {"_FillValue": None} for name in ("x", "y")}
     encoding |= {str(name): {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
     stream = io.BytesIO()
-    write_netcdf(coverage, encoding, stream)
+    write_netcdf(coverage.compute(), encoding, stream)
     return stream.getvalue()
 
 

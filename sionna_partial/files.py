@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from sionna_partial.checks import shown
+from sionna_partial.checks import require, shown
 from sionna_partial.errors import OutputError, SionnaPartialError
 from sionna_partial.process import own_folder, signals_held
 
@@ -121,11 +121,15 @@ def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], stream: Any) 
     """
     import h5netcdf
     import h5py
+    import numpy as np
     import xarray as xr
     from h5py import h5f, h5fd, h5p
     from xarray.backends import H5NetCDFStore
     from xarray.backends.common import ArrayWriter
 
+    for name, value in table.attrs.items():
+        kind = np.asarray(value).dtype.kind
+        require(kind in "biufSU", f"attribute {name}", value, "give a number or a text.")
     creation, access, writer = h5p.create(h5p.FILE_CREATE), h5p.create(h5p.FILE_ACCESS), ArrayWriter()
     creation.set_obj_track_times(False)
     for set_order in (creation.set_link_creation_order, creation.set_attr_creation_order):

@@ -163,9 +163,14 @@ def require_network(network: xr.Dataset) -> None:
     """Raise a SettingsError unless `network` is what `network_map` returns."""
     remedy = "give what network_map returned."
     require_type("network", network, xr.Dataset, remedy)
-    wanted = {name: ("tx", "y", "x")[name != "p_best" :] for name in (*VARIABLES, "cell_state", "observed")}
-    wanted |= {name: (name.partition("_")[0],) for name in ("x", "y", "tx", *TX_COORDINATES)}
-    missing = [name for name, dims in wanted.items() if name not in network or network[name].dims != dims]
+    wanted = {name: (("tx", "y", "x")[name != "p_best" :], "f") for name in VARIABLES}
+    wanted["best_server"] = ("y", "x"), "i"
+    wanted |= dict.fromkeys(("cell_state", "observed", "wall_parts"), (("y", "x"), "biu"))
+    wanted |= {name: ((name.partition("_")[0],), "f") for name in ("x", "y", *TX_COORDINATES)}
+    missing = ["tx"] if "tx" not in network.coords else []
+    for name, (dims, kinds) in wanted.items():
+        if name not in network or network[name].dims != dims or network[name].dtype.kind not in kinds:
+            missing.append(name)
     missing += [name for name in _ATTRIBUTES if not math.isfinite(number_of(network.attrs.get(name)))]
     require(not missing and network["cell_state"].size > 0, "network without", missing, remedy)
     require_names("network.tx", [str(name) for name in network["tx"].to_numpy()])

@@ -142,6 +142,13 @@ def test_names_of_transmitters_are_texts_for_files(coverage: xr.Dataset, names: 
         sp.network_map(coverage.assign_coords(tx=("tx", [str(name) for name in names])))
 
 
+@pytest.mark.parametrize("value", [np.datetime64("now"), np.timedelta64(3), object(), 1j, 2**70])
+def test_attributes_that_no_file_holds(coverage: xr.Dataset, tmp_path: Path, value: object) -> None:
+    with pytest.raises(SettingsError, match="attribute mine = "):
+        sp.save_coverage(coverage.chunk(x=3).assign_attrs(mine=value), tmp_path / "coverage.nc")
+    assert not [*tmp_path.iterdir()]
+
+
 def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     network = sp.network_map(coverage)
     for suffix in (".nc", ".tif", ".csv", ".png"):
@@ -155,6 +162,7 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     sp.save_network(xr.load_dataset(tmp_path / "network.nc"), tmp_path / "again.nc")
     assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "network.nc").read_bytes()
     others = coverage, network.drop_vars("p_best"), network.isel(x=0), network.assign_attrs(load="much")
+    others += (network.astype(str),)
     for other in others:
         with pytest.raises(SettingsError, match="give what network_map returned"):
             sp.plot_network(other)

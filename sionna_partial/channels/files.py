@@ -238,7 +238,9 @@ def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
             found[name] = (name[:2], "axis"), values[:, 0] if name == "tx_m" else values[0]
         else:
             found[name] = ("tx", "rx", *dims[1:]), values
-    along = {name: each.variable for name, each in links.coords.items() if name in ("frequency", "tap")}
+    along = {str(name): each.variable for name, each in links.coords.items() if name in ("frequency", "tap")}
+    for name, each in along.items():
+        require(each.dtype.kind in "iuf", f"channels.{name}", each.dtype, _CHANNELS)
     kept = {name: number_of(links.attrs.get(name)) for name in _ATTRIBUTES}
     kept = {name: value for name, value in kept.items() if math.isfinite(value)}
     return xr.Dataset(found, coords=along, attrs=kept | {"transmitters": len(tx), "receivers": len(rx)})
