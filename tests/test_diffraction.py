@@ -8,7 +8,8 @@ from extruded import ROOM, SPLINTERS, chains_between, diffracted_blocks, extrude
 from numpy.typing import NDArray
 
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.candidates import EDGE, Candidates
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, find_wedges
 
 TX = np.array([1.07, 1.93, 1.2])
@@ -27,16 +28,17 @@ def _join(
     wedges = find_wedges(geometry, open_ends=False)
     blocks = diffracted_blocks(geometry, wedges, tx, rx, max_depth, walls_a_side)
     parts = [part for part, _ in blocks]
-    names = ("rx", "face", "vertices_m", "wedge")
+    names = ("rx", "kind", "face", "vertices_m", "wedge")
     return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), wedges)
 
 
 def _ways(found: Candidates, floor_face: int) -> list[tuple[tuple[float, ...], int, int]]:
     """All numbers of each candidate, and how many walls mirror it before and after its edge; sorted."""
     ways = []
-    for rx, face, vertices, wedge in zip(found.rx, found.face, found.vertices_m, found.wedge, strict=True):
-        at, wall = int(np.flatnonzero(face == EDGE)[0]), (face >= 0) & (face < floor_face)
-        used = face != -1
+    columns = found.rx, found.kind, found.face, found.vertices_m, found.wedge
+    for rx, kind, face, vertices, wedge in zip(*columns, strict=True):
+        at, used = int(np.flatnonzero(kind == DIFFRACTION)[0]), kind != 0
+        wall = used & (kind != DIFFRACTION) & (face < floor_face)
         row = (float(rx), float(wedge), *face[used].tolist(), *vertices[used].ravel().tolist())
         ways.append((row, int(wall[:at].sum()), int(wall[at + 1 :].sum())))
     return sorted(ways)
@@ -113,8 +115,8 @@ class TestDiffractionCandidates:
         found = _join(geometry, rx)
         edges = found.wedges.edge_m
         ways = set()
-        for receiver, face, wedge in zip(found.rx, found.face, found.wedge, strict=True):
-            at = int(np.flatnonzero(face == EDGE)[0])
+        for receiver, kind, face, wedge in zip(found.rx, found.kind, found.face, found.wedge, strict=True):
+            at = int(np.flatnonzero(kind == DIFFRACTION)[0])
             before, after = face[:at] // 2, face[at + 1 :]
             ways.add((int(receiver), tuple(before), int(wedge % len(edges)), tuple(after[after >= 0] // 2)))
         truth = set()
@@ -133,12 +135,12 @@ class TestDiffractionCandidates:
         geometry = extrude(ROOM)
         found = _join(geometry, rx)
         assert {geometry.floor_face, geometry.ceiling_face} <= set(found.face.ravel().tolist())
-        for index, face, vertices in zip(found.rx, found.face, found.vertices_m, strict=True):
-            points = np.concatenate([TX[None], vertices[face != -1], rx[index][None]])
+        for index, kinds, face, vertices in zip(found.rx, found.kind, found.face, found.vertices_m, strict=True):
+            points = np.concatenate([TX[None], vertices[kinds != 0], rx[index][None]])
             direction = np.diff(points, axis=0)
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            for number, before, after in zip(face, direction[:-1], direction[1:], strict=False):
-                if number == EDGE:
+            for kind, number, before, after in zip(kinds, face, direction[:-1], direction[1:], strict=False):
+                if kind == DIFFRACTION:
                     assert after[2] == pytest.approx(before[2], abs=1e-9)
                     continue
                 normal = np.array([0, 0, 1.0])

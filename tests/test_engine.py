@@ -88,7 +88,8 @@ class TestVerify:
     def test_a_candidate_through_a_wall_is_refused(self, tmp_path: Path) -> None:
         geometry = extrude(ROOM)
         rx = np.array([[5.0, 0.4, 1.5], [2.0, 2.0, 1.5]])
-        through = Candidates(np.array([0, 1], np.int32), np.full((2, 1), -1, np.int32), np.zeros((2, 1, 3)))
+        kind, face = np.zeros((2, 1), np.uint8), np.full((2, 1), -1, np.int32)
+        through = Candidates(np.array([0, 1], np.int32), kind, face, np.zeros((2, 1, 3)))
         assert _solver(geometry, tmp_path).verify(through, TX, rx)[0].path_rx.tolist() == [1]
 
     def test_no_candidates_give_no_paths(self, tmp_path: Path) -> None:
@@ -122,7 +123,7 @@ class TestCompiling:
 def _elsewhere(candidates: Candidates, skip: int) -> Candidates:
     """Copy candidates to addresses that are off by `skip` of their numbers."""
     moved = {}
-    for name in ("rx", "face", "vertices_m"):
+    for name in ("rx", "kind", "face", "vertices_m"):
         values = getattr(candidates, name)
         moved[name] = np.concatenate([np.zeros(skip, values.dtype), values.ravel()])[skip:].reshape(values.shape)
     return dataclasses.replace(candidates, **moved)

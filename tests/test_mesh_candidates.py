@@ -154,7 +154,7 @@ class TestRoom:
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
         whole = candidates_of(scene, room(), TX, RX)
         parts = candidates_of(scene, room(), TX, RX, receivers_per_block=50)
-        for name in ("rx", "face", "vertices_m"):
+        for name in ("rx", "kind", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 
 

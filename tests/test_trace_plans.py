@@ -81,7 +81,7 @@ def test_blocks_of_candidates_together_hold_what_one_block_holds() -> None:
     assert len(parts) > 3
     assert list(shares) == sorted(shares)
     assert shares[-1] == 1.0
-    for name in ("rx", "face", "vertices_m"):
+    for name in ("rx", "kind", "face", "vertices_m"):
         np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(whole, name))
 
 

@@ -5,14 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.tracing.paths import widened
-
-EDGE = -2
-"""Stands for the face of an interaction in a candidate where that is a diffraction."""
-
-WALL, SAME_WALL = 1, 2
-"""What crossing a face costs: the loss of a wall, or nothing, since it belongs to a wall that has been crossed."""
 
 
 @dataclass(frozen=True)
@@ -38,45 +32,47 @@ class Wedges:
 class Candidates:
     """C geometrically possible paths, to be verified.
 
-    `rx` (C,) is the receiver of each. `face` (C, D) is the face of the scene at every interaction in order from the
-    transmitter, counted through its shapes; any of the faces in one plane stands for all. It is EDGE where the path is
-    diffracted, and -1 where there is no interaction. `vertices_m` (C, D, 3) are the points of interaction [m]. If all
-    candidates are diffracted, `wedge` (C,) is the one of `wedges` at which each is. If any candidate goes through
-    walls, `crossed` (C, D) is WALL where it does, SAME_WALL at further faces of that wall, which cost nothing, and 0
-    elsewhere.
+    `rx` (C,) is the receiver of each. `kind` (C, D) is Sionna RT's `InteractionType` of every interaction in order from
+    the transmitter, 0 where there is none. `face` (C, D) is the face of the scene there, counted through its shapes:
+    any of the faces in one plane stands for all, the 0-face for an edge, and -1 for none. `vertices_m` (C, D, 3) are
+    the points of interaction [m]. If all candidates are diffracted, `wedge` (C,) is the one of `wedges` at which each is.
+    If any candidate goes through walls, `same_wall` (C, D) marks refractions at further faces of a wall that has been
+    crossed: they cost nothing.
     """
 
     rx: NDArray[np.int32]
+    kind: NDArray[np.uint8]
     face: NDArray[np.int32]
     vertices_m: Floats
     wedge: NDArray[np.int32] | None = None
     wedges: Wedges | None = None
-    crossed: NDArray[np.uint8] | None = None
+    same_wall: Bools | None = None
 
     def is_like(self, other: "Candidates") -> bool:
         """Whether both can be verified together."""
         same = self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
-        return same and (self.crossed is None) == (other.crossed is None)
+        return same and (self.same_wall is None) == (other.same_wall is None)
 
     @classmethod
     def concatenate(cls, parts: list["Candidates"]) -> "Candidates":
         """Join candidates that can be verified together; at least one part."""
         wedge = None if parts[0].wedge is None else np.concatenate([each.wedge for each in parts])  # type: ignore[misc]
-        crossed = None if parts[0].crossed is None else np.concatenate([each.crossed for each in parts])  # type: ignore[misc]
-        rx, face, vertices_m = (
-            np.concatenate([getattr(each, name) for each in parts]) for name in ("rx", "face", "vertices_m")
+        same = None if parts[0].same_wall is None else np.concatenate([each.same_wall for each in parts])  # type: ignore[misc]
+        rx, kind, face, vertices_m = (
+            np.concatenate([getattr(each, name) for each in parts]) for name in ("rx", "kind", "face", "vertices_m")
         )
-        return cls(rx, face, vertices_m, wedge, parts[0].wedges, crossed)
+        return cls(rx, kind, face, vertices_m, wedge, parts[0].wedges, same)
 
     def widened(self, depth: int) -> "Candidates":
         """Return them with room for `depth` interactions."""
-        crossed = None if self.crossed is None else widened(self.crossed, depth, 0)
-        face, vertices_m = widened(self.face, depth, -1), widened(self.vertices_m, depth, 0.0)
-        return replace(self, face=face, vertices_m=vertices_m, crossed=crossed)
+        same_wall = None if self.same_wall is None else widened(self.same_wall, depth, 0)
+        kind, face = widened(self.kind, depth, 0), widened(self.face, depth, -1)
+        vertices_m = widened(self.vertices_m, depth, 0.0)
+        return replace(self, kind=kind, face=face, vertices_m=vertices_m, same_wall=same_wall)
 
     def rows(self, index: Indices) -> "Candidates":
         """Pick some of the candidates."""
         wedge = None if self.wedges is None or self.wedge is None else self.wedge[index]
-        crossed = None if self.crossed is None else self.crossed[index]
-        rx, face, vertices_m = self.rx[index], self.face[index], self.vertices_m[index]
-        return replace(self, rx=rx, face=face, vertices_m=vertices_m, wedge=wedge, crossed=crossed)
+        same_wall = None if self.same_wall is None else self.same_wall[index]
+        columns = {name: getattr(self, name)[index] for name in ("rx", "kind", "face", "vertices_m")}
+        return replace(self, **columns, wedge=wedge, same_wall=same_wall)

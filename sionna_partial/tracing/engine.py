@@ -27,7 +27,7 @@ from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.process import signals_held
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import EDGE, SAME_WALL, Candidates, Wedges
+from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
@@ -179,14 +179,14 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
 
 def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
     """Return verified candidates without the faces that cost nothing: a refraction does not change a path."""
-    if candidates.crossed is None:
+    if candidates.same_wall is None:
         return buffer
     import drjit as dr
     import mitsuba as mi
     from sionna.rt.constants import InteractionType
     from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
-    dropped, none = candidates.crossed == SAME_WALL, candidates.face == -1
+    dropped, none = candidates.same_wall, candidates.kind == InteractionType.NONE
     count, depth = dropped.shape
     kept = np.argsort(dropped, axis=1, kind="stable")
     kept = kept[:, : max(1, int((~dropped & ~none).sum(axis=1).max()))]
@@ -412,17 +412,9 @@ class SceneSolver:
     def _buffer(self, candidates: Candidates) -> Any:
         """Fill one of Sionna RT's path buffers with unverified candidates."""
         import mitsuba as mi
-        from sionna.rt.constants import InteractionType
         from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
-        face = candidates.face
-        kind = np.where(face == EDGE, InteractionType.DIFFRACTION, InteractionType.SPECULAR).astype(np.uint32)
-        kind[face == -1] = InteractionType.NONE
-        if candidates.crossed is not None:
-            kind[candidates.crossed > 0] = InteractionType.REFRACTION
-        if candidates.wedges is not None and candidates.wedge is not None:
-            # Sionna RT takes the normal of the 0-face from the face that a path diffracts at
-            face = np.where(face == EDGE, candidates.wedges.face[candidates.wedge, :1], face)
+        face, kind = candidates.face, candidates.kind.astype(np.uint32)
         shape, primitive = self._shape_of_face[face], self._primitive_of_face[face]
         buffer = PathsBuffer(*face.shape, candidates.wedges is not None)
         buffer._vertices_x, buffer._vertices_y, buffer._vertices_z = (

@@ -259,7 +259,7 @@ def _merged(parts: list[Part]) -> list[Part]:
             (candidates, paths)
             for candidates, paths in parts
             if len(candidates.rx)
-            and (candidates.wedges is not None, candidates.crossed is not None) == (diffracted, crossing)
+            and (candidates.wedges is not None, candidates.same_wall is not None) == (diffracted, crossing)
         ]
         if not some:
             continue

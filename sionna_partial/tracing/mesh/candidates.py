@@ -17,6 +17,7 @@ from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.planes import face_at, group_planes
 from sionna_partial.tracing.mesh.sequences import Rays, collect_sequences, view_sequences
+from sionna_partial.tracing.paths import REFLECTION
 
 _REACH, _REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
@@ -92,10 +93,10 @@ class MeshCandidates:
         """
         direct = np.flatnonzero((strengths.first == 0) & (strengths.last > 0)).astype(np.int32)
         face, points = np.full((len(direct), self._size), -1, np.int32), np.zeros((len(direct), self._size, 3))
-        yield Candidates(direct, face, points), 0.0
+        yield Candidates(direct, np.zeros(face.shape, np.uint8), face, points), 0.0
         count, done = len(self._best), 0
         while done < count:
-            *columns, done = _next_block(
+            rx, face, points, done = _next_block(
                 done,
                 (self._sequences, self._views, self._planes, self._boxes, self._material),
                 self._rx_m,
@@ -104,7 +105,8 @@ class MeshCandidates:
                 self._best,
                 receivers_per_block,
             )
-            yield Candidates(*columns), done / count
+            kind = np.where(face < 0, 0, REFLECTION).astype(np.uint8)
+            yield Candidates(rx, kind, face, points), done / count
 
 
 @njit(cache=True)

@@ -20,7 +20,8 @@ from sionna_partial.scene.floor_plan import Plan, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry, constants_of
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.bounds import dropped_power
-from sionna_partial.tracing.candidates import SAME_WALL, WALL, Candidates
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.paths import REFLECTION, REFRACTION
 from sionna_partial.tracing.plan.beams import TOLERANCE_M, _add_points, _reflect, _root_beams, _Scratch, _visible_pieces
 from sionna_partial.tracing.plan.specular import CEILING, FLOOR, Room, can_bounce, merge_heights, unfolded_height
 from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
@@ -48,8 +49,9 @@ _AT_ONCE = 100_000
 _PAIRS_AT_ONCE = 5_000
 """Number of pairs whose power is computed by one thread at a time."""
 
-_FLAT = 3
-"""Kind of a reflection at floor or ceiling, beside 0 at a wall, WALL and SAME_WALL."""
+WALL, SAME_WALL, _FLAT = 1, 2, 3
+"""What a path does, if it is not reflected at a wall (0): it crosses a wall, a further face of that wall, which costs
+nothing, or is reflected at floor or ceiling."""
 
 _FACES = 40
 """Most faces of walls that a leg may cross."""
@@ -224,8 +226,9 @@ class CrossingCandidates:
         surface, kind, vertices_m = surface[:, :used], kind[:, :used], vertices_m[:, :used]
         flat = np.where(vertices_m[:, :, 2] > 0.5 * self._room.height_m, geometry.ceiling_face, geometry.floor_face)
         face = np.where(kind == _FLAT, flat, np.where(kind < 0, -1, 2 * surface)).astype(np.int32)
-        crossed = np.where((kind == WALL) | (kind == SAME_WALL), kind, 0).astype(np.uint8)
-        return Candidates(tree.pair[chosen, 1].astype(np.int32), face, vertices_m, crossed=crossed)
+        same_wall = kind == SAME_WALL
+        kind = np.where(same_wall | (kind == WALL), REFRACTION, np.where(kind < 0, 0, REFLECTION)).astype(np.uint8)
+        return Candidates(tree.pair[chosen, 1].astype(np.int32), kind, face, vertices_m, same_wall=same_wall)
 
 
 def slab_of(material: Floats, frequency_hz: float) -> Slab:

@@ -30,6 +30,7 @@ from sionna_partial.tracing.bounds import (
     wedge_constants,
 )
 from sionna_partial.tracing.candidates import Candidates, Wedges
+from sionna_partial.tracing.paths import DIFFRACTION
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
 from sionna_partial.tracing.plan.specular import (
     CEILING,
@@ -38,8 +39,8 @@ from sionna_partial.tracing.plan.specular import (
     Room,
     can_bounce,
     clear,
-    faces_of,
     incidence,
+    interactions_of,
     merge_heights,
     unfold,
     unfolded_height,
@@ -153,7 +154,9 @@ class DiffractionCandidates:
             rx, wedge, surface, vertices_m = _combine(
                 *self._beams[number], groups[number], self._edges, self._arrivals, self._room, self._reflections, own
             )
-            return Candidates(rx, faces_of(surface, geometry), vertices_m, wedge, self._wedges), own.power
+            kind, face = interactions_of(surface, geometry)
+            face = np.where(kind == DIFFRACTION, self._wedges.face[wedge, :1], face)
+            return Candidates(rx, kind, face, vertices_m, wedge, self._wedges), own.power
 
         for number, (candidates, power) in enumerate(in_order(listed, range(len(groups)))):
             strengths.power[:] += power

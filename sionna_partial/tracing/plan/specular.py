@@ -15,7 +15,8 @@ from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.bounds import LEVELS, Strengths, at_flats, at_wall, level_of
-from sionna_partial.tracing.candidates import EDGE, Candidates
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.paths import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.plan.beams import trace_beams
 
 FLOOR, CEILING, DIFFRACTED = -2, -3, -4
@@ -67,14 +68,18 @@ class SpecularCandidates:
             rx, surface, vertices_m = _expand_heights(
                 self._beams, start, stop, self._room, self._max_depth, strengths, self._best
             )
-            yield Candidates(rx, faces_of(surface, self._geometry), vertices_m), stop / count
+            yield Candidates(rx, *interactions_of(surface, self._geometry), vertices_m), stop / count
 
 
-def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.int32]:
-    """Turn wall segments, FLOOR, CEILING and DIFFRACTED (C, D) into faces of the scene; -1 stays."""
-    walls = 2 * np.arange(len(geometry.segments), dtype=np.int32)
-    others = np.array([EDGE, geometry.ceiling_face, geometry.floor_face, -1], dtype=np.int32)
-    return np.concatenate([walls, others])[surface]
+def interactions_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
+    """Turn wall segments, FLOOR, CEILING and DIFFRACTED (C, D) into kinds of interactions and faces of the scene.
+
+    Edges have no face yet: -1, as where there is no interaction.
+    """
+    walls = np.arange(len(geometry.segments))
+    face = np.append(2 * walls, [-1, geometry.ceiling_face, geometry.floor_face, -1]).astype(np.int32)
+    kind = np.append(0 * walls + REFLECTION, [DIFFRACTION, REFLECTION, REFLECTION, 0]).astype(np.uint8)
+    return kind[surface], face[surface]
 
 
 @njit(cache=True, nogil=True)
