@@ -92,6 +92,14 @@ class TestVerify:
         through = Candidates(np.array([0, 1], np.int32), kind, face, np.zeros((2, 1, 3)))
         assert _solver(geometry, tmp_path).verify(through, TX, rx)[0].path_rx.tolist() == [1]
 
+    @pytest.mark.parametrize("make", [_specular, _diffracted], ids=["specular", "diffracted"])
+    def test_paths_are_of_the_kinds_of_their_candidates(self, make, tmp_path: Path) -> None:
+        geometry = extrude(ROOM)
+        candidates = make(geometry, TX, RX, 2)
+        paths, rows = _solver(geometry, tmp_path).verify(candidates, TX, RX)
+        assert len(rows) > 20
+        assert candidates.kind[rows].tolist() == paths.interactions.tolist()
+
     def test_no_candidates_give_no_paths(self, tmp_path: Path) -> None:
         geometry = extrude(ROOM)
         none = _specular(geometry, TX, RX, 2).rows(np.zeros(0, np.intp))
