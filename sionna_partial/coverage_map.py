@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import number_of, real_array, require, require_names, require_number, shown
@@ -325,7 +325,8 @@ class CoverageAccessor:
     """
 
     def __init__(self, coverage: xr.Dataset) -> None:
-        self._coverage = coverage
+        inner = ("y", "x") if {"y", "x"} <= coverage.sizes.keys() else ()
+        self._coverage = coverage.transpose(..., *inner)
 
     def plot(self) -> Any:
         """Return the figure of `plot_coverage`."""
@@ -352,6 +353,158 @@ class CoverageAccessor:
         attributes = {"long_name": f"probability of a path gain above {threshold_db:g} dB", "units": "1"}
         values = self._coverage["p_los"].copy(data=above.astype(np.float32))
         return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
+
+    def power(self, *, eirp_dbm: ArrayLike = 20.0, rx_gain_db: float = 0.0) -> xr.Dataset:
+        """Return the received power: EIRP + path gain + gain of the receiver's antenna.
+
+        Parameters
+        ----------
+        eirp_dbm : float or (T,) array-like
+            Equivalent isotropically radiated power [dBm], of all or of each of the T transmitters.
+        rx_gain_db : float
+            Gain of the receiver's antenna [dB].
+
+        Returns
+        -------
+        xarray.Dataset
+            `power_mean_dbm`, an outage counting as a path gain of -150 dB, and `power_std_db`.
+
+        Raises
+        ------
+        SettingsError
+            For a power or a gain that is none.
+        """
+        return self._level("power", "dBm", self._offset_db(eirp_dbm, rx_gain_db))
+
+    def snr(
+        self,
+        *,
+        eirp_dbm: ArrayLike = 20.0,
+        rx_gain_db: float = 0.0,
+        noise_figure_db: float = 7.0,
+        bandwidth_hz: float = 100e6,
+    ) -> xr.Dataset:
+        """Return the SNR of the received `power` over -174 dBm/Hz + 10 log10(bandwidth) + noise figure.
+
+        Returns
+        -------
+        xarray.Dataset
+            `snr_mean_db`, an outage counting as a path gain of -150 dB, and `snr_std_db`. With interference:
+            `network_map`.
+        """
+        budget = later("link_budget:LinkBudget")(noise_figure_db, bandwidth_hz)
+        return self._level("snr", "dB", self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm)
+
+    def rate(
+        self,
+        standard: str,
+        *,
+        eirp_dbm: ArrayLike = 20.0,
+        rx_gain_db: float = 0.0,
+        noise_figure_db: float = 7.0,
+        bandwidth_hz: float = 80e6,
+    ) -> xr.DataArray:
+        """Return the mean rate [bit/s] of one spatial stream whose modulation and coding follow the SNR.
+
+        Parameters
+        ----------
+        standard : {"wifi6", "wifi7", "nr"}
+            Wi-Fi: MCS 0 to 11 of IEEE 802.11ax, 0 to 13 of 802.11be, guard interval 0.8 us, each from the SNR of the
+            standard's receiver sensitivity at its noise figure of 10 dB. NR: MCS 0 to 28 of 3GPP TS 38.214, table
+            5.1.3.1-1, each from the SNR at which it is 0.6 of the Shannon bound (TR 36.942, annex A), less the overhead
+            of TS 38.306.
+        bandwidth_hz : float
+            Of the channel; in Wi-Fi 20, 40, 80, 160 and (802.11be) 320 MHz.
+
+        Raises
+        ------
+        SettingsError
+            For another standard, or a channel that it does not have.
+        """
+        budget = later("link_budget:LinkBudget")(noise_figure_db, bandwidth_hz)
+        offset_db = self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm
+        mean, before = np.zeros(()), 0.0
+        table = later("link_budget:schemes")(standard, bandwidth_hz, float(self._coverage.attrs["frequency_hz"]))
+        for snr_db, rate_bit_s in table:
+            mean = mean + (rate_bit_s - before) * self._probability_of(snr_db - offset_db)
+            before = rate_bit_s
+        attributes = {"long_name": f"mean rate of {standard}, {bandwidth_hz / 1e6:g} MHz", "units": "bit/s"}
+        return self._coverage["p_los"].copy(data=np.float32(mean)).rename("rate_bit_s").assign_attrs(attributes)
+
+    def area(
+        self,
+        threshold_dbm: float,
+        *,
+        probability: float = 0.9,
+        eirp_dbm: ArrayLike = 20.0,
+        rx_gain_db: float = 0.0,
+    ) -> xr.Dataset:
+        """Return how much of the floor receives more than a power: "95 % of it above -67 dBm with probability 0.9".
+
+        Parameters
+        ----------
+        threshold_dbm : float
+            Received power, as `power` computes it [dBm].
+        probability : float
+            Required of each receiver, in [0, 1].
+
+        Returns
+        -------
+        xarray.Dataset
+            On `floor`, "observed" (free cells) and "all" (each receiver weighted by the probability that it is indoors;
+            1 in free cells): `fraction` with at least that probability, `fraction_mean`, the mean probability, and the
+            size `area_m2`; NaN where there is no such floor. Several transmitters are on `tx`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
+        >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+        >>> coverage.radio.area(-67.0, eirp_dbm=20.0).fraction.sel(floor="observed").item()
+        1.0
+        """
+        require_number("threshold_dbm", threshold_dbm, -400.0, 400.0)
+        require_number("probability", probability, 0.0, 1.0)
+        above = self._probability_of(threshold_dbm - self._offset_db(eirp_dbm, rx_gain_db))
+        valid, indoor = self._coverage["valid"].to_numpy() == 1, self._coverage["p_indoor"].to_numpy()
+        free = np.broadcast_to(self._coverage["cell_state"].to_numpy() == CellState.FREE, above.shape)
+        weights = np.stack([valid & free, np.where(valid, np.where(free, 1.0, indoor), 0.0)])
+        total = weights.sum(axis=(-2, -1))
+        dims = ("floor", *self._coverage["p_los"].dims[:-2])
+        with np.errstate(invalid="ignore"):
+            shares = [
+                (weights * np.nan_to_num(each)).sum(axis=(-2, -1)) / total for each in (above >= probability, above)
+            ]
+        values = {"fraction": shares[0], "fraction_mean": shares[1], "area_m2": total * self._coverage.spacing_m**2}
+        coordinates = {"floor": ["observed", "all"]} | ({"tx": self._coverage["tx"]} if len(dims) > 1 else {})
+        settings = {"threshold_dbm": float(threshold_dbm), "probability": float(probability)}
+        return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
+
+    def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
+        """Return what is added to path gains, () or (T, 1, 1) [dB]."""
+        maps = transmitters_of(self._coverage)
+        require_number("rx_gain_db", rx_gain_db, -200.0, 200.0)
+        offset_db = later("link_budget:transmit_powers_dbm")(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
+        return offset_db[:, None, None] if "tx" in self._coverage.dims else offset_db[0]
+
+    def _level(self, name: str, unit: str, offset_db: Floats) -> xr.Dataset:
+        mean_db = self._coverage["gain_mean_db"]
+        words = {"power": "received power", "snr": "SNR"}[name]
+        attributes = {"long_name": f"mean {words}, an outage counting -150 dB of path gain", "units": unit}
+        spread = {"long_name": f"standard deviation of the {words}", "units": "dB"}
+        return xr.Dataset(
+            {
+                f"{name}_mean_{unit.lower()}": mean_db.copy(data=np.float32(mean_db + offset_db)).assign_attrs(
+                    attributes
+                ),
+                f"{name}_std_db": self._coverage["gain_std_db"].assign_attrs(spread),
+            }
+        )
+
+    def _probability_of(self, threshold_db: Floats) -> Floats:
+        """Return P(path gain > threshold), thresholds () or (T, 1, 1); an outage is never above."""
+        columns = {name: self._coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
+        return LinkPrediction(**columns).probability_above(np.maximum(threshold_db, GAIN_FLOOR_DB))
 
     def at(self, x: float, y: float) -> xr.Dataset:
         """Return all variables at the receiver nearest to world x and y [m].

@@ -1,8 +1,8 @@
 """Networks of several transmitters: coverage maps -> best server, SINR and rate, with their uncertainty."""
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -11,10 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import (
-    Checked,
-    Within,
     number_of,
-    real_array,
     require,
     require_names,
     require_type,
@@ -23,39 +20,13 @@ from sionna_partial.checks import (
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
 from sionna_partial.errors import SettingsError
+from sionna_partial.link_budget import LinkBudget, transmit_powers_dbm
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
-
-NOISE_DENSITY_DBM_HZ = -174.0
-"""Thermal noise at 290 K [dBm/Hz]."""
 
 MOST_DRAWS = 1_000
 _RECEIVERS_AT_ONCE = 5_000
 _LOWEST_SINR_DB = -60.0
-
-
-@dataclass(frozen=True)
-class LinkBudget(Checked):
-    """What receivers and traffic of a network are like; the fields are arguments of `network_map`."""
-
-    noise_figure_db: Annotated[float, Within(0.0, 100.0)] = 7.0
-    bandwidth_hz: Annotated[float, Within(0.0, 1e12, open_low=True)] = 100e6
-    load: Annotated[float, Within(0.0, 1.0)] = 1.0
-    sinr_threshold_db: Annotated[float, Within(-200.0, 200.0)] = 0.0
-
-    @property
-    def noise_dbm(self) -> float:
-        """Thermal noise and that of the receiver [dBm]."""
-        return NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(self.bandwidth_hz) + self.noise_figure_db
-
-
-def transmit_powers_dbm(tx_power_dbm: ArrayLike, count: int) -> Floats:
-    """Return the powers (count,) of transmitters [dBm], or raise a SettingsError."""
-    remedy = f"give one power [dBm], or one for each of the {count} transmitters."
-    powers_dbm = real_array("tx_power_dbm", tx_power_dbm, SettingsError, remedy)
-    allowed = powers_dbm.shape in ((), (count,)) and bool((np.abs(powers_dbm) <= 200.0).all())
-    require(allowed, "tx_power_dbm", tx_power_dbm, remedy)
-    return np.array(np.broadcast_to(powers_dbm, count), dtype=np.float64)
 
 
 def _described(long_name: str, units: str = "1") -> dict[str, str]:

@@ -1,6 +1,7 @@
 import json
 import math
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from sionna_partial.coverage import predict_map
 from sionna_partial.coverage_map import ATTRIBUTES, WALL_PARTS, require_coverage
 from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.export import load_coverage
+from sionna_partial.link_budget import schemes
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -400,6 +402,55 @@ class TestAccessor:
         expected = (complete["gain_mean_db"] > -75.0).where(complete["valid"].astype(bool))
         assert np.array_equal(above, expected, equal_nan=True)
 
+    def test_power_and_snr_are_gains_and_a_link_budget(self, coverage, several):
+        power, snr = coverage.radio.power(eirp_dbm=23.0, rx_gain_db=2.0), coverage.radio.snr(bandwidth_hz=20e6)
+        np.testing.assert_allclose(power["power_mean_dbm"], coverage["gain_mean_db"] + 25.0, atol=1e-4)
+        np.testing.assert_allclose(snr["snr_mean_db"], coverage["gain_mean_db"] + 20.0 + 93.99, atol=1e-2)
+        np.testing.assert_array_equal(power["power_std_db"], coverage["gain_std_db"])
+        each = several.transpose("y", "x", "tx").radio.power(eirp_dbm=[20.0, 10.0])["power_mean_dbm"]
+        np.testing.assert_allclose(each, several["gain_mean_db"] + np.array([20.0, 10.0])[:, None, None], atol=1e-4)
+
+    def test_area_above_a_power_is_counted(self, complete, several):
+        area = complete.radio.area(-67.0, eirp_dbm=13.0, probability=0.9)
+        floor = (complete["valid"] & (complete["cell_state"] == CellState.FREE)).to_numpy() == 1
+        above = complete["gain_mean_db"].to_numpy()[floor] > -80.0
+        assert 0.0 < above.mean() < 1.0
+        assert area.fraction.sel(floor="observed").item() == pytest.approx(above.mean())
+        assert area.area_m2.sel(floor="observed").item() == pytest.approx(floor.sum() * complete.spacing_m**2)
+        assert several.radio.area(-67.0).fraction.dims == ("floor", "tx")
+        assert (several.radio.area(-400.0).fraction_mean < 1.0).all()  # an outage is never above
+
+    @pytest.mark.parametrize(
+        ("standard", "bandwidth_hz", "slowest", "fastest"),
+        [
+            ("wifi6", 20e6, 8.6e6, 143.4e6),
+            ("wifi6", 80e6, 36.0e6, 600.5e6),
+            ("wifi7", 320e6, 144.1e6, 2882.4e6),
+            ("nr", 100e6, 0.2344 * 82e6, 5.5547 * 82e6),
+        ],
+    )
+    def test_rates_are_those_of_the_standards(self, coverage, standard, bandwidth_hz, slowest, fastest):
+        table = schemes(standard, bandwidth_hz, 28e9)
+        assert [table[0].rate_bit_s, table[-1].rate_bit_s] == pytest.approx([slowest, fastest], rel=0.003)
+        assert all(low.snr_db < high.snr_db and low[1] < high[1] for low, high in pairwise(table))
+        rate = coverage.radio.rate(standard, bandwidth_hz=bandwidth_hz, eirp_dbm=200.0)
+        np.testing.assert_allclose(rate, coverage.radio.probability_above(-150.0) * table[-1].rate_bit_s, rtol=1e-3)
+
+    @pytest.mark.parametrize(
+        ("call", "message"),
+        [
+            (lambda radio: radio.power(eirp_dbm=[1.0, 2.0]), "eirp_dbm"),
+            (lambda radio: radio.power(rx_gain_db=np.nan), "rx_gain_db = nan"),
+            (lambda radio: radio.snr(bandwidth_hz=0.0), "bandwidth_hz = 0"),
+            (lambda radio: radio.rate("wifi5"), "standard = 'wifi5'"),
+            (lambda radio: radio.rate("wifi6", bandwidth_hz=320e6), "channels of wifi6 are 2e.07, 4e.07"),
+            (lambda radio: radio.area(-67.0, probability=1.1), "probability = 1.1"),
+        ],
+    )
+    def test_link_budgets_are_checked(self, coverage, call, message):
+        with pytest.raises(SettingsError, match=message):
+            call(coverage.radio)
+
     def test_at_is_the_nearest_receiver(self, coverage):
         here = coverage.radio.at(0.7, 3.1)
         assert abs(float(here.x) - 0.7) <= 0.125
@@ -427,10 +478,10 @@ class TestAccessor:
         assert loaded.identical(coverage)
         assert loaded.radio.at(0.7, 3.1).identical(coverage.radio.at(0.7, 3.1))
 
-    @pytest.mark.parametrize("call", ["probability_above", "at", "__repr__"])
+    @pytest.mark.parametrize("call", ["probability_above", "power", "rate", "area", "at", "__repr__"])
     def test_other_datasets_are_refused(self, call):
         other = xr.Dataset({"p_los": ("x", [0.5])})
-        arguments = {"probability_above": [-90.0], "at": [0.0, 0.0]}.get(call, [])
+        arguments = {"probability_above": [-90.0], "at": [0.0, 0.0], "rate": ["nr"], "area": [-67.0]}.get(call, [])
         with pytest.raises(SettingsError, match="coverage lacks "):
             getattr(other.radio, call)(*arguments)
 

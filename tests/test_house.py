@@ -47,7 +47,7 @@ ROOMS = {
         *("responses", "beams", "files"),
         *("joint", "path_model", "samples"),
     ),
-    "networks": ("network",),
+    "networks": ("link_budget", "network"),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
@@ -103,6 +103,9 @@ LATER = {
     "scene.wall_cells:wall_cells": "`PartialMap.wall_noise`",
     **dict.fromkeys([f"channels.responses:{name}" for name in ("cir", "cfr", "taps", "spreads")], "`TracedLinks`"),
     "channels.beams:beam_gains": "`TracedLinks.beam_gains`",
+    "link_budget:LinkBudget": "`coverage.radio.snr`",
+    "link_budget:schemes": "`coverage.radio.rate`",
+    "link_budget:transmit_powers_dbm": "`coverage.radio.power`",
 }
 """What `later` imports from later rooms, besides plots, and the method that it is for."""
 

@@ -43,7 +43,7 @@ def network(
     memory: opt.Memory = MEMORY_GB,
 ) -> None:
     """Predict best server, SINR and rate of several transmitters on a partial map."""
-    from sionna_partial.network import LinkBudget, transmit_powers_dbm
+    from sionna_partial.link_budget import LinkBudget, transmit_powers_dbm
 
     positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
     powers_dbm = transmit_powers_dbm(tx_power[0] if len(tx_power) == 1 else tx_power, len(positions))

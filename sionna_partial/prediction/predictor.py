@@ -199,7 +199,7 @@ class LinkPrediction(Shown):
         stds_db = np.stack([nothing, of.los_std_db, nlos_std_db])
         return cls.of_parts(np.stack([outage, los, 1.0 - outage - los]), np.maximum(means_db, GAIN_FLOOR_DB), stds_db)
 
-    def probability_above(self, threshold_db: float) -> Floats:
+    def probability_above(self, threshold_db: float | Floats) -> Floats:
         """Return the probability (N,) that the path gain exceeds a threshold t [dB], an outage counting -150 dB.
 
         ``p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t)``, where m and s are

@@ -1,0 +1,97 @@
+"""Link budgets: received power, noise, SNR, and the rates of the modulation and coding schemes (MCS) of standards."""
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sionna_partial.arrays import Floats
+from sionna_partial.checks import Checked, Within, real_array, require, require_choice
+from sionna_partial.errors import SettingsError
+
+NOISE_DENSITY_DBM_HZ = -174.0
+"""Thermal noise at 290 K [dBm/Hz]."""
+
+RATES = ("wifi6", "wifi7", "nr")
+"""Standards with a table of MCS."""
+
+_BITS = (0.5, 1, 1.5, 2, 3, 4, 4.5, 5, 6, 20 / 3, 7.5, 25 / 3, 9, 10)
+_SENSITIVITY_DBM = (-82, -79, -77, -74, -70, -66, -65, -64, -59, -57, -54, -52, -49, -46)
+"""Coded bits of a subcarrier, and minimum receiver sensitivity at 20 MHz, of MCS 0 to 11 (IEEE 802.11ax-2021, clause
+27.3.20.2) and 12 and 13 (IEEE 802.11be-2024, clause 36.3.21.2)."""
+
+_SENSITIVITY_HZ, _NOISE_FIGURE_DB, _SYMBOL_S = 20e6, 10.0, 13.6e-6
+"""Bandwidth and noise figure of these sensitivities, with 5 dB of implementation loss; symbol with guard interval."""
+
+_SUBCARRIERS = {20e6: 234, 40e6: 468, 80e6: 980, 160e6: 1960, 320e6: 3920}
+"""Data subcarriers of a channel of one user."""
+
+_NR_QPSK = (120, 157, 193, 251, 308, 379, 449, 526, 602, 679)
+_NR_16QAM = (340, 378, 434, 490, 553, 616, 658)
+_NR_64QAM = (466, 517, 567, 616, 666, 719, 772, 822, 873, 910, 948)
+"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1); MCS 17, which is no faster than 16, is left out."""
+
+_NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
+"""Overhead of the downlink (3GPP TS 38.306, clause 4.1.2)."""
+
+_NR_SHANNON = 0.6
+"""Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A)."""
+
+
+@dataclass(frozen=True)
+class LinkBudget(Checked):
+    """What receivers and traffic of a network are like; the fields are arguments of `network_map`."""
+
+    noise_figure_db: Annotated[float, Within(0.0, 100.0)] = 7.0
+    bandwidth_hz: Annotated[float, Within(0.0, 1e12, open_low=True)] = 100e6
+    load: Annotated[float, Within(0.0, 1.0)] = 1.0
+    sinr_threshold_db: Annotated[float, Within(-200.0, 200.0)] = 0.0
+
+    @property
+    def noise_dbm(self) -> float:
+        """Thermal noise and that of the receiver [dBm]."""
+        return NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(self.bandwidth_hz) + self.noise_figure_db
+
+
+def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power_dbm") -> Floats:
+    """Return the powers (count,) of transmitters [dBm], or raise a SettingsError."""
+    remedy = f"give one power [dBm], or one for each of the {count} transmitters, from -200 to 200."
+    found = real_array(name, powers_dbm, SettingsError, remedy)
+    allowed = found.shape in ((), (count,)) and bool((np.abs(found) <= 200.0).all())
+    require(allowed, name, powers_dbm, remedy)
+    return np.array(np.broadcast_to(found, count), dtype=np.float64)
+
+
+class Scheme(NamedTuple):
+    """A modulation and coding scheme: the least SNR [dB] at which it is used, and its rate [bit/s]."""
+
+    snr_db: float
+    rate_bit_s: float
+
+
+def schemes(standard: str, bandwidth_hz: float, frequency_hz: float) -> list[Scheme]:
+    """Return the schemes of a standard for one spatial stream, the slowest first.
+
+    Wi-Fi: the SNR of the standard's minimum sensitivity at a noise figure of 10 dB. NR, whose standard has none: the
+    SNR at which 0.6 of the Shannon bound is the spectral efficiency.
+    """
+    require_choice("standard", standard, RATES)
+    if standard == "nr":
+        overhead = _NR_OVERHEAD["FR1" if frequency_hz < 24e9 else "FR2"]
+        coded = [(2, rate) for rate in _NR_QPSK] + [(4, rate) for rate in _NR_16QAM] + [(6, rate) for rate in _NR_64QAM]
+        each = [order * rate / 1024 for order, rate in coded]
+        return [
+            Scheme(10 * math.log10(2 ** (bits / _NR_SHANNON) - 1), bits * bandwidth_hz * (1 - overhead))
+            for bits in each
+        ]
+    channels = [each for each in _SUBCARRIERS if standard == "wifi7" or each < 320e6]
+    remedy = f"channels of {standard} are {', '.join(f'{each:g}' for each in channels)} Hz wide."
+    require(bandwidth_hz in channels, "bandwidth_hz", bandwidth_hz, remedy)
+    noise_dbm = LinkBudget(_NOISE_FIGURE_DB, _SENSITIVITY_HZ).noise_dbm
+    count = {"wifi6": 12, "wifi7": 14}[standard]
+    return [
+        Scheme(level_dbm - noise_dbm, _SUBCARRIERS[bandwidth_hz] * bits / _SYMBOL_S)
+        for bits, level_dbm in zip(_BITS[:count], _SENSITIVITY_DBM[:count], strict=True)
+    ]
