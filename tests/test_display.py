@@ -35,7 +35,7 @@ PLACEMENT = sp.TransmitterPlacement(
 )
 SETTINGS = (
     *(sp.SceneSettings, sp.TraceSettings, sp.SensorSettings, sp.DatasetSettings, sp.Material),
-    *(sp.PredictorSettings, sp.PlacementSettings),
+    *(sp.PredictorSettings, sp.PlacementSettings, sp.LiveSettings),
 )
 
 
@@ -66,7 +66,15 @@ def test_one_line(value: Any, start: str) -> None:
 def test_every_public_class_is_shown_in_one_line() -> None:
     classes = {name for name in sp.__all__ if isinstance(getattr(sp, name), type)}
     own = {name for name in classes if getattr(getattr(sp, name).__repr__, "__module__", "").endswith(".display")}
-    others = {"CellState", "LinkState", "SionnaPartialError", "Simulation", "LinkModel", "DifferentiableScene"}
+    others = {
+        "CellState",
+        "LinkState",
+        "SionnaPartialError",
+        "Simulation",
+        "LinkModel",
+        "DifferentiableScene",
+        "LiveCoverage",
+    }
     assert classes - own == others | ({kind.__name__ for kind in SETTINGS} & classes)
 
 

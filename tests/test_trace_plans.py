@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from test_trace import _grid, _half_seen_room, _room, all_paths
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
 from sionna_partial.settings import SceneSettings
@@ -194,12 +195,14 @@ class TestTransmitters:
             if isinstance(one, np.ndarray):
                 assert one.tobytes() == other.tobytes()
 
-    @pytest.mark.parametrize(("transmitters", "receivers"), [(0, 2), (3, 0), (0, 0)])
-    def test_none_of_either_gives_no_links(self, transmitters: int, receivers: int) -> None:
-        tx, rx = np.full((transmitters, 3), 1.0), np.full((receivers, 3), 2.0)
-        links = trace_links(_room(), tx, rx)
-        assert links.link_state.shape == links.gain_db.shape == (transmitters, receivers)
+    def test_no_receivers_give_no_links(self) -> None:
+        links = trace_links(_room(), self.TX, np.zeros((0, 3)))
+        assert links.link_state.shape == links.gain_db.shape == (len(self.TX), 0)
         assert links.a.shape == links.path_tx.shape == (0,)
+
+    def test_at_least_one_transmitter_is_needed(self) -> None:
+        with pytest.raises(PositionError, match="tx has shape .0, 3.: give at least 1 position"):
+            trace_links(_room(), np.zeros((0, 3)), [[2.0, 1.0, 1.5]])
 
     def test_progress_runs_through_all_of_them(self) -> None:
         seen: list[float] = []
