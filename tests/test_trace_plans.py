@@ -201,7 +201,7 @@ class TestTransmitters:
         assert links.a.shape == links.path_tx.shape == (0,)
 
     def test_at_least_one_transmitter_is_needed(self) -> None:
-        with pytest.raises(PositionError, match="tx has shape .0, 3.: give at least 1 position"):
+        with pytest.raises(PositionError, match=r"tx has shape .0, 3.: give at least 1 position"):
             trace_links(_room(), np.zeros((0, 3)), [[2.0, 1.0, 1.5]])
 
     def test_progress_runs_through_all_of_them(self) -> None:
