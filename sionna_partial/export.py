@@ -246,7 +246,9 @@ def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
     quantity = {"quantity": "probability of outage in percent; 255 where no receiver can stand"}
     sheet = ros_sheet(path, "raw", spacing_m, corner_m) | quantity
     percent = np.rint(100 * coverage[p_outage].fillna(NO_RECEIVER / 100).to_numpy()).astype(np.uint8)
-    write_ros_files(path, yaml.safe_dump(sheet, sort_keys=False, default_flow_style=None), percent)
+    write_ros_files(
+        path, yaml.safe_dump(sheet, sort_keys=False, default_flow_style=None), {path.with_suffix(".pgm"): percent}
+    )
 
 
 _ENCODERS: dict[str, Callable[[xr.Dataset], bytes]] = {

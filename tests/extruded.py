@@ -64,7 +64,8 @@ def extrude(
         cell_m=0.1,
         height_m=height_m,
         ceiling=ceiling,
-        material=Material(),
+        wall_material=np.zeros(len(index) // 2, np.int64),
+        materials=(Material(),),
         origin_m=(0.0, 0.0),
     )
 
@@ -174,11 +175,16 @@ def everything(receivers: int) -> Strengths:
     return strengths_of([constants], 28e9, receivers)
 
 
+def room_of(geometry: SceneGeometry, tx_m: Floats, rx_m: Floats) -> Room:
+    """Room whose faces are all of the one material."""
+    return Room.of(geometry, tx_m, rx_m, np.zeros(2 * len(geometry.segments) + 1, np.int64))
+
+
 def specular_blocks(
     geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, max_depth: int, pairs_at_once: int = 200_000
 ) -> Blocks:
     """List all specular candidates, and the fraction of the work done with each block."""
-    candidates = SpecularCandidates(geometry, Room.of(geometry, tx_m, rx_m), max_depth)
+    candidates = SpecularCandidates(geometry, room_of(geometry, tx_m, rx_m), max_depth)
     return list(candidates.blocks(everything(len(rx_m)), pairs_at_once=pairs_at_once))
 
 
@@ -191,5 +197,5 @@ def diffracted_blocks(
     walls_a_side: int = MAX_REFLECTIONS,
 ) -> Blocks:
     """List all candidates with a diffraction, and the fraction of the work done with each block."""
-    candidates = DiffractionCandidates(geometry, wedges, Room.of(geometry, tx_m, rx_m), max_depth, walls_a_side)
+    candidates = DiffractionCandidates(geometry, wedges, room_of(geometry, tx_m, rx_m), max_depth, walls_a_side)
     return list(candidates.blocks(everything(len(rx_m))))

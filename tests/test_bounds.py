@@ -69,7 +69,7 @@ class TestDiffraction:
             utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
             for boundary in (1.0, 10.0, 100.0):
                 level = 1.0, 0.0, (1.0, 0.0, 1.0)
-                exact = at_edge(table.faces[0], table.transition, terms, boundary, -1.0, -1.0, *level)
+                exact = at_edge(table.faces, 0, table.transition, terms, boundary, -1.0, -1.0, *level)
                 assert exact[0] <= 1.03 * most_at_edge(terms, boundary, 1.0, 1.0)
 
 
@@ -94,17 +94,17 @@ class TestLevels:
 @pytest.mark.parametrize("walls", [ROOM, np.concatenate([ROOM, SPLINTERS])], ids=["room", "splinters"])
 def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, tmp_path) -> None:
     """Sum of |a|^2 over all paths of a link, against the sum of all bounds."""
-    from extruded import everything
+    from extruded import everything, room_of
 
-    from sionna_partial.scene.scene import SHAPES, write_scene
+    from sionna_partial.scene.scene import write_scene
     from sionna_partial.tracing.engine import SceneSolver
     from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
-    from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
+    from sionna_partial.tracing.plan.specular import SpecularCandidates
 
     geometry = extrude(walls)
     tx, rx = np.array([1.07, 1.93, 1.2]), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4], [2.2, 3.4, 1.2]])
-    room, wedges = Room.of(geometry, tx, rx), find_wedges(geometry, open_ends=False)
-    solver = SceneSolver(write_scene(geometry, tmp_path, offset_m=(0.0, 0.0)), SHAPES, sp.TraceSettings())
+    room, wedges = room_of(geometry, tx, rx), find_wedges(geometry, open_ends=False)
+    solver = SceneSolver(write_scene(geometry, tmp_path, offset_m=(0.0, 0.0)), geometry.shapes, sp.TraceSettings())
     for kind in ("reflected", "diffracted"):
         strengths = everything(len(rx))
         blocks = (

@@ -92,11 +92,19 @@ EVERY = sp.TraceSettings(
 )
 
 
-def test_stock_finds_no_other_paths(tmp_path: Path) -> None:
+def of_several_materials() -> sp.PartialMap:
+    """The rooms, with a wall of glass, one of concrete, and half of an outer wall of metal."""
+    partial = rooms().with_wall_material("glass", [(0.9, 2.0), (1.3, 2.0), (1.3, 6.1), (0.9, 6.1)])
+    partial = partial.with_wall_material("concrete", [(3.9, 3.1), (4.2, 3.1), (4.2, 7.9), (3.9, 7.9)])
+    return partial.with_wall_material("metal", [(-2.0, 2.9), (2.03, 2.9), (2.03, 3.1), (-2.0, 3.1)])
+
+
+@pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])
+def test_stock_finds_no_other_paths(partial: sp.PartialMap, tmp_path: Path) -> None:
     """With each face a slab, all strong paths of the public solver, at the same points, as strong."""
-    settings, scene_settings = checked_settings(rooms(), EVERY, sp.SceneSettings(material=BRICK))
-    ours = sp.trace_links(rooms(), TX, RX, trace_settings=settings, scene_settings=scene_settings)
-    folder = sp.export_scene(replace(rooms(), origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
+    settings, scene_settings = checked_settings(partial, EVERY, sp.SceneSettings(material=BRICK))
+    ours = sp.trace_links(partial, TX, RX, trace_settings=settings, scene_settings=scene_settings)
+    folder = sp.export_scene(replace(partial, origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
     scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
     found = 0
     for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
@@ -116,10 +124,11 @@ def test_stock_finds_no_other_paths(tmp_path: Path) -> None:
     assert found > 30
 
 
-def test_reciprocity() -> None:
+@pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])
+def test_reciprocity(partial: sp.PartialMap) -> None:
     settings = replace(EVERY, wall_depth_m=0.6, max_depth=3)
-    there = sp.trace_links(rooms(), TX, RX, trace_settings=settings)
-    back = [sp.trace_links(rooms(), rx, [TX], trace_settings=settings).gain_db[0] for rx in RX]
+    there = sp.trace_links(partial, TX, RX, trace_settings=settings)
+    back = [sp.trace_links(partial, rx, [TX], trace_settings=settings).gain_db[0] for rx in RX]
     np.testing.assert_allclose(there.gain_db, back, atol=0.02)
 
 

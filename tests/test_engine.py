@@ -14,20 +14,21 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, write_scene
+from sionna_partial.scene.scene import SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing import engine
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault, open_scene
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.diffraction import find_wedges
 
+SHAPES = ("walls", "floor", "ceiling")
 TX = np.array([1.07, 1.93, 1.2])
 RX = np.array([[2.3, 3.1, 2.1], [4.7, 1.2, 0.4], [5.2, 3.4, 1.9], [4.1, 0.3, 1.1]])
 
 
 def _solver(geometry: SceneGeometry, folder: Path) -> SceneSolver:
     xml = write_scene(geometry, folder, offset_m=geometry.origin_m)
-    return SceneSolver(xml, SHAPES, sp.TraceSettings())
+    return SceneSolver(xml, geometry.shapes, sp.TraceSettings())
 
 
 def _specular(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], depth: int) -> Candidates:

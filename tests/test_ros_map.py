@@ -262,7 +262,7 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
         (
             "material",
             (3, {"color": "red"}, {"relative_permittivity": 0.5}),
-            "thickness_m, itu, conductivity_exponent, as save_map does",
+            "give a name, or relative_permittivity, .*thickness_m, itu, conductivity_exponent",
         ),
         ("interior_cells", (-1, 2.5, "many", True), "give the number of free cells"),
     ],

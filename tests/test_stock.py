@@ -11,7 +11,7 @@ from test_trace import NO_FLOOR, WAVELENGTH_M, _room
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.scene import SHAPES, build_scene, write_scene
+from sionna_partial.scene.scene import build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene
 from sionna_partial.tracing.finder import listed_before, stock_paths
@@ -52,7 +52,8 @@ class TestStockPaths:
 
     def test_finds_the_paths_of_exact_beams(self, room_xml: Path) -> None:
         settings = TraceSettings(max_depth=2, samples_per_tx=100_000)
-        geometry, solver = build_scene(_room()), SceneSolver(room_xml, SHAPES, settings)
+        geometry = build_scene(_room())
+        solver = SceneSolver(room_xml, geometry.shapes, settings)
         blocks = specular_blocks(geometry, TX, RX, settings.max_depth)
         exact = join_paths([solver.verify(block, TX, RX)[0] for block, _ in blocks], settings.max_depth)
         shot = _solve(room_xml, settings, TX, RX)

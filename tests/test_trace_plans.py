@@ -12,7 +12,7 @@ from test_trace import _grid, _half_seen_room, _room, all_paths
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.scene import SHAPES, SceneGeometry, write_scene
+from sionna_partial.scene.scene import SceneGeometry, write_scene
 from sionna_partial.settings import SceneSettings
 from sionna_partial.tracing.engine import SceneSolver
 from sionna_partial.tracing.links import TracedLinks
@@ -46,7 +46,7 @@ LATTICE = np.array([[x, y, 1.2] for x in (0.5, 1.0, 2.0, 4.0, 5.0, 5.5) for y in
 
 
 def _trace(geometry: SceneGeometry, tx: NDArray[np.float64], rx: NDArray[np.float64], folder: Path) -> SolvedPaths:
-    solver = SceneSolver(write_scene(geometry, folder, offset_m=(0.0, 0.0)), SHAPES, all_paths())
+    solver = SceneSolver(write_scene(geometry, folder, offset_m=(0.0, 0.0)), geometry.shapes, all_paths())
     blocks = specular_blocks(geometry, tx, rx, 2)
     return join_paths([solver.verify(block, tx, rx)[0] for block, _ in blocks], 2)
 

@@ -58,8 +58,8 @@ _NUMBERS = (
 class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
 
-    Of a scene of one material the parameters are numbers; of a mesh with M materials they are arrays (M,), in the
-    order of `scene.mesh.materials`, without those that no triangle has.
+    Of a scene of one material the parameters are numbers. Of a map with M materials they are arrays (M,): that of
+    floor, ceiling and all other walls and `scene.wall_materials`, or `scene.mesh.materials`, without unused ones.
 
     Parameters
     ----------
@@ -270,7 +270,7 @@ def calibrate_materials(
     for message in undetermined.values():
         _log.warning("%s", message)
     values = (*fit.point.values, *fit.deviations)
-    numbers = [float(each[0]) if partial.mesh is None or len(materials) == 1 else each for each in values]
+    numbers = [float(each[0]) if len(materials) == 1 else each for each in values]
     return MaterialCalibration(
         permittivity=numbers[0],
         conductivity_s_m=numbers[1],

@@ -102,10 +102,10 @@ class MeasuredBuilding:
 
     def with_materials(self, materials: Sequence[Material]) -> PartialMap:
         """Return the map with other materials."""
-        mesh = self.partial.mesh
+        mesh, new = self.partial.mesh, dict(zip(self.start, materials, strict=True))
         if mesh is None:
-            return replace(self.partial, material=materials[0])
-        new = dict(zip(self.start, materials, strict=True))
+            of_walls = tuple(new.get(f"material{k}", old) for k, old in enumerate(self.partial.wall_materials, 1))
+            return replace(self.partial, material=materials[0], wall_materials=of_walls)
         named = tuple(new.get(f"material{index}", old) for index, old in enumerate(mesh.materials))
         return replace(self.partial, mesh=replace(mesh, materials=named))
 
@@ -116,9 +116,11 @@ class MeasuredBuilding:
 
         They are traced from those ends of which there are fewer. Sionna RT's diffraction is not reciprocal.
         """
-        reflecting = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in self.start.values()]
+        traced = [*self.start.values()]  # what reflects all lets nothing through
+        if not trace_settings.through_walls:
+            traced = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in traced]
         every = replace(trace_settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
-        simulation = Simulation(self.with_materials(reflecting), every, scene_settings)
+        simulation = Simulation(self.with_materials(traced), every, scene_settings)
         if not set(self.start) <= set(simulation.materials):
             raise MeasurementError(f"the map has no walls, floor or ceiling {_NO_MATERIAL}")
         tx, rx = measured.tx, measured.rx
@@ -163,7 +165,9 @@ def start_materials(
 ) -> dict[str, Material]:
     """Return the materials of a scene by their names there, with constants in place of formulas."""
     if partial.mesh is None:
-        materials = {"material": start or scene_settings.material}
+        cells, of_walls = partial.wall_material, (scene_settings.material, *partial.wall_materials)
+        used = [0] if cells is None else np.unique(np.append(cells, 0)).tolist()
+        materials = {f"material{index or ''}": start or of_walls[index] for index in used}
     else:
         used, own = np.unique(partial.mesh.material).tolist(), partial.mesh.materials
         materials = {f"material{index}": start or own[index] or scene_settings.material for index in used}

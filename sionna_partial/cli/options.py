@@ -31,6 +31,10 @@ Up = Annotated[str | None, typer.Option(metavar="y|z", help="Of a mesh or cloud:
 WallHeight = Annotated[
     float | None, typer.Option(help="Height of walls and ceiling [m]. Default: the map's.", show_default=False)
 ]
+MaterialOf = Annotated[
+    list[str] | None,
+    typer.Option(metavar="LAYER=MATERIAL", help="Of a drawing: material of the walls on a layer.", show_default=False),
+]
 MaterialText = Annotated[str, typer.Option(help=_MATERIAL_HELP)]
 Frequency = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
 MaxDepth = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
@@ -117,9 +121,26 @@ def settings_of(
 
 
 def _read_map(
-    map_path: Map, strict: Strict = False, height_band: HeightBand = None, up: Up = None, wall_height: WallHeight = None
+    map_path: Map,
+    strict: Strict = False,
+    height_band: HeightBand = None,
+    up: Up = None,
+    wall_height: WallHeight = None,
+    material_of: MaterialOf = None,
 ) -> Any:
-    return sp.load_map(map_path, strict=strict, wall_height_m=wall_height, height_band_m=height_band, up=up)
+    pairs = [text.rpartition("=") for text in material_of or ()]
+    for layer, _, material in pairs:
+        if not layer or not material:
+            raise typer.BadParameter(f"--material-of {layer or material!r} is no LAYER=MATERIAL: give A-WALL=concrete.")
+    materials = {layer: parse_material(material) for layer, _, material in pairs} or None
+    return sp.load_map(
+        map_path,
+        strict=strict,
+        wall_height_m=wall_height,
+        height_band_m=height_band,
+        up=up,
+        layer_materials=materials,
+    )
 
 
 def _sensor(

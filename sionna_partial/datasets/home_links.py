@@ -3,7 +3,7 @@
 import hashlib
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -84,9 +84,8 @@ def closed_home(home: PartialMap, name: str) -> PartialMap:
     """Return a complete home, with a ring of walls around its grid if it lacks nothing else."""
     if home.is_complete:
         return home
-    x, y = home.origin_m
-    origin_m = (x - home.resolution_m, y - home.resolution_m)
-    closed = replace(home, state=np.pad(home.state, 1, constant_values=CellState.WALL), origin_m=origin_m)
+    ny, nx = home.shape
+    closed = home.window(-1, -1, (ny + 2, nx + 2), CellState.WALL)
     if not (home.state == CellState.FREE).any():
         raise MapError(f"home {name!r} has no free cell: give maps of whole homes, with rooms.")
     if not closed.is_complete:
@@ -120,10 +119,8 @@ def map_area(home: PartialMap, margin_m: float) -> PartialMap:
     known = np.argwhere(home.state != CellState.UNKNOWN)
     margin = math.ceil(margin_m / home.resolution_m - 1e-9)
     (row0, column0), (row1, column1) = known.min(axis=0), known.max(axis=0) + 1
-    state = np.pad(home.state[row0:row1, column0:column1], margin, constant_values=CellState.UNKNOWN)
-    x, y = home.origin_m
-    corner = (x + (int(column0) - margin) * home.resolution_m, y + (int(row0) - margin) * home.resolution_m)
-    return replace(home, state=state, origin_m=corner)
+    shape = int(row1 - row0) + 2 * margin, int(column1 - column0) + 2 * margin
+    return home.window(int(row0) - margin, int(column0) - margin, shape, CellState.UNKNOWN)
 
 
 def _draw_positions(

@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from sionna_partial.checks import shown
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
+from sionna_partial.maps.mesh.mesh import material_records
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkContext, LinkFeatures
 from sionna_partial.prediction.inputs import FEATURES, columns_of, features_of_columns
@@ -217,11 +219,13 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
 
 def _packed(partial: PartialMap) -> dict[str, object]:
     """Return a floor plan as JSON has it, its cells deflated."""
-    material = {} if partial.material is None else {"material": asdict(partial.material)}
-    cells = base64.b64encode(zlib.compress(partial.state.tobytes(), 9)).decode()
+    material: dict[str, object] = {} if partial.material is None else {"material": asdict(partial.material)}
+    if partial.wall_material is not None:
+        material["wall_material"] = _deflated(partial.wall_material)
+        material["wall_materials"] = material_records(partial.wall_materials)
     return {
         "shape": list(partial.shape),
-        "cells": cells,
+        "cells": _deflated(partial.state),
         "resolution_m": partial.resolution_m,
         "origin_m": list(partial.origin_m),
         "wall_height_m": partial.wall_height_m,
@@ -230,15 +234,26 @@ def _packed(partial: PartialMap) -> dict[str, object]:
     }
 
 
+def _deflated(cells: NDArray[np.uint8]) -> str:
+    return base64.b64encode(zlib.compress(cells.tobytes(), 9)).decode()
+
+
 def _unpacked(entry: Any) -> PartialMap:
     rows, columns = map(int, entry["shape"])
     if not 0 < rows * columns <= _MAX_CELLS:
         raise PredictorError(f"a map of {rows:,} x {columns:,} cells is more than {_MAX_CELLS:,}")
-    inflated = zlib.decompressobj().decompress(base64.b64decode(entry["cells"]), rows * columns + 1)
-    cells = np.frombuffer(inflated, dtype=np.uint8)
+
+    def inflated(text: str) -> NDArray[np.uint8]:
+        cells = zlib.decompressobj().decompress(base64.b64decode(text), rows * columns + 1)
+        return np.frombuffer(cells, dtype=np.uint8).reshape(rows, columns)
+
     rest = {name: entry[name] for name in ("resolution_m", "wall_height_m", "interior_cells")}
-    material = Material(**entry["material"]) if "material" in entry else None
-    return PartialMap(cells.reshape(rows, columns), origin_m=tuple(entry["origin_m"]), material=material, **rest)
+    if "material" in entry:
+        rest["material"] = Material(**entry["material"])
+    if "wall_material" in entry:
+        rest["wall_material"] = inflated(entry["wall_material"])
+        rest["wall_materials"] = tuple(Material(**record) for record in entry["wall_materials"])
+    return PartialMap(inflated(entry["cells"]), origin_m=tuple(entry["origin_m"]), **rest)
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:

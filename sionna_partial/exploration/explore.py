@@ -217,8 +217,8 @@ def explore_trajectory(
     corner_m = np.array(home.origin_m) + (np.array([column0, row0]) - margin) * home.resolution_m
     choose: Choice | None = None
     if policy == "coverage":
-        origin_m = float(corner_m[0]), float(corner_m[1])
-        choose = coverage_choice(replace(home, mesh=None), origin_m, tx, sensor)
+        corner = int(row0) - margin, int(column0) - margin
+        choose = coverage_choice(replace(home, mesh=None), corner, tx, sensor)
     robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor, choose)
 
     by_fraction = not all(map(is_whole, steps))

@@ -278,17 +278,16 @@ def next_views(
     return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal)
 
 
-def coverage_choice(
-    home: PartialMap, origin_m: tuple[float, float], tx: ArrayLike | None, sensor: SensorSettings
-) -> Choice:
-    """Return how a robot, whose map has another origin, chooses frontiers for the coverage of transmitters."""
+def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | None, sensor: SensorSettings) -> Choice:
+    """Return how a robot, whose map begins at another cell, chooses frontiers for the coverage of transmitters."""
     if tx is not None:
         _transmitters(home, tx, None)
 
     def choose(robot: Robot, frontiers: list[Frontier]) -> int:
         if len(frontiers) == 1:
             return 0
-        partial = replace(home, state=robot.seen.copy(), origin_m=origin_m, interior_cells=None)
+        area = home.window(*corner, robot.seen.shape, CellState.UNKNOWN)
+        partial = replace(area, state=robot.seen.copy(), interior_cells=None)
         tx_m = _transmitters(partial, tx, None)
         gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(LinkModel(partial), tx_m, None, None), sensor)
         return int(np.argmax(np.array(gains) / [robot.steps_to(each) + LOOK_M / FORWARD_M for each in frontiers]))

@@ -5,11 +5,13 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.arrays import Floats, States
@@ -20,6 +22,7 @@ from sionna_partial.files import decoding, input_path, read_bytes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
 """Largest drawing that is read [bytes]."""
@@ -59,6 +62,7 @@ def map_from_drawing(
     path: str | os.PathLike[str],
     *,
     wall_layers: Sequence[str] | None = None,
+    layer_materials: Mapping[str, Material | str] | None = None,
     unit_m: float | None = None,
     resolution_m: float = DEFAULT_RESOLUTION_M,
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
@@ -77,6 +81,9 @@ def map_from_drawing(
     wall_layers : sequence of str or None
         Layers with the walls, `*` and `?` as in file names. By default visible layers whose names look like walls,
         columns or windows, and all visible ones, with a `MapWarning`, if there are none.
+    layer_materials : mapping of str to Material or str, or None
+        Materials of the walls on layers, `*` and `?` as in file names, or their names as of `Material.named`. Where
+        there are lines of several, the last holds. All other walls are of the default.
     unit_m : float or None
         Length of a unit of the drawing [m], 0.001 for millimetres. By default that of its `$INSUNITS`. Without one it
         is guessed if only one of m, cm and mm makes a building, with a `MapWarning`.
@@ -112,7 +119,8 @@ def map_from_drawing(
     with decoding(source, "no DXF", MapError):
         drawing = _opened(content)
         layers = _wall_layers(source, drawing, names)
-        segments = _segments(source, drawing, layers)
+        segments, on_layer = _segments(source, drawing, layers)
+        materials = _of_layers(source, drawing, layers, layer_materials or {})
         unit = unit or _unit(source, drawing, segments)
     segments = segments * unit
     extent = np.ptp(segments.reshape(-1, 2), axis=0)
@@ -128,7 +136,45 @@ def map_from_drawing(
             f"path = '{source}': the walls of {shown(sorted(layers))} enclose nothing: name the layers that close the "
             f"rooms as wall_layers; it has {_listed(drawing)}."
         )
-    return PartialMap(state, empty.resolution_m, empty.origin_m, wall_height_m)
+    partial = PartialMap(state, empty.resolution_m, empty.origin_m, wall_height_m)
+    return _with_materials(partial, segments, on_layer, materials) if materials else partial
+
+
+def _of_layers(
+    path: Path, drawing: Any, layers: set[str], given: Mapping[str, Material | str]
+) -> dict[Material, set[str]]:
+    """Return which of the layers with walls are of each material."""
+    from fnmatch import fnmatch
+
+    if not isinstance(given, Mapping):
+        raise MapError(f"layer_materials = {shown(given)} is not allowed: give materials by the names of layers.")
+    found: dict[Material, set[str]] = {}
+    for name, value in given.items():
+        material = Material.named(value) if isinstance(value, str) else value
+        own = {layer for layer in layers if fnmatch(layer, str(name).lower())}
+        if not isinstance(material, Material) or not own:
+            what = f"layer_materials[{shown(name)}] = {shown(value)}"
+            raise MapError(
+                f"{what} names no layer with walls of path = '{path}', or no material: it has {_listed(drawing)}."
+            )
+        found[material] = found.get(material, set()) | own
+    return found
+
+
+def _with_materials(
+    partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], materials: dict[Material, set[str]]
+) -> PartialMap:
+    """Give each wall the material of the nearest line."""
+    lines = (segments - partial.origin_m) / partial.resolution_m
+    drawn = np.zeros(partial.shape, dtype=np.uint8)
+    for number, layers in enumerate([set(on_layer.tolist()), *materials.values()]):
+        chosen, cells = np.isin(on_layer, sorted(layers)), np.zeros(partial.shape, dtype=np.bool_)
+        corners = np.zeros((int(chosen.sum()), 5, 2))
+        corners[:, :2] = lines[chosen]
+        mark_cells(corners, np.full(len(corners), 2), cells, BORDER_M / partial.resolution_m, True)
+        drawn[cells] = number + 1
+    nearest = ndimage.distance_transform_edt(drawn == 0, return_distances=False, return_indices=True)
+    return replace(partial, wall_material=drawn[tuple(nearest)] - 1, wall_materials=tuple(materials))
 
 
 def _given_unit(unit_m: float | None) -> float | None:
@@ -187,9 +233,10 @@ def _wall_layers(path: Path, drawing: Any, names: Sequence[str] | None) -> set[s
     return found or visible
 
 
-def _segments(path: Path, drawing: Any, layers: set[str]) -> Segments:
-    """Pieces of lines on some layers of the model space, in units of the drawing."""
+def _segments(path: Path, drawing: Any, layers: set[str]) -> tuple[Segments, NDArray[np.str_]]:
+    """Pieces (N, 2, 2) of lines on some layers of the model space, in units of the drawing, and their layers (N,)."""
     pieces: list[tuple[float, float, float, float]] = []
+    on_layer: list[str] = []
     parts = 0
     for entity in _entities(drawing.modelspace(), "", MAX_NESTING):
         parts += entity is None or entity.is_virtual
@@ -201,12 +248,13 @@ def _segments(path: Path, drawing: Any, layers: set[str]) -> Segments:
                 points = np.array([(corner.x, corner.y) for corner in corners], dtype=np.float64).reshape(-1, 2)
                 if np.isfinite(points).all():
                     pieces.extend(np.hstack([points[:-1], points[1:]]).tolist())
+                    on_layer.extend([entity.dxf.layer.lower()] * (len(points) - 1))
     if not pieces:
         raise MapError(
             f"path = '{path}' has no lines on {shown(sorted(layers))}: name layers with lines as wall_layers; it has "
             f"{_listed(drawing)}."
         )
-    return np.array(pieces).reshape(-1, 2, 2)
+    return np.array(pieces).reshape(-1, 2, 2), np.array(on_layer)
 
 
 def _entities(entities: Iterable[Any], layer: str, nesting: int) -> Iterator[Any]:

@@ -68,6 +68,7 @@ def load_map(
     observed: ArrayLike | PartialMap | None = None,
     resolution_m: float | None = None,
     up: str | None = None,
+    layer_materials: Mapping[str, Material | str] | None = None,
 ) -> PartialMap:
     """Read a map from a file or a folder.
 
@@ -100,6 +101,8 @@ def load_map(
     up : {"z", "y"} or None
         Axis of a mesh or cloud that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB
         files.
+    layer_materials : mapping of str to Material or str, or None
+        Materials of the walls on layers of a drawing, or their names as of `Material.named` (see `map_from_drawing`).
 
     Returns
     -------
@@ -126,10 +129,12 @@ def load_map(
     if not os.path.isdir(source) and not os.path.isfile(source):
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
     file, reader = _reader_of(source)
-    given = {"height_band_m": height_band_m, "observed": observed, "resolution_m": resolution_m, "up": up}
+    given: dict[str, Any] = {"height_band_m": height_band_m, "observed": observed, "resolution_m": resolution_m}
+    given |= {"up": up, "layer_materials": layer_materials}
     for name, value in given.items():
         if value is not None and name not in reader.options:
-            raise MapError(f"{name} is for scans alone, but path = '{source}' is {reader.what}: leave it out.")
+            kinds = "drawings" if name == "layer_materials" else "scans"
+            raise MapError(f"{name} is for {kinds} alone, but path = '{source}' is {reader.what}: leave it out.")
     given["strict"] = strict or None
     partial = reader.read(file, **{name: given[name] for name in reader.options if given[name] is not None})
     if partial.mesh is None:
@@ -192,10 +197,16 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             content["interior_cells"] = partial.interior_cells
         if partial.material is not None:
             content["material"] = json.dumps(asdict(partial.material))
+        if partial.wall_material is not None:
+            content["wall_material"] = partial.wall_material
+            content["wall_materials"] = json.dumps(material_records(partial.wall_materials))
         if partial.mesh is not None:
             mesh = partial.mesh
             content["mesh_vertices_m"], content["mesh_triangles"] = mesh.vertices_m, mesh.triangles
-            content["mesh_material"], content["mesh_materials"] = mesh.material, json.dumps(material_records(mesh))
+            content["mesh_material"], content["mesh_materials"] = (
+                mesh.material,
+                json.dumps(material_records(mesh.materials)),
+            )
             content["mesh_height_range_m"] = mesh.height_range_m
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content)
@@ -412,6 +423,8 @@ def _read_npz(source: Path) -> PartialMap:
             origin_m, height_m = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
+            walls = content.get("wall_material")
+            of_walls = json.loads(str(content["wall_materials"])) if walls is not None else []
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
@@ -419,7 +432,8 @@ def _read_npz(source: Path) -> PartialMap:
                 materials = tuple(None if record is None else Material(**record) for record in records)
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
-    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material)
+            wall_materials = tuple(Material(**record) for record in of_walls)
+    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, walls, wall_materials)
 
 
 def _read_exported(source: Path) -> PartialMap:
@@ -446,7 +460,7 @@ _READERS = {
     **dict.fromkeys(MESH_SUFFIXES, _Reader("a mesh", _read_mesh, _OF_SCANS)),
     **dict.fromkeys(POINT_SUFFIXES, _Reader("a point cloud", _read_cloud, _OF_SCANS)),
     ".ply": _Reader("a mesh or a point cloud", _read_ply, _OF_SCANS),
-    **dict.fromkeys(DRAWING_SUFFIXES, _Reader("a drawing", _read_drawing, ("resolution_m",))),
+    **dict.fromkeys(DRAWING_SUFFIXES, _Reader("a drawing", _read_drawing, ("resolution_m", "layer_materials"))),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
 """Readers by suffix. Their modules, and the libraries that these need, are imported when a file is read."""

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
@@ -24,6 +25,9 @@ MAX_CELLS = 100_000_000
 
 MAX_INTERIOR_CELLS = 2**53
 """Largest number of free cells of a complete home: more is damage, and no file could hold it."""
+
+MAX_WALL_MATERIALS = 255
+"""Most materials of the walls of a map, which a byte per cell counts."""
 
 ODD_CELLS = 1000
 """Number of cells from which a map has free and wall cells."""
@@ -66,6 +70,11 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     material : Material or None
         Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
         SceneSettings.
+    wall_material : (ny, nx) uint8 array or None
+        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Kept read-only, and 0 where there
+        is no wall. A mesh has its own. See `with_wall_material`.
+    wall_materials : tuple of Material
+        At most 255 materials that `wall_material` counts.
 
     Raises
     ------
@@ -87,6 +96,8 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     interior_cells: int | None = None
     mesh: SceneMesh | None = None
     material: Material | None = None
+    wall_material: NDArray[np.uint8] | None = None
+    wall_materials: tuple[Material, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "state", _checked_state(self.state))
@@ -106,11 +117,92 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         if not isinstance(self.material, Material | None):
             kind = type(self.material).__name__
             raise MapError(f"material is of type {kind}: give a Material, or None for that of SceneSettings.")
+        object.__setattr__(self, "wall_materials", _checked_materials(self.wall_materials))
+        object.__setattr__(self, "wall_material", self._checked_wall_material())
+
+    def _checked_wall_material(self) -> NDArray[np.uint8] | None:
+        """Return the materials of the wall cells as a new read-only array, None where all are of the default."""
+        if self.wall_material is None:
+            return None
+        if self.mesh is not None:
+            raise MapError("wall_material is for floor plans: a mesh has materials of its own.")
+        cells = grid_array("wall_material", self.wall_material, "iub")
+        if cells.shape != self.shape:
+            raise MapError(f"wall_material has shape {cells.shape} and state {self.shape}: give arrays of one shape.")
+        if cells.min() < 0 or cells.max() > len(self.wall_materials):
+            what = f"wall_material has values {cells.min()} to {cells.max()}"
+            raise MapError(f"{what}: use 0 (material) to {len(self.wall_materials)}, one for each of wall_materials.")
+        cells = np.where(self.state == CellState.WALL, cells, 0).astype(np.uint8)
+        cells.setflags(write=False)
+        return cells if cells.any() else None
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, PartialMap):
             return NotImplemented
         return equal_fields(self, other)
+
+    def window(self, row: int, column: int, shape: tuple[int, int], beyond: CellState) -> "PartialMap":
+        """Return the map of `shape` cells from a row and a column on; those outside the grid are all `beyond`."""
+        ny, nx = self.shape
+        rows, columns = np.arange(row, row + shape[0]), np.arange(column, column + shape[1])
+        inside = np.ix_((rows >= 0) & (rows < ny), (columns >= 0) & (columns < nx))
+        own = np.ix_(rows[(rows >= 0) & (rows < ny)], columns[(columns >= 0) & (columns < nx)])
+
+        def cut(cells: States, fill: int) -> States:
+            window = np.full(shape, fill, np.uint8)
+            window[inside] = cells[own]
+            return window
+
+        walls = None if self.wall_material is None else cut(self.wall_material, 0)
+        x, y = self.origin_m
+        origin_m = x + column * self.resolution_m, y + row * self.resolution_m
+        return replace(self, state=cut(self.state, beyond), origin_m=origin_m, wall_material=walls)
+
+    def with_wall_material(self, material: Material | str, where: object) -> "PartialMap":
+        """Return the map with the walls of an area made of a material.
+
+        Parameters
+        ----------
+        material : Material or str
+            The material, or its name as of `Material.named`.
+        where : (ny, nx) bool array, (M, 2) array-like, or shapely geometry
+            Cells, or the corners of a polygon or a geometry in world x and y [m]: cells whose centres it holds.
+
+        Raises
+        ------
+        MapError
+            For an area of another kind, a mesh, or more than 255 materials.
+        SettingsError
+            For a material that is not known.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> home = sp.make_home(3, "apartment")
+        >>> shell = home.with_wall_material("concrete", [(-1, -1), (0.3, -1), (0.3, 9), (-1, 9)])
+        >>> [material.itu for material in shell.wall_materials]
+        ['concrete']
+        """
+        material = Material.named(material) if isinstance(material, str) else material
+        materials = self.wall_materials if material in self.wall_materials else (*self.wall_materials, material)
+        cells = np.zeros(self.shape, np.uint8) if self.wall_material is None else self.wall_material.copy()
+        materials = _checked_materials(materials)
+        cells[self._cells_within(where)] = materials.index(material) + 1
+        return replace(self, wall_material=cells, wall_materials=materials)
+
+    def _cells_within(self, where: object) -> Bools:
+        """Cells (ny, nx) of a mask, or whose centres are in a polygon or a shapely geometry [m]."""
+        if not isinstance(where, shapely.Geometry):
+            area = real_array("where", where, MapError, "give cells (ny, nx) as booleans, or a polygon.", "biuf")
+            if area.dtype == np.bool_ and area.shape == self.shape:
+                return area
+            if area.dtype == np.bool_ or area.ndim != 2 or area.shape[1] != 2 or len(area) < 3:
+                what = f"where has shape {area.shape}"
+                raise MapError(f"{what}: give booleans {self.shape}, or corners (M, 2) of a polygon in metres.")
+            where = shapely.Polygon(area.astype(np.float64))
+        rows, columns = np.indices(self.shape)
+        centres = cell_centres_m(self, np.stack([rows, columns], axis=-1))
+        return np.asarray(shapely.contains_xy(where, centres[..., 0], centres[..., 1]))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -220,7 +312,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
         can_tell = len(points_m) >= 3 and self.mesh is None and bool((np.abs(points_m) < 1e8).all())
         for name, state in turns.items() if can_tell else ():
-            if (replace(self, state=state).state_at(points_m) == CellState.FREE).all():
+            if (replace(self, state=state, wall_material=None).state_at(points_m) == CellState.FREE).all():
                 return f" All {len(points_m)} are free on the map {name}."
         return ""
 
@@ -352,6 +444,17 @@ def _checked_state(values: ArrayLike) -> States:
     state = np.array(state, dtype=np.uint8)
     state.setflags(write=False)
     return state
+
+
+def _checked_materials(values: object) -> tuple[Material, ...]:
+    """Return materials of walls as a tuple, or raise a MapError."""
+    materials = tuple(values) if isinstance(values, tuple | list) else (values,)
+    other = next((type(each).__name__ for each in materials if not isinstance(each, Material)), None)
+    if other is not None:
+        raise MapError(f"wall_materials holds a {other}: give a tuple of Material, such as Material.named returns.")
+    if len(materials) > MAX_WALL_MATERIALS:
+        raise MapError(f"wall_materials has {len(materials)} materials: give at most {MAX_WALL_MATERIALS}.")
+    return materials
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:

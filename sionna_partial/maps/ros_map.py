@@ -5,6 +5,7 @@ import math
 import os
 import warnings
 from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -113,7 +114,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     interior = raw.get("interior_cells")
     if interior is not None and not (is_whole(interior) and interior <= MAX_INTERIOR_CELLS):
         raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
-    material = _material(path, raw.get("material"))
+    material = _material(path, "material", raw.get("material"))
     pixels = _read_pixels(sheet)
     state = _classify(pixels, sheet)
     if sheet.mode == "trinary" and not strict:
@@ -124,7 +125,32 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
     mesh = _exported_mesh(path.parent, raw) if "mesh" in raw else None
-    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material)
+    walls: tuple[States | None, tuple[Material, ...]] = None, ()
+    if "wall_material" in raw:
+        given = raw["wall_material"]
+        image = _image_path(path, given.get("image") if isinstance(given, dict) else None, confined=confined)
+        walls = _wall_material(path, given, _decode(sheet._replace(image=image)), pixels.level.shape, origin)
+    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, *walls)
+
+
+def _wall_material(
+    path: Path, value: Any, image: Image.Image, shape: tuple[int, ...], origin: tuple[float, float, float]
+) -> tuple[States, tuple[Material, ...]]:
+    """Return the materials of the wall cells, which the shades of an image count."""
+    if not isinstance(value.get("materials"), list):
+        raise _refuse(path, "wall_material", value, "give an image and a list of materials, as save_map does.")
+    records = [_material(path, "wall_material", record) for record in value["materials"]]
+    if image.mode != "L" or image.size != shape[::-1]:
+        what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th material."
+        raise _refuse(path, "wall_material", value.get("image"), f"give {what}")
+    cells = np.flipud(np.asarray(image))
+    if cells.max(initial=0) > len(records) or None in records:
+        what = f"has shades up to {cells.max()} for {len(records)} materials"
+        raise MapError(f"{path}: wall_material {what}: list a material for each shade from 1 on.")
+    turns = round(origin[2] / (math.pi / 2))
+    if abs(origin[2] - turns * math.pi / 2) * math.hypot(*cells.shape) > 0.5:
+        raise _refuse(path, "origin", [*origin], "with wall_material its yaw must be a quarter turn, or 0.")
+    return np.rot90(cells, -turns), tuple(record for record in records if record is not None)
 
 
 def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
@@ -144,11 +170,20 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
     if partial.mesh is not None:
-        sheet["mesh"] = {"height_range": [*partial.height_range_m], "materials": material_records(partial.mesh)}
+        sheet["mesh"] = {
+            "height_range": [*partial.height_range_m],
+            "materials": material_records(partial.mesh.materials),
+        }
+    images = {}
+    if partial.wall_material is not None:
+        image = f"{path.stem}_wall_material.pgm"
+        sheet["wall_material"] = {"image": image, "materials": material_records(partial.wall_materials)}
+        images[path.with_name(image)] = partial.wall_material
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet
-    write_ros_files(path, _yaml_text(sheet, {} if extra is None else extra), shades[partial.state])
+    images[path.with_suffix(".pgm")] = shades[partial.state]
+    write_ros_files(path, _yaml_text(sheet, {} if extra is None else extra), images)
 
 
 def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[float]) -> dict[str, object]:
@@ -164,12 +199,13 @@ def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[flo
     }
 
 
-def write_ros_files(path: Path, text: str, pixels: NDArray[np.uint8]) -> None:
-    """Write a YAML, and the PGM beside it whose pixels (ny, nx) begin with the smallest y, or neither."""
-    with atomic_write(path, "w") as sheet:
+def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint8]]) -> None:
+    """Write a YAML, and PGM images whose pixels (ny, nx) begin with the smallest y, or none of them."""
+    with atomic_write(path, "w") as sheet, ExitStack() as together:
         sheet.write(text)
-        sheet.flush()  # a full disk fails here, not after the picture is there
-        with atomic_write(path.with_suffix(".pgm")) as picture:
+        sheet.flush()  # a full disk fails here, not after the pictures are there
+        for image, pixels in images.items():
+            picture = together.enter_context(atomic_write(image))
             picture.write(b"P5\n%d %d\n255\n" % pixels.shape[::-1])
             picture.write(np.flipud(pixels).tobytes())
 
@@ -177,7 +213,7 @@ def write_ros_files(path: Path, text: str, pixels: NDArray[np.uint8]) -> None:
 def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
     """Return the YAML of a map with further keys, which can be read again as they are."""
     names = [] if not isinstance(extra, Mapping) else [*extra]
-    own = sorted({*sheet, "interior_cells", "material", "mesh"}.intersection(map(str, names)))
+    own = sorted({*sheet, "interior_cells", "material", "mesh", "wall_material"}.intersection(map(str, names)))
     if own or names != [name for name in names if isinstance(name, str)] or not isinstance(extra, Mapping):
         what = f"holds {own[0]!r}, which the map sets itself" if own else "has keys that are no text"
         raise OutputError(f"extra = {shown(extra)} {what}: give a mapping of further keys.")
@@ -264,12 +300,14 @@ def _read_sheet(path: Path, raw: Mapping[Any, Any], *, confined: bool) -> _Sheet
     return _Sheet(path, image, mode.lower(), bool(negate), occupied, free)
 
 
-def _material(path: Path, value: object) -> Material | None:
+def _material(path: Path, field: str, value: object) -> Material | None:
     try:
+        if isinstance(value, str):
+            return Material.named(value)
         return None if value is None else Material(**value)  # type: ignore[arg-type]
     except (TypeError, SettingsError) as error:
-        names = ", ".join(field.name for field in fields(Material))
-        raise _refuse(path, "material", value, f"give {names}, as save_map does ({error}).") from error
+        names = ", ".join(each.name for each in fields(Material))
+        raise _refuse(path, field, value, f"give a name, or {names} ({error}).") from error
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:

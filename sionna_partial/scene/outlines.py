@@ -1,6 +1,7 @@
 """PartialMap -> wall outlines: straight segments through the centres of the boundary wall cells."""
 
 import itertools
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -401,3 +402,38 @@ def _extended(outlines: Outlines, state: States) -> Points:
     index = np.delete(index, tip[~own])
     vertices[ends[index]] += 0.5 * along[index]
     return vertices
+
+
+def cut_by_material(outlines: Outlines, partial: PartialMap) -> tuple[Outlines, Indices]:
+    """Cut outlines where the material of the wall cells changes, and sort them by material (S,).
+
+    A point of an outline is of the material of the nearest wall cell; what is shorter than a cell, of its neighbour.
+    """
+    count = len(outlines.segments)
+    if partial.wall_material is None or not count:
+        return outlines, np.zeros(count, np.intp)
+    _, (row, column) = ndimage.distance_transform_edt(partial.state != CellState.WALL, return_indices=True)
+    nearest, cell_m, last = partial.wall_material[row, column], partial.resolution_m, np.array(partial.shape)[::-1] - 1
+    vertices, material = [*outlines.vertices_m], list[int]()
+    segments = list[tuple[int, int]]()
+    for first, end in outlines.segments.tolist():
+        start, along = vertices[first], vertices[end] - vertices[first]
+        pieces = max(1, math.ceil(4.0 * np.hypot(*along) / cell_m))
+        middles = start + (np.arange(pieces)[:, None] + 0.5) / pieces * along
+        x, y = np.clip(np.floor(middles / cell_m).astype(np.intp), 0, last).T
+        runs: list[tuple[int, int]] = []  # first piece and material
+        bounds = np.append(np.flatnonzero(np.diff(nearest[y, x])) + 1, pieces)
+        for begin, stop in pairwise([0, *bounds.tolist()]):
+            kind = int(nearest[y[begin], x[begin]])
+            if not runs or (stop - begin >= min(4, pieces) and kind != runs[-1][1]):
+                runs.append((begin, kind))
+        if len(runs) > 1 and runs[1][0] < 4:
+            runs[:2] = [(0, runs[1][1])]
+        ends = [first]
+        for begin, _ in runs[1:]:
+            ends.append(len(vertices))
+            vertices.append(start + begin / pieces * along)
+        segments += pairwise([*ends, end])
+        material += [kind for _, kind in runs]
+    order = np.argsort(material, kind="stable")
+    return Outlines(np.array(vertices), np.array(segments, np.int64)[order]), np.array(material, np.intp)[order]

@@ -1,5 +1,6 @@
 """PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one module that writes scenes."""
 
+import itertools
 import logging
 import os
 import xml.etree.ElementTree as ET
@@ -23,13 +24,13 @@ from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map, row_runs
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
-from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
+from sionna_partial.scene.outlines import Outlines, cut_by_material, lattice_outlines, wall_outlines
 from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
 
 _log = logging.getLogger(__name__)
 
-SHAPES = ("walls", "floor", "ceiling")
-"""Shapes of an exported floor plan in the order in which faces are counted; those that are empty are left out."""
+FLAT_SHAPES = ("floor", "ceiling")
+"""Shapes of an exported floor plan beside its walls."""
 
 FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
@@ -51,6 +52,10 @@ class SceneGeometry:
         Walls, as indices into `vertices_m`.
     open_end : (V,) bool array
         Where a wall ends because observation did: what lies beyond is not free.
+    wall_material : (S,) int64 array
+        Index of the material of each wall in `materials`; walls are in the order of their materials.
+    materials : tuple of Material
+        The first is that of floor and ceiling.
     floor_m : (R, 4) float64 array
         Rectangles x0, y0, x1, y1 of floor and ceiling [m], on a lattice of `cell_m`; they do not overlap.
     origin_m : (float, float)
@@ -60,12 +65,18 @@ class SceneGeometry:
     vertices_m: Floats
     segments: NDArray[np.int64]
     open_end: Bools
+    wall_material: NDArray[np.int64]
+    materials: tuple[Material, ...]
     floor_m: Floats
     cell_m: float
     height_m: float
     ceiling: bool
-    material: Material
     origin_m: tuple[float, float]
+
+    @property
+    def shapes(self) -> tuple[str, ...]:
+        """Names of the shapes in the order in which faces are counted; those that are empty are not exported."""
+        return (*(f"walls{index or ''}" for index in range(len(self.materials))), *FLAT_SHAPES)
 
     @property
     def walls_m(self) -> Floats:
@@ -97,7 +108,7 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
     """Return the settings of a map's scene, with the map's own material, if it has one."""
     settings = settings_or_default("scene_settings", settings, SceneSettings)
     default = partial.material or settings.material
-    used = {default} if partial.mesh is None else partial.mesh.used_materials(default)
+    used = used_materials(partial, default)
     if used and settings.material not in (DRYWALL, *used):
         _log.warning(
             "material = %s of the scene settings is not used: the map or mesh has its own; leave it out, or set that "
@@ -105,6 +116,11 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
             settings.material,
         )
     return replace(settings, material=default)
+
+
+def used_materials(partial: PartialMap, default: Material) -> set[Material]:
+    """Return the materials of a map, `default` where it names none; those of floor and ceiling count as used."""
+    return {default, *partial.wall_materials} if partial.mesh is None else partial.mesh.used_materials(default)
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
@@ -116,15 +132,17 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     else:
         tolerance_cells, gap_m = settings.outline_tolerance_cells, settings.bridge_gap_m
         outlines = wall_outlines(partial, tolerance_cells=tolerance_cells, bridge_gap_m=gap_m)
+    outlines, wall_material = cut_by_material(outlines, partial)
     return SceneGeometry(
         vertices_m=outlines.vertices_m,
         segments=outlines.segments,
         open_end=_open_ends(partial, outlines),
+        wall_material=wall_material,
+        materials=(settings.material, *partial.wall_materials),
         floor_m=_rectangles(floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
         cell_m=partial.resolution_m,
         height_m=partial.wall_height_m,
         ceiling=settings.ceiling,
-        material=settings.material,
         origin_m=partial.origin_m,
     )
 
@@ -138,10 +156,11 @@ def export_scene(
 ) -> Path:
     """Write a map as a scene folder that stock Sionna RT loads.
 
-    The folder holds `scene.xml`, `meshes/walls.ply`, `meshes/floor.ply` and `meshes/ceiling.ply` (those that are not
-    empty), and the map itself as `map.yaml` and `map.pgm`, from which `load_map` reads it back. Scene coordinates are
-    the map's world coordinates less `scene_offset` in `map.yaml`: [0, 0], or the lower-left corner of a map that
-    reaches farther than `FAR_M` from the origin.
+    The folder holds `scene.xml`, `meshes/walls.ply`, `meshes/floor.ply` and `meshes/ceiling.ply` (those that are
+    not empty; `meshes/walls1.ply` and so on are walls of the map's `wall_materials`), and the map itself as
+    `map.yaml` and `map.pgm`, from which `load_map` reads it back. Scene coordinates are the map's world coordinates
+    less `scene_offset` in `map.yaml`: [0, 0], or the lower-left corner of a map that reaches farther than `FAR_M`
+    from the origin.
 
     A map with a mesh has its `meshes/part0.ply` and so on, one for each material, in place of walls, floor and
     ceiling, and a `scene_offset` of three whole numbers; axes on which it lies on both sides of the origin stay.
@@ -181,14 +200,12 @@ def export_scene(
     settings = scene_settings_of(partial, scene_settings)
     material = settings.material
     if partial.mesh is None:
-        materials = {material}
         far = max(abs(value) for value in partial.bounds_m) > FAR_M
         offset_m = [*(partial.origin_m if far else (0.0, 0.0))]
     else:
-        materials = partial.mesh.used_materials(material)
         x0, y0, x1, y1 = partial.bounds_m
         offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]
-    for each in materials:
+    for each in used_materials(partial, material):
         each.require_frequency(frequency_hz)
     with atomic_folder(folder) as target:
         if partial.mesh is None:
@@ -214,16 +231,19 @@ def write_scene(
     """Write `scene.xml`, whose path is returned, and its meshes into an existing folder.
 
     The world x and y `offset_m` become the scene's origin; `geometry.origin_m` gives local coordinates. Wall i is made
-    of the triangles 2 i and 2 i + 1; walls that meet share vertices, so that they form wedges.
+    of the triangles 2 i and 2 i + 1, counted through `geometry.shapes`; walls of one material that meet share vertices,
+    so that they form wedges.
     """
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
     scene = _new_scene(folder)
-    _add_material(scene, "material", geometry.material, frequency_hz)
-    for name, (vertices, faces) in _meshes(geometry).items():
-        if len(faces):
-            mesh = trimesh.Trimesh(vertices + shift, faces, process=False)
-            mesh.export(folder / "meshes" / f"{name}.ply")
-            _add_shape(scene, name, "material")
+    meshes = {name: mesh for name, mesh in _meshes(geometry).items() if len(mesh[1])}
+    number = {name: 0 if name in FLAT_SHAPES else index for index, name in enumerate(geometry.shapes)}
+    for index in sorted({0, *(number[name] for name in meshes)}):
+        _add_material(scene, f"material{index or ''}", geometry.materials[index], frequency_hz)
+    for name, (vertices, faces) in meshes.items():
+        mesh = trimesh.Trimesh(vertices + shift, faces, process=False)
+        mesh.export(folder / "meshes" / f"{name}.ply")
+        _add_shape(scene, name, f"material{number[name] or ''}")
     return _write_xml(scene, folder)
 
 
@@ -313,14 +333,18 @@ def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz
 
 
 def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64]]]:
-    """Vertices (V, 3) [m] and triangles (F, 3) of each mesh, in the local frame."""
+    """Vertices (V, 3) [m] and triangles (F, 3) of each shape, in the local frame."""
     low = np.column_stack([geometry.vertices_m, np.zeros(len(geometry.vertices_m))])
     up = np.array([0.0, 0.0, geometry.height_m])
     (a, b), count = geometry.segments.T, len(low)
     walls = np.stack([a, b, b + count, a, b + count, a + count], axis=1).reshape(-1, 3)
     corners, triangles = geometry.floor_mesh
     floor = np.column_stack([corners, np.zeros(len(corners))])
-    meshes = {"walls": (np.concatenate([low, low + up]), walls), "floor": (floor, triangles)}
+    ends = 2 * np.searchsorted(geometry.wall_material, np.arange(len(geometry.materials) + 1))
+    of_material = (walls[first:last] for first, last in itertools.pairwise(ends))
+    vertices = np.concatenate([low, low + up])
+    meshes = {name: (vertices, faces) for name, faces in zip(geometry.shapes, of_material, strict=False)}
+    meshes["floor"] = floor, triangles
     return meshes | ({"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {})
 
 

@@ -126,13 +126,13 @@ def reflected_power(largest, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def most_at_wall(largest, cosine):  # type: ignore[no-untyped-def]
+def most_at_wall(largest, material, cosine):  # type: ignore[no-untyped-def]
     """Upper bound of what a reflection leaves of any field, if the cosine of the angle of incidence is no smaller."""
-    return largest[min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
+    return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
 
 
 @njit(cache=True)
-def at_wall(largest, cosine, sine, slope, field):  # type: ignore[no-untyped-def]
+def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-untyped-def]
     """Bounds of a field after a reflection at a wall: vertical, horizontal, and what of the vertical always was.
 
     `cosine` is that of the angle of incidence seen from above; `sine` and `slope` are the horizontal and the vertical
@@ -140,7 +140,7 @@ def at_wall(largest, cosine, sine, slope, field):  # type: ignore[no-untyped-def
     """
     cosine = min(abs(cosine), 1.0)
     at = min(int(cosine * sine * _ANGLES), _ANGLES - 1)
-    te, tm, both = largest[at, 0], largest[at, 1], largest[at, 2]
+    te, tm, both = largest[material, at, 0], largest[material, at, 1], largest[material, at, 2]
     part = _te_part(1.0 - cosine * cosine, sine, slope)
     kept, mixed, other = te * part + tm * (1.0 - part), both * math.sqrt(part * (1.0 - part)), te + (tm - te) * part
     vertical, horizontal, pure = field
@@ -148,7 +148,7 @@ def at_wall(largest, cosine, sine, slope, field):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def at_edge(faces, transition, terms, boundary, cosine_0, cosine_n, sine, slope, field):  # type: ignore[no-untyped-def]
+def at_edge(faces, material, transition, terms, boundary, cosine_0, cosine_n, sine, slope, field):  # type: ignore[no-untyped-def]
     """Bounds of a field after a diffraction likewise, but for the spread of the wave.
 
     `boundary` is sqrt(2 k L); `cosine_0` and `cosine_n` are those of the angles of incidence at both faces.
@@ -156,8 +156,8 @@ def at_edge(faces, transition, terms, boundary, cosine_0, cosine_n, sine, slope,
     by_0 = utd_term(transition, terms, 0, boundary) - utd_term(transition, terms, 3, boundary)
     by_n = utd_term(transition, terms, 1, boundary) - utd_term(transition, terms, 2, boundary)
     size_0, size_n = _size(by_0), _size(by_n)
-    own_0, mixed_0, other_0 = _at_face(faces, cosine_0, sine, slope)
-    own_n, mixed_n, other_n = _at_face(faces, cosine_n, sine, slope)
+    own_0, mixed_0, other_0 = _at_face(faces, material, cosine_0, sine, slope)
+    own_n, mixed_n, other_n = _at_face(faces, material, cosine_n, sine, slope)
     kept = _size(own_0 * by_0 + own_n * by_n) + _CANCELLED * (_size(own_0) * size_0 + _size(own_n) * size_n)
     vertical, horizontal, pure = field
     mixed, other = mixed_0 * size_0 + mixed_n * size_n, other_0 * size_0 + other_n * size_n
@@ -179,10 +179,10 @@ def most_at_edge(terms, boundary, face_0, face_n):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def at_flats(largest, slope, bounces, field):  # type: ignore[no-untyped-def]
+def at_flats(largest, material, slope, bounces, field):  # type: ignore[no-untyped-def]
     """Bound of a vertical field after reflections off floor and ceiling, wherever they are in the path."""
     at = min(int(slope * _ANGLES), _ANGLES - 1)
-    te, tm = largest[at, 0], largest[at, 1]
+    te, tm = largest[material, at, 0], largest[material, at, 1]
     vertical, _, pure = field
     return tm**bounces * pure + max(te, tm) ** bounces * (vertical - pure)
 
@@ -197,7 +197,7 @@ def _te_part(along, sine, slope):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _at_face(faces, cosine, sine, slope):  # type: ignore[no-untyped-def]
+def _at_face(faces, material, cosine, sine, slope):  # type: ignore[no-untyped-def]
     """Coefficient of a vertical field at a face of a wedge, and sizes of the others.
 
     A face in the shadow, where the cosine is negative, is a perfect mirror to Sionna RT.
@@ -206,10 +206,10 @@ def _at_face(faces, cosine, sine, slope):  # type: ignore[no-untyped-def]
         return 1.0 + 0.0j, 0.0, 1.0
     at = cosine * sine * _ANGLES
     k = min(int(at), _ANGLES - 1)
-    te = faces[k, 0] + (at - k) * (faces[k + 1, 0] - faces[k, 0])
+    te = faces[material, k, 0] + (at - k) * (faces[material, k + 1, 0] - faces[material, k, 0])
     if slope < 1e-6:
         return te, 0.0, 0.0
-    tm = faces[k, 1] + (at - k) * (faces[k + 1, 1] - faces[k, 1])
+    tm = faces[material, k, 1] + (at - k) * (faces[material, k + 1, 1] - faces[material, k, 1])
     part = _te_part(1.0 - cosine * cosine, sine, slope)
     mixed = _size(te + tm) * math.sqrt(part * (1.0 - part))
     return part * te - (1.0 - part) * tm, mixed, (1.0 - part) * _size(te) + part * _size(tm)

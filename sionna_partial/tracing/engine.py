@@ -445,7 +445,7 @@ class SceneSolver:
         return WedgeGeometry(
             shape=dr.reinterpret_array(mi.MeshPtr, to_device(mi.UInt, self._shape_of_face[face[:, 0]])),
             prim0=to_device(mi.UInt, self._primitive_of_face[face[:, 0]]),
-            primn=to_device(mi.UInt, self._primitive_of_face[face[:, 1]]),
+            primn=to_device(mi.UInt, self._primitive_of_face[face[:, 0]] + (face[:, 0] != face[:, 1])),
             local_edge=dr.zeros(mi.UInt, len(index)),
             o=vectors(mi.Point3f, x, y, np.where(upward, 0.0, wedges.height_m)),
             e_hat=vectors(mi.Vector3f, flat, flat, np.where(upward, 1.0, -1.0)),

@@ -17,7 +17,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import BackendError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.progress import part_of
-from sionna_partial.scene.scene import SHAPES, SceneGeometry, build_scene, floor_cells, write_mesh_scene, write_scene
+from sionna_partial.scene.scene import SceneGeometry, build_scene, floor_cells, write_mesh_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
 from sionna_partial.tracing.candidates import Candidates, Wedges
@@ -61,7 +61,8 @@ class PlanScene:
 
     def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths between a transmitter (3,) and receivers (N, 3) that are strong enough to matter."""
-        kinds = self._kinds(Room.of(self.geometry, tx_m, rx_m))
+        room = Room.of(self.geometry, tx_m, rx_m, solver.material_of_face)
+        kinds = self._kinds(room)
         ends = (0.0, 1.0) if len(kinds) == 1 else (0.0, 0.2, 1.0)
 
         def listed(strengths: Strengths) -> _Blocks:
@@ -77,7 +78,7 @@ class PlanScene:
             indirect = ~paths.is_direct
             np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
             yield candidates, paths
-        crossing = CrossingCandidates(self.geometry, Room.of(self.geometry, tx_m, rx_m), self.interior, self.settings)
+        crossing = CrossingCandidates(self.geometry, room, self.interior, self.settings)
         blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
         yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.5, 1.0))
 
@@ -161,7 +162,7 @@ def write_scene_of(
     floor = floor_cells(partial, scene_settings.floor_extent)
     interior = Interior(partial.state == CellState.FREE, floor, partial.resolution_m, settings.wall_depth_m)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)
-    return PlanScene(xml, SHAPES, settings, geometry, wedges, interior)
+    return PlanScene(xml, geometry.shapes, settings, geometry, wedges, interior)
 
 
 def _strong_paths(

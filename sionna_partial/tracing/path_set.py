@@ -263,8 +263,9 @@ def _merged(parts: list[Part]) -> list[Part]:
         ]
         if not some:
             continue
-        depth = max(candidates.face.shape[1] for candidates, _ in some)
-        candidates = Candidates.concatenate([each.widened(depth) for each, _ in some])
+        faces = max(candidates.face.shape[1] for candidates, _ in some)
+        depth = max(paths.interactions.shape[1] for _, paths in some)  # further faces of one wall are no interactions
+        candidates = Candidates.concatenate([each.widened(faces) for each, _ in some])
         paths = SolvedPaths.concatenate([solved for _, solved in some], depth)
         for start in range(0, len(paths.a), PATHS_PER_BLOCK):
             rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))

@@ -21,7 +21,7 @@ from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
 from sionna_partial.progress import part_of, reporting
-from sionna_partial.scene.scene import scene_settings_of
+from sionna_partial.scene.scene import scene_settings_of, used_materials
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
 from sionna_partial.tracing.finder import ExactFinder, Found, RayFinder, write_scene_of
@@ -437,7 +437,7 @@ def checked_settings(
     settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
     scene_settings = scene_settings_of(partial, scene_settings)
     default = scene_settings.material
-    for material in {default} if partial.mesh is None else partial.mesh.used_materials(default):
+    for material in used_materials(partial, default):
         material.require_frequency(settings.frequency_hz)
     if settings.diffraction is None:
         settings = replace(settings, diffraction=partial.mesh is None)

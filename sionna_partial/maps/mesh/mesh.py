@@ -1,5 +1,6 @@
 """SceneMesh: the triangles of a scanned or modelled building, and what they are made of."""
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
@@ -142,9 +143,9 @@ def merged_mesh(
     return replace(mesh, triangles=merge_points(mesh.vertices_m)[mesh.triangles].astype(np.int64))
 
 
-def material_records(mesh: SceneMesh) -> list[dict[str, Any] | None]:
-    """Return the materials of a mesh as plain data, for files."""
-    return [None if material is None else asdict(material) for material in mesh.materials]
+def material_records(materials: Iterable[Material | None]) -> list[dict[str, Any] | None]:
+    """Return the materials of a mesh, or of walls, as plain data for files."""
+    return [None if material is None else asdict(material) for material in materials]
 
 
 def equal_fields(one: Any, other: Any) -> bool:

@@ -6,7 +6,7 @@ one wall if they are at most `depth_m` apart, measured across them. Only one fac
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from sionna_partial.planar import span_in_strip
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import Plan, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry, constants_of
-from sionna_partial.settings import TraceSettings
+from sionna_partial.settings import Material, TraceSettings
 from sionna_partial.tracing.bounds import dropped_power
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.paths import REFLECTION, REFRACTION
@@ -60,17 +60,19 @@ _SHORTEST_LEG_M = 0.0101
 """Sionna RT drops paths with legs of 1 cm or less."""
 
 
-class Slab(NamedTuple):
-    """Coefficients (K + 1, 2) of walls, TE and TM, where the cosine of the angle of incidence is k / K.
+class Slabs(NamedTuple):
+    """Coefficients (M, K + 1, 2) of M materials, TE and TM, where the cosine of the angle of incidence is k / K.
 
-    `most_reflected` (K + 1,) is the largest |R|^2 at this cosine or a larger one, `most_transmitted` (K + 1,) the
-    largest |T|^2 at this cosine or a smaller one.
+    `most_reflected` (M, K + 1) is the largest |R|^2 at this cosine or a larger one, `most_transmitted` (M, K + 1) the
+    largest |T|^2 at this cosine or a smaller one. `material` (P,) is that of the pieces of walls of the plan; floor and
+    ceiling are of the first.
     """
 
     reflection: NDArray[np.complex128]
     transmission: NDArray[np.complex128]
     most_reflected: Floats
     most_transmitted: Floats
+    material: NDArray[np.int64]
 
 
 class Interior(NamedTuple):
@@ -141,9 +143,8 @@ class CrossingCandidates:
         self._limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
         self._weakest = _WEAKEST_OF_ALL if exact else _WEAKEST
         self._wavelength_m = SPEED_OF_LIGHT_M_S / settings.frequency_hz
-        material = geometry.material
-        constants = *constants_of(material, settings.frequency_hz), material.thickness_m
-        self._slab = slab_of(np.array(constants), settings.frequency_hz)
+        material = geometry.wall_material[geometry.plan.owner].astype(np.int64)
+        self._slabs = slabs_of(geometry.materials, material, settings.frequency_hz)
 
     def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
         """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
@@ -174,7 +175,7 @@ class CrossingCandidates:
         least = _needed_by_distance(room, needed, self._wavelength_m)
 
         def of_root(root: Floats) -> tuple[Any, ...]:
-            fixed = self._slab, self._interior.depth_m, self._limits, least, 2.0 * room.height_m
+            fixed = self._slabs, self._interior.depth_m, self._limits, least, 2.0 * room.height_m
             return _trace(self._geometry.plan, root[None].copy(), receivers, *fixed)  # type: ignore[no-any-return]
 
         parts = list(in_order(of_root, _root_beams(room.tx_m[None, :2])))
@@ -195,7 +196,7 @@ class CrossingCandidates:
 
         def of_pairs(start: int) -> Floats:
             some = tree._replace(pair=tree.pair[start : start + _PAIRS_AT_ONCE])
-            fixed = self._geometry.plan, self._interior, self._room, self._slab, self._limits, self._wavelength_m
+            fixed = self._geometry.plan, self._interior, self._room, self._slabs, self._limits, self._wavelength_m
             return pair_powers(some, needed, *fixed, trail_of(self._geometry.plan))  # type: ignore[no-any-return]
 
         starts = range(0, len(tree.pair), _PAIRS_AT_ONCE)
@@ -231,15 +232,18 @@ class CrossingCandidates:
         return Candidates(tree.pair[chosen, 1].astype(np.int32), kind, face, vertices_m, same_wall=same_wall)
 
 
-def slab_of(material: Floats, frequency_hz: float) -> Slab:
-    """Tabulate the coefficients of a material, its permittivity, conductivity and thickness (3,)."""
+def slabs_of(materials: Sequence[Material], of_piece: NDArray[np.int64], frequency_hz: float) -> Slabs:
+    """Tabulate the coefficients of materials, which the pieces of walls (P,) count."""
     cosine = np.linspace(0.0, 1.0, _COSINES + 1)
-    reflection = np.stack(reflection_coefficients(*material, frequency_hz, cosine), axis=1)  # type: ignore[call-arg]
-    transmission = np.stack(transmission_coefficients(*material, frequency_hz, cosine), axis=1)  # type: ignore[call-arg]
-    reflection[0], transmission[0] = -1.0, 0.0
-    reflected, transmitted = (np.max(np.abs(each) ** 2, axis=1) for each in (reflection, transmission))
-    most_reflected = np.maximum.accumulate(reflected[::-1])[::-1].copy()
-    return Slab(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted))
+    constants = [(*constants_of(each, frequency_hz), each.thickness_m, frequency_hz, cosine) for each in materials]
+    reflection, transmission = (
+        np.stack([np.stack(coefficients(*each), axis=1) for each in constants])
+        for coefficients in (reflection_coefficients, transmission_coefficients)
+    )
+    reflection[:, 0], transmission[:, 0] = -1.0, 0.0
+    reflected, transmitted = (np.max(np.abs(each) ** 2, axis=2) for each in (reflection, transmission))
+    most_reflected = np.maximum.accumulate(reflected[:, ::-1], axis=1)[:, ::-1].copy()
+    return Slabs(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted, axis=1), of_piece)
 
 
 def _needed_by_distance(room: Room, needed: Floats, wavelength_m: float) -> Needed:
@@ -256,7 +260,7 @@ def _needed_by_distance(room: Room, needed: Floats, wavelength_m: float) -> Need
 
 
 @njit(cache=True, nogil=True)
-def _trace(plan, beam, receivers, slab, depth_m, limits, needed, height_m):  # type: ignore[no-untyped-def]
+def _trace(plan, beam, receivers, slabs, depth_m, limits, needed, height_m):  # type: ignore[no-untyped-def]
     """Breadth-first tree of beams: nodes, numbers of their sequences of reflections, image sources and pairs."""
     walls, count = plan.pieces_m, len(beam)
     node = np.empty((count, 3), np.int32)
@@ -307,7 +311,7 @@ def _trace(plan, beam, receivers, slab, depth_m, limits, needed, height_m):  # t
                     same = _apart(beam[first, 2:], ends[2:]) * min(value[k, 1], least) <= depth_m
                 if not same:
                     first, crossed = count, crossed + 1
-                    loss *= slab.most_transmitted[min(int(most * _COSINES) + 1, _COSINES)]
+                    loss *= slabs.most_transmitted[slabs.material[wall], min(int(most * _COSINES) + 1, _COSINES)]
                 else:
                     cosine = min(value[k, 1], least)
                 last = state[k, 0] == limits.reflections
@@ -324,7 +328,7 @@ def _trace(plan, beam, receivers, slab, depth_m, limits, needed, height_m):  # t
             # reflected
             if state[k, 0] < limits.reflections:
                 flat = near / np.hypot(near, height_m)
-                loss = value[k, 0] * slab.most_reflected[int(least * flat * _COSINES)]
+                loss = value[k, 0] * slabs.most_reflected[slabs.material[wall], int(least * flat * _COSINES)]
                 last = state[k, 0] + 1 == limits.reflections
                 rarer = limits.rarer ** max(0, state[k, 0] + 1 - _USUAL_REFLECTIONS)
                 if (
@@ -625,7 +629,7 @@ def _can_bounce(variant, room):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _path_power(trail, count, length, room, target, bounces, first, plan, interior, slab, wavelength):  # type: ignore[no-untyped-def]
+def _path_power(trail, count, length, room, target, bounces, first, plan, interior, slabs, wavelength):  # type: ignore[no-untyped-def]
     """Power between vertical antennas of a path that the plan has, with reflections at floor and ceiling."""
     rise = target[2] - room.tx_m[2]
     if bounces:
@@ -649,7 +653,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
         fraction = (to_first + turn * room.height_m) / up if turn < bounces else 2.0
         if item < count and trail.points[item, 2] <= fraction:
             i = trail.surface[item]
-            kind = trail.kind[item]
+            kind, material = trail.kind[item], slabs.material[i]
             wx, wy = plan.pieces_m[i, 1, 0] - plan.pieces_m[i, 0, 0], plan.pieces_m[i, 1, 1] - plan.pieces_m[i, 0, 1]
             norm = np.hypot(wx, wy)
             nx, ny, nz = wy / norm, -wx / norm, 0.0
@@ -666,7 +670,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
             inside = 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1]
             if not (inside and interior.floor[row, column]):
                 return 0.0
-            nx, ny, nz, kind = 0.0, 0.0, 1.0, 0
+            nx, ny, nz, kind, material = 0.0, 0.0, 1.0, 0, 0
             turn += 1
         along = kx * nx + ky * ny + kz * nz
         at = abs(along) * _COSINES
@@ -680,9 +684,9 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
         te = ex * sx + ey * sy + ez * sz
         px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
         tm = ex * px + ey * py + ez * pz
-        table = slab.transmission if kind == WALL else slab.reflection
-        te *= table[low, 0] + part * (table[low + 1, 0] - table[low, 0])
-        tm *= table[low, 1] + part * (table[low + 1, 1] - table[low, 1])
+        table = slabs.transmission if kind == WALL else slabs.reflection
+        te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
+        tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
         if kind == 0:
             kx, ky, kz = kx - 2.0 * along * nx, ky - 2.0 * along * ny, kz - 2.0 * along * nz
             px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
@@ -693,7 +697,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
 
 
 @njit(cache=True, nogil=True)
-def pair_powers(tree, needed, plan, interior, room, slab, limits, wavelength, trail):  # type: ignore[no-untyped-def]
+def pair_powers(tree, needed, plan, interior, room, slabs, limits, wavelength, trail):  # type: ignore[no-untyped-def]
     """Power (K, V) of each variant of all pairs; 0 where there is none that goes through a wall, or is needed."""
     power = np.zeros((len(tree.pair), _VARIANTS))
     for i in range(len(tree.pair)):
@@ -712,12 +716,12 @@ def pair_powers(tree, needed, plan, interior, room, slab, limits, wavelength, tr
             if good and bounces > 0 and node >= 0:
                 up = unfolded_height(room, target, bounces, first)
                 total = np.hypot(length, up)
-                flat = slab.reflection[min(int(up / total * _COSINES) + 1, _COSINES)]
+                flat = slabs.reflection[0, min(int(up / total * _COSINES) + 1, _COSINES)]
                 most = tree.loss[node] * max(abs(flat[0]), abs(flat[1])) ** (2 * bounces)
                 good = most * (wavelength / (4.0 * np.pi * total)) ** 2 >= needed[rx]
             if good and reflections + bounces <= limits.depth:
                 power[i, variant] = _path_power(
-                    trail, count, length, room, target, bounces, first, plan, interior, slab, wavelength
+                    trail, count, length, room, target, bounces, first, plan, interior, slabs, wavelength
                 )
     return power
 

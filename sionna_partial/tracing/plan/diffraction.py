@@ -67,9 +67,10 @@ class _Arrivals(NamedTuple):
     """J paths from the transmitter to edges, ordered by edge.
 
     `start` (E + 1,) gives the first of each edge, `reflections` (J,) their number, `length_m` (J,) the length in
-    the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them, `cosine` (J, R) of the
-    angles of incidence there, `angle` (J, 4) the direction of arrival as `wedge_angle` gives it, `faces` (J, 2) the
-    cosines of the angles of incidence at 0-face and n-face, -1 in the shadow, and `lit` (J,) whether the 0-face is lit.
+    the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them, `material` (J, R) of
+    those walls, `cosine` (J, R) of the angles of incidence there, `angle` (J, 4) the direction of arrival as
+    `wedge_angle` gives it, `faces` (J, 2) the cosines of the angles of incidence at 0-face and n-face, -1 in the
+    shadow, and `lit` (J,) whether the 0-face is lit.
     """
 
     start: NDArray[np.int64]
@@ -77,6 +78,7 @@ class _Arrivals(NamedTuple):
     length_m: Floats
     walls: NDArray[np.int64]
     points: Floats
+    material: NDArray[np.int64]
     cosine: Floats
     angle: Floats
     faces: Floats
@@ -86,7 +88,8 @@ class _Arrivals(NamedTuple):
 class _Edges(NamedTuple):
     """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4).
 
-    `utd` (E, 5) are the `wedge_constants`.
+    `utd` (E, 5) are the `wedge_constants`, and `material` (E, 2) is that of both faces where the 0-face is lit, and
+    where it is not: to Sionna RT an edge is of one shape.
     """
 
     position_m: Floats
@@ -94,6 +97,7 @@ class _Edges(NamedTuple):
     exterior_rad: Floats
     normals: Floats
     utd: Floats
+    material: NDArray[np.int64]
 
 
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
@@ -134,7 +138,7 @@ class DiffractionCandidates:
         self._reflections = min(MAX_REFLECTIONS, max_depth - 1)
         self._walls_a_side = min(walls_a_side, self._reflections)
         self._beams: dict[int, tuple[Beams, NDArray[np.uint8]]] = {}
-        self._edges = _edges_of(wedges)
+        self._edges = _edges_of(wedges, room.wall_material)
         if self._reflections >= 0 and len(wedges.edge_m):
             self._arrivals = _arrivals(geometry.plan, self._edges, room, self._walls_a_side)
 
@@ -170,13 +174,15 @@ class DiffractionCandidates:
         return trace_beams_in(self._geometry.plan, receivers, self._wedges.edge_m[group], onward)
 
 
-def _edges_of(wedges: Wedges) -> _Edges:
+def _edges_of(wedges: Wedges, wall_material: NDArray[np.int64]) -> _Edges:
     """Lay out wedges for the search of paths."""
     normals = wedges.normal[: len(wedges.edge_m)]
     face_rad, end_rad = np.arctan2(-normals[:, 0, 0], normals[:, 0, 1]), np.arctan2(normals[:, 1, 0], -normals[:, 1, 1])
     exterior_rad = (end_rad - face_rad) % (2 * np.pi)
     exterior_rad[exterior_rad < _FLAT_RAD] = 2 * np.pi  # the free end of a wall
-    return _Edges(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4), wedge_constants(exterior_rad))
+    material = wall_material[wedges.face[: len(wedges.edge_m)] // 2]
+    constants = wedge_constants(exterior_rad)
+    return _Edges(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4), constants, material)
 
 
 def _arrivals(plan: Plan, edges: _Edges, room: Room, reflections: int) -> _Arrivals:
@@ -195,6 +201,7 @@ def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no
     good, count = np.empty(len(node), np.bool_), np.empty(len(node), np.int64)
     length, walls = np.empty(len(node)), np.empty((len(node), reflections), np.int64)
     points, cosine = np.empty((len(node), reflections, 3)), np.empty((len(node), reflections))
+    material = np.zeros((len(node), reflections), np.int64)
     angle, faces, lit = np.empty((len(node), 4)), np.empty((len(node), 2)), np.empty(len(node), np.bool_)
     for i in range(len(node)):
         target = edges.position_m[edge[i]]
@@ -207,6 +214,8 @@ def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no
         if count[i] > 0:
             x, y = points[i, count[i] - 1, 0], points[i, count[i] - 1, 1]
             incidence(room.walls_m, room.tx_m, target, walls[i, : count[i]], points[i], cosine[i])
+            for k in range(count[i]):
+                material[i, k] = room.wall_material[walls[i, k]]
         x, y = x - target[0], y - target[1]
         lit[i], outside = _outside(edges.normals[edge[i]], x, y)
         good[i] = outside and np.hypot(x, y) > _NEAR_M
@@ -215,7 +224,7 @@ def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no
         angle[i, 0], angle[i, 1], angle[i, 2], angle[i, 3] = wedge_angle(from_0, exterior)
         for k, from_face in enumerate((from_0, exterior - from_0)):
             faces[i, k] = max(0.0, np.sin(from_face)) if from_face <= np.pi else -1.0
-    return good, count, length, walls, points, cosine, angle, faces, lit
+    return good, count, length, walls, points, material, cosine, angle, faces, lit
 
 
 @njit(cache=True)
@@ -256,7 +265,8 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
     normals, face_rad, exterior_rad, utd = edges.normals, edges.face_rad, edges.exterior_rad, edges.utd
     heights = _heights(room, size)
     highest = heights.max()
-    most = _most_of_arrivals(strengths.largest[0], arrivals, highest)
+    most = _most_of_arrivals(strengths.largest, arrivals, edges.material, highest)
+    wall_material, material = room.wall_material, np.full(size + 1, room.flat_material)
     level = np.empty((np.diff(start).max(), size, 2), np.int64)
     for i in range(len(pair_node)):
         here = pair_rx[i]
@@ -271,10 +281,22 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
         if not good or np.hypot(ox, oy) < _NEAR_M or not _outside(normals[edge], ox, oy)[1]:
             continue
         incidence(walls_m, origin, target, walls[:after], points, cosine)
+        for k in range(after):
+            material[k] = wall_material[walls[k]]
         departure = wedge_angle(_angle_rad(face_rad[edge], exterior_rad[edge], ox, oy), exterior_rad[edge])
         pair = here, start[edge], start[edge + 1], reflections - after, onward
         best[i] = _bound(
-            strengths, arrivals, most, pair, utd[edge], departure, cosine[:after], heights[here], level, terms
+            strengths,
+            arrivals,
+            most,
+            pair,
+            utd[edge],
+            (material, edges.material[edge]),
+            departure,
+            cosine[:after],
+            heights[here],
+            level,
+            terms,
         )
         if not first[here] < last[here] or best[i] >= last[here]:
             continue
@@ -308,15 +330,23 @@ def _heights(room, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _bound(strengths, arrivals, most, pair, wedge, departure, cosine, heights, level, terms):  # type: ignore[no-untyped-def]
+def _bound(strengths, arrivals, most, pair, wedge, materials, departure, cosine, heights, level, terms):  # type: ignore[no-untyped-def]
     """Write the levels of all paths of a pair, one for each arrival, number of bounces and first flat; the lowest.
 
     Paths that are negligible by a rough bound count with it, in the last level; `most` is what that takes. A pair is
-    (receiver, first arrival, end of the arrivals, reflections that remain, length onward [m]).
+    (receiver, first arrival, end of the arrivals, reflections that remain, length onward [m]); materials are those of
+    the walls after the edge, with that of floor and ceiling at their end, and those of the edge.
     """
-    largest, faces, transition = strengths.largest[0], strengths.faces[0], strengths.transition
+    largest, faces, transition, (material, at_faces) = (
+        strengths.largest,
+        strengths.faces,
+        strengths.transition,
+        materials,
+    )
     power, reflected, wavelength = strengths.power, strengths.reflected, strengths.wavelength_m
-    lengths, reflections, angle, lit, before = (
+    earlier, is_lit, lengths, reflections, angle, lit, before = (
+        arrivals.material,
+        arrivals.lit,
         arrivals.length_m,
         arrivals.reflections,
         arrivals.angle,
@@ -325,7 +355,7 @@ def _bound(strengths, arrivals, most, pair, wedge, departure, cosine, heights, l
     )
     here, start, stop, remain, onward = pair
     constants = wedge[0], wedge[1], wedge[2], wedge[3], wedge[4]
-    most_after = _most_at_walls(largest, cosine, len(cosine), onward, heights.max())
+    most_after = _most_at_walls(largest, material, cosine, len(cosine), onward, heights.max())
     lowest, adds = LEVELS, len(power) > 0
     rough = NEGLIGIBLE * reflected[here] if strengths.last[here] < LEVELS else 0.0
     level[: stop - start] = LEVELS
@@ -350,12 +380,13 @@ def _bound(strengths, arrivals, most, pair, wedge, departure, cosine, heights, l
                 total = np.sqrt((length + onward) ** 2 + height**2)
                 sine, slope, field = (length + onward) / total, height / total, (1.0, 0.0, 1.0)
                 for k in range(reflections[j]):
-                    field = at_wall(largest, before[j, k], sine, slope, field)
+                    field = at_wall(largest, earlier[j, k], before[j, k], sine, slope, field)
                 edge = np.sqrt(boundary * sine)
-                field = at_edge(faces, transition, terms, edge, lit[j, 0], lit[j, 1], sine, slope, field)
+                own = at_faces[0] if is_lit[j] else at_faces[1]
+                field = at_edge(faces, own, transition, terms, edge, lit[j, 0], lit[j, 1], sine, slope, field)
                 for k in range(len(cosine)):
-                    field = at_wall(largest, cosine[k], sine, slope, field)
-                strength = at_flats(largest, slope, bounces, field) ** 2 * spread / total
+                    field = at_wall(largest, material[k], cosine[k], sine, slope, field)
+                strength = at_flats(largest, material[-1], slope, bounces, field) ** 2 * spread / total
                 at = level_of(strength)
                 level[j - start, bounces, down] = at
                 lowest = min(lowest, at)
@@ -365,24 +396,27 @@ def _bound(strengths, arrivals, most, pair, wedge, departure, cosine, heights, l
 
 
 @njit(cache=True)
-def _most_of_arrivals(largest, arrivals, highest):  # type: ignore[no-untyped-def]
+def _most_of_arrivals(largest, arrivals, material, highest):  # type: ignore[no-untyped-def]
     """Bounds (J, 3) of what walls leave of fields that arrive at edges, and of what the two faces there reflect."""
     most = np.empty((len(arrivals.lit), 3))
-    for j in range(len(most)):
-        length = arrivals.length_m[j]
-        most[j, 0] = _most_at_walls(largest, arrivals.cosine[j], arrivals.reflections[j], length, highest)
-        for k in range(2):
-            lit = arrivals.faces[j, k] >= 0.0
-            most[j, 1 + k] = _most_at_walls(largest, arrivals.faces[j, k : k + 1], 1, length, highest) if lit else 1.0
+    for edge in range(len(arrivals.start) - 1):
+        for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
+            length, own = arrivals.length_m[j], material[edge] if arrivals.lit[j] else material[edge, 1:]
+            most[j, 0] = _most_at_walls(
+                largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
+            )
+            for k in range(2):
+                face = arrivals.faces[j, k : k + 1]
+                most[j, 1 + k] = _most_at_walls(largest, own, face, 1, length, highest) if face[0] >= 0.0 else 1.0
     return most
 
 
 @njit(cache=True)
-def _most_at_walls(largest, cosine, count, length, highest):  # type: ignore[no-untyped-def]
+def _most_at_walls(largest, material, cosine, count, length, highest):  # type: ignore[no-untyped-def]
     """Bound of what walls leave of a field whose path has some length in the plan, and rises by `highest` at most."""
     most, sine = 1.0, length / np.sqrt(length * length + highest * highest)
     for k in range(count):
-        most *= most_at_wall(largest, cosine[k] * sine)
+        most *= most_at_wall(largest, material[k], cosine[k] * sine)
     return most
 
 

@@ -30,7 +30,7 @@ class Room(NamedTuple):
     """What paths meet between a transmitter (3,) and receivers (N, 3), in the local frame [m].
 
     Walls (S, 2, 2) stand between the floor at 0 and the ceiling at `height_m`; `floor` and `ceiling` are whether they
-    reflect.
+    reflect. `wall_material` (S,) and `flat_material` are indices of materials.
     """
 
     walls_m: Floats
@@ -39,12 +39,16 @@ class Room(NamedTuple):
     ceiling: bool
     tx_m: Floats
     rx_m: Floats
+    wall_material: NDArray[np.int64]
+    flat_material: int
 
     @classmethod
-    def of(cls, geometry: SceneGeometry, tx_m: Floats, rx_m: Floats) -> "Room":
-        """Take it from a scene."""
+    def of(cls, geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, material_of_face: NDArray[np.int64]) -> "Room":
+        """Take it from a scene, whose faces have these materials."""
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
-        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m)
+        of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
+        materials = material_of_face[: 2 * len(geometry.segments) : 2], of_flats
+        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m, *materials)
 
 
 class SpecularCandidates:
@@ -96,11 +100,13 @@ def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # ty
     all_power, reflected, largest, wavelength = (
         strengths.power,
         strengths.reflected,
-        strengths.largest[0],
+        strengths.largest,
         strengths.wavelength_m,
     )
+    wall_material, flat_material = room.wall_material, room.flat_material
     size = max(1, max_depth)
     walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
+    material = np.full(size + 1, flat_material)
     out_rx, surface, vertices = np.empty(1024, np.int32), np.empty((1024, size), np.int32), np.empty((1024, size, 3))
     count = np.int64(0)
     for i in range(start, stop):
@@ -112,12 +118,14 @@ def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # ty
         if not good:
             continue
         incidence(walls_m, tx_m, target, walls[:k], points, cosine)
+        for level in range(k):
+            material[level] = wall_material[walls[level]]
         for bounces in range(max_depth - k + 1):
             for first in (FLOOR, CEILING):
                 if not can_bounce(bounces, first, room):
                     continue
                 height = unfolded_height(room, target, bounces, first)
-                power = _specular_power(wavelength, largest, cosine, k, length, height, bounces)
+                power = _specular_power(wavelength, largest, material, cosine, k, length, height, bounces)
                 level = level_of(power) if k + bounces > 0 else 0
                 if len(all_power):
                     all_power[rx, level] += power
@@ -169,13 +177,16 @@ def incidence(all_walls, start, end, walls, points, cosine):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _specular_power(wavelength, largest, cosine, count, length, height, bounces):  # type: ignore[no-untyped-def]
-    """Upper bound of the power of a path of some length in the plan, with reflections at walls, floor and ceiling."""
+def _specular_power(wavelength, largest, material, cosine, count, length, height, bounces):  # type: ignore[no-untyped-def]
+    """Upper bound of the power of a path of some length in the plan, with reflections at walls, floor and ceiling.
+
+    `material` has those of the walls, and at its end that of floor and ceiling.
+    """
     total = np.hypot(length, height)
     sine, slope, field = length / total, height / total, (1.0, 0.0, 1.0)
     for k in range(count):
-        field = at_wall(largest, cosine[k], sine, slope, field)
-    return (wavelength / (4.0 * np.pi * total) * at_flats(largest, slope, bounces, field)) ** 2
+        field = at_wall(largest, material[k], cosine[k], sine, slope, field)
+    return (wavelength / (4.0 * np.pi * total) * at_flats(largest, material[-1], slope, bounces, field)) ** 2
 
 
 @njit(cache=True)
