@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 
 import sionna_partial as sp
+from sionna_partial.scene.scene import build_scene
 from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.finder import stock_paths
+from sionna_partial.tracing.finder import diffracted_as_exact, stock_paths
+from sionna_partial.tracing.plan.diffraction import find_wedges
 from sionna_partial.tracing.simulation import checked_settings
 from sionna_partial.tracing.slab import transmission_coefficients
 
 BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
 STRAIGHT = sp.TraceSettings(frequency_hz=5e9, max_depth=0, power_tolerance_db=0.0)
-REFRACTION = 4
+REFRACTION, DIFFRACTION = 4, 8
 
 
 def walled(cells: int, *, resolution_m: float = 0.1, unseen: bool = False) -> sp.PartialMap:
@@ -122,6 +124,36 @@ def test_stock_finds_no_other_paths(partial: sp.PartialMap, tmp_path: Path) -> N
             assert abs(ours.a[same[0]]) ** 2 == pytest.approx(paths.power[path], rel=2e-3)
             found += REFRACTION in kinds
     assert found > 30
+
+
+def test_stock_is_diffracted_at_no_other_edges(tmp_path: Path) -> None:
+    """Paths over an edge and through walls; those with the most interactions have the power that stock gives them."""
+    every = replace(EVERY, diffraction=True, max_depth=3)
+    wedges = find_wedges(build_scene(rooms()), open_ends=True)
+    settings, scene_settings = checked_settings(rooms(), every, sp.SceneSettings(material=BRICK))
+    ours = sp.trace_links(rooms(), TX, RX, trace_settings=settings, scene_settings=scene_settings)
+    folder = sp.export_scene(replace(rooms(), origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
+    scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
+    found = 0
+    for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
+        own = np.flatnonzero(ours.path_rx == rx)
+        at_edges = diffracted_as_exact(wedges, paths, 2)  # Sionna RT has junctions of walls and rims as well
+        for path in np.flatnonzero(at_edges & (paths.power > 1e-4 * paths.power.sum())):
+            kinds = paths.interactions[path][paths.interactions[path] > 0]
+            at_m = paths.vertices_m[path, : len(kinds)] + shift
+            if {*kinds.tolist()} != {REFRACTION, DIFFRACTION}:
+                continue
+            same = [
+                k
+                for k in own
+                if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
+                and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
+            ]
+            assert len(same) == 1
+            if len(kinds) == settings.max_depth:
+                assert abs(ours.a[same[0]]) ** 2 == pytest.approx(paths.power[path], rel=5e-3)
+                found += 1
+    assert found > 2
 
 
 @pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])

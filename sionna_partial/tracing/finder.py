@@ -25,6 +25,7 @@ from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, 
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION, SolvedPaths
+from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
@@ -80,7 +81,15 @@ class PlanScene:
             yield candidates, paths
         crossing = CrossingCandidates(self.geometry, room, self.interior, self.settings)
         blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
-        yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.5, 1.0))
+        for candidates, paths in _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.5, 0.8)):
+            np.add.at(power, paths.path_rx, paths.power)
+            yield candidates, paths
+        if self.settings.diffraction and len(rx_m):
+            fixed = self.interior, self.settings, crossing.slabs
+            edges = CrossedEdgeCandidates(self.geometry, self.wedges, room, *fixed)
+            strengths = strengths_of(solver.materials.values(), self.settings.frequency_hz, len(rx_m))
+            blocks = ((*block, "verifying diffractions through walls") for block in edges.blocks(strengths, power))
+            yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.8, 1.0))
 
     def _kinds(self, room: Room) -> dict[str, SpecularCandidates | DiffractionCandidates]:
         """Kinds of candidates, by what is done with them."""

@@ -254,7 +254,7 @@ class PathSet:
 def _merged(parts: list[Part]) -> list[Part]:
     """Join parts that can be verified together, and cut them to `PATHS_PER_BLOCK`."""
     merged = []
-    for diffracted, crossing in ((False, False), (True, False), (False, True)):
+    for crossing, diffracted in itertools.product((False, True), repeat=2):
         some = [
             (candidates, paths)
             for candidates, paths in parts

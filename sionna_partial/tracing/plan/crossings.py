@@ -6,7 +6,7 @@ one wall if they are at most `depth_m` apart, measured across them. Only one fac
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,10 +18,10 @@ from sionna_partial.planar import span_in_strip
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import Plan, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry, constants_of
-from sionna_partial.settings import Material, TraceSettings
+from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.bounds import dropped_power
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.paths import REFLECTION, REFRACTION
+from sionna_partial.tracing.paths import DIFFRACTION, REFLECTION, REFRACTION
 from sionna_partial.tracing.plan.beams import TOLERANCE_M, _add_points, _reflect, _root_beams, _Scratch, _visible_pieces
 from sionna_partial.tracing.plan.specular import CEILING, FLOOR, Room, can_bounce, merge_heights, unfolded_height
 from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
@@ -49,9 +49,9 @@ _AT_ONCE = 100_000
 _PAIRS_AT_ONCE = 5_000
 """Number of pairs whose power is computed by one thread at a time."""
 
-WALL, SAME_WALL, _FLAT = 1, 2, 3
+WALL, SAME_WALL, FLAT, EDGE = 1, 2, 3, 4
 """What a path does, if it is not reflected at a wall (0): it crosses a wall, a further face of that wall, which costs
-nothing, or is reflected at floor or ceiling."""
+nothing, is reflected at floor or ceiling, or diffracted at an edge."""
 
 _FACES = 40
 """Most faces of walls that a leg may cross."""
@@ -141,22 +141,21 @@ class CrossingCandidates:
         exact = self._tolerance_db == 0.0
         most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
         self._limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
-        self._weakest = _WEAKEST_OF_ALL if exact else _WEAKEST
         self._wavelength_m = SPEED_OF_LIGHT_M_S / settings.frequency_hz
-        material = geometry.wall_material[geometry.plan.owner].astype(np.int64)
-        self._slabs = slabs_of(geometry.materials, material, settings.frequency_hz)
+        self.slabs = slabs_of(geometry, settings.frequency_hz)
 
     def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
         """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
         straight = self._straight()
         power = self._powers(straight, np.zeros(len(found)))
         total = found + np.bincount(straight.pair[:, 1], power.sum(axis=1), len(found))
-        needed = self._weakest * np.maximum(total, 10.0 ** (GAIN_FLOOR_DB / 10.0))
+        needed = weakest_needed(total, self._tolerance_db)
         trees = [(straight, power)]
         if self._limits.depth:
             tree = self._tree(needed)
             trees.append((tree, self._powers(tree, needed)))
-        least = self._least([(tree.pair[:, 1], power) for tree, power in trees], found)
+        rx = np.concatenate([np.repeat(tree.pair[:, 1], _VARIANTS) for tree, _ in trees])
+        least = least_power(rx, np.concatenate([power.ravel() for _, power in trees]), found, self._tolerance_db)
         for number, (tree, power) in enumerate(trees):
             chosen, variant = np.nonzero((power > 0.0) & (power >= least[tree.pair[:, 1], None]))
             for start in range(0, len(chosen), _AT_ONCE):
@@ -175,7 +174,7 @@ class CrossingCandidates:
         least = _needed_by_distance(room, needed, self._wavelength_m)
 
         def of_root(root: Floats) -> tuple[Any, ...]:
-            fixed = self._slabs, self._interior.depth_m, self._limits, least, 2.0 * room.height_m
+            fixed = self.slabs, self._interior.depth_m, self._limits, least, 2.0 * room.height_m
             return _trace(self._geometry.plan, root[None].copy(), receivers, *fixed)  # type: ignore[no-any-return]
 
         parts = list(in_order(of_root, _root_beams(room.tx_m[None, :2])))
@@ -196,26 +195,11 @@ class CrossingCandidates:
 
         def of_pairs(start: int) -> Floats:
             some = tree._replace(pair=tree.pair[start : start + _PAIRS_AT_ONCE])
-            fixed = self._geometry.plan, self._interior, self._room, self._slabs, self._limits, self._wavelength_m
+            fixed = self._geometry.plan, self._interior, self._room, self.slabs, self._limits, self._wavelength_m
             return pair_powers(some, needed, *fixed, trail_of(self._geometry.plan))  # type: ignore[no-any-return]
 
         starts = range(0, len(tree.pair), _PAIRS_AT_ONCE)
         return np.concatenate([np.zeros((0, _VARIANTS)), *in_order(of_pairs, starts)])
-
-    def _least(self, parts: list[tuple[Indices, Floats]], found: Floats) -> Floats:
-        """Power (N,) below which links can do without paths."""
-        rx = np.concatenate([np.repeat(pair_rx, _VARIANTS) for pair_rx, _ in parts])
-        power = np.concatenate([each.ravel() for _, each in parts])
-        rx, power = rx[power > 0.0], power[power > 0.0]
-        order = np.lexsort((power, rx))
-        rx, power = rx[order], power[order]
-        allowed = dropped_power(found + np.bincount(rx, power, len(found)), self._tolerance_db)
-        sums = np.cumsum(power)
-        before = np.concatenate([[0.0], sums])[np.searchsorted(rx, np.arange(len(found)))]
-        kept = sums - before[rx] > allowed[rx]
-        least = np.full(len(found), np.inf)
-        np.minimum.at(least, rx[kept], power[kept])
-        return least
 
     def _written(self, tree: Tree, chosen: Indices, variant: Indices) -> Candidates:
         """Write the paths of some pairs."""
@@ -223,19 +207,48 @@ class CrossingCandidates:
         surface, kind, vertices_m = write_paths(
             tree, chosen, variant, geometry.plan, self._interior, self._room, self._limits, trail_of(geometry.plan)
         )
-        used = max(1, int((kind >= 0).sum(axis=1).max(initial=0)))
-        surface, kind, vertices_m = surface[:, :used], kind[:, :used], vertices_m[:, :used]
-        flat = np.where(vertices_m[:, :, 2] > 0.5 * self._room.height_m, geometry.ceiling_face, geometry.floor_face)
-        face = np.where(kind == _FLAT, flat, np.where(kind < 0, -1, 2 * surface)).astype(np.int32)
-        same_wall = kind == SAME_WALL
-        kind = np.where(same_wall | (kind == WALL), REFRACTION, np.where(kind < 0, 0, REFLECTION)).astype(np.uint8)
+        kind, face, vertices_m, same_wall = faces_and_kinds(surface, kind, vertices_m, geometry)
         return Candidates(tree.pair[chosen, 1].astype(np.int32), kind, face, vertices_m, same_wall=same_wall)
 
 
-def slabs_of(materials: Sequence[Material], of_piece: NDArray[np.int64], frequency_hz: float) -> Slabs:
-    """Tabulate the coefficients of materials, which the pieces of walls (P,) count."""
+def weakest_needed(power: Floats, tolerance_db: float) -> Floats:
+    """Return below which power (N,) paths of links whose paths have some power do not matter."""
+    weakest = _WEAKEST_OF_ALL if tolerance_db == 0.0 else _WEAKEST
+    return weakest * np.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0))
+
+
+def least_power(rx: Indices, power: Floats, found: Floats, tolerance_db: float) -> Floats:
+    """Return the power (N,) below which links can do without paths, if the others have the power `found` (N,)."""
+    rx, power = rx[power > 0.0], power[power > 0.0]
+    order = np.lexsort((power, rx))
+    rx, power = rx[order], power[order]
+    allowed = dropped_power(found + np.bincount(rx, power, len(found)), tolerance_db)
+    sums = np.cumsum(power)
+    before = np.concatenate([[0.0], sums])[np.searchsorted(rx, np.arange(len(found)))]
+    kept = sums - before[rx] > allowed[rx]
+    least = np.full(len(found), np.inf)
+    np.minimum.at(least, rx[kept], power[kept])
+    return least
+
+
+def faces_and_kinds(
+    surface: NDArray[np.int32], kind: NDArray[np.int32], vertices_m: Floats, geometry: SceneGeometry
+) -> tuple[NDArray[np.uint8], NDArray[np.int32], Floats, Bools]:
+    """Turn walls and kinds of `Trail` (C, D) into those of `Candidates`: kind, face, vertices and `same_wall`."""
+    used = max(1, int((kind >= 0).sum(axis=1).max(initial=0)))
+    surface, kind, vertices_m = surface[:, :used], kind[:, :used], vertices_m[:, :used]
+    flat = np.where(vertices_m[:, :, 2] > 0.5 * geometry.height_m, geometry.ceiling_face, geometry.floor_face)
+    face = np.where(kind == FLAT, flat, np.where(kind < 0, -1, 2 * surface)).astype(np.int32)
+    of_kind = np.array([REFLECTION, REFRACTION, REFRACTION, REFLECTION, DIFFRACTION, 0], np.uint8)
+    return of_kind[kind], face, vertices_m, kind == SAME_WALL
+
+
+def slabs_of(geometry: SceneGeometry, frequency_hz: float) -> Slabs:
+    """Tabulate the coefficients of the materials of a scene."""
     cosine = np.linspace(0.0, 1.0, _COSINES + 1)
-    constants = [(*constants_of(each, frequency_hz), each.thickness_m, frequency_hz, cosine) for each in materials]
+    constants = [
+        (*constants_of(each, frequency_hz), each.thickness_m, frequency_hz, cosine) for each in geometry.materials
+    ]
     reflection, transmission = (
         np.stack([np.stack(coefficients(*each), axis=1) for each in constants])
         for coefficients in (reflection_coefficients, transmission_coefficients)
@@ -243,6 +256,7 @@ def slabs_of(materials: Sequence[Material], of_piece: NDArray[np.int64], frequen
     reflection[:, 0], transmission[:, 0] = -1.0, 0.0
     reflected, transmitted = (np.max(np.abs(each) ** 2, axis=2) for each in (reflection, transmission))
     most_reflected = np.maximum.accumulate(reflected[:, ::-1], axis=1)[:, ::-1].copy()
+    of_piece = geometry.wall_material[geometry.plan.owner].astype(np.int64)
     return Slabs(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted, axis=1), of_piece)
 
 
@@ -498,7 +512,7 @@ def _follow(tree, node, plan, interior, tx_m, target, limits, trail):  # type: i
             )
         else:
             bx, by, stop, other = target[0], target[1], 1.0, -1
-        count, more = _cross_leg(plan, interior, ax, ay, bx, by, own, other, done, stop, count, trail)
+        count, more = cross_leg(plan, interior, ax, ay, bx, by, own, other, done, stop, count, trail)
         crossed += more
         if count < 0 or crossed > limits.walls:
             return -1, crossed, total
@@ -513,7 +527,7 @@ def _follow(tree, node, plan, interior, tx_m, target, limits, trail):  # type: i
 
 
 @njit(cache=True)
-def _cross_leg(plan, interior, ax, ay, bx, by, own, other, done, stop, count, trail):  # type: ignore[no-untyped-def]
+def cross_leg(plan, interior, ax, ay, bx, by, own, other, done, stop, count, trail):  # type: ignore[no-untyped-def]
     """Add the faces that a leg crosses; the number of entries (-1 if there are too many), and the walls among them."""
     found, wall, n = trail.found, trail.wall, 0
     x0, y0, edge, columns, rows = plan.cells.grid
@@ -621,7 +635,7 @@ def _is_free_between(interior, ax, ay, dx, dy, length, first, last):  # type: ig
 
 
 @njit(cache=True)
-def _can_bounce(variant, room):  # type: ignore[no-untyped-def]
+def can_bounce_as(variant, room):  # type: ignore[no-untyped-def]
     """Bounces at floor and ceiling of a variant, which comes first, and whether the room allows them."""
     bounces = 0 if variant == 0 else (1 if variant < 3 else 2)
     first = CEILING if variant == 2 or variant == 4 else FLOOR
@@ -708,11 +722,11 @@ def pair_powers(tree, needed, plan, interior, room, slabs, limits, wavelength, t
             if tree.loss[node] * (wavelength / (4.0 * np.pi * max(far, 1e-3))) ** 2 < needed[rx]:
                 continue
         count, crossed, length = _follow(tree, node, plan, interior, room.tx_m, target, limits, trail)
-        if count < 0 or crossed == 0 or not _has_long_legs(trail, count, length):
+        if count < 0 or crossed == 0 or not has_long_legs(trail, count, length):
             continue
         reflections = count - np.sum(trail.kind[:count] > 0)
         for variant in range(_VARIANTS):
-            bounces, first, good = _can_bounce(variant, room)
+            bounces, first, good = can_bounce_as(variant, room)
             if good and bounces > 0 and node >= 0:
                 up = unfolded_height(room, target, bounces, first)
                 total = np.hypot(length, up)
@@ -727,7 +741,8 @@ def pair_powers(tree, needed, plan, interior, room, slabs, limits, wavelength, t
 
 
 @njit(cache=True)
-def _has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
+def has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
+    """Whether no leg of a path of some length in the plan is so short that Sionna RT drops the path."""
     previous = 0.0
     for k in range(count):
         if (trail.points[k, 2] - previous) * length < _SHORTEST_LEG_M:
@@ -738,7 +753,7 @@ def _has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def write_paths(tree, chosen, variants, plan, interior, room, limits, trail):  # type: ignore[no-untyped-def]
-    """Write chosen pairs: surfaces (C, D), kinds of `Trail` or _FLAT, -1 where there is nothing, vertices (C, D, 3)."""
+    """Write chosen pairs: surfaces (C, D), kinds of `Trail` or FLAT, -1 where there is nothing, vertices (C, D, 3)."""
     columns = len(trail.surface) + 2
     surface, kind = np.full((len(chosen), columns), -1, np.int32), np.full((len(chosen), columns), -1, np.int32)
     vertices = np.zeros((len(chosen), columns, 3))
@@ -747,14 +762,30 @@ def write_paths(tree, chosen, variants, plan, interior, room, limits, trail):  #
         node, rx = tree.pair[chosen[c], 0], tree.pair[chosen[c], 1]
         target = room.rx_m[rx]
         count, _, _ = _follow(tree, node, plan, interior, room.tx_m, target, limits, trail)
-        bounces, first, _ = _can_bounce(variants[c], room)
+        bounces, first, _ = can_bounce_as(variants[c], room)
         for k in range(count):
             item[k] = k
         merge_heights(item[:count], trail.points[:count], room, target, bounces, first, surface[c], vertices[c])
-        for d in range(count + bounces):
-            if surface[c, d] >= 0:
-                kind[c, d] = trail.kind[surface[c, d]]
-                surface[c, d] = plan.owner[trail.surface[surface[c, d]]]
-            else:
-                kind[c, d] = _FLAT
+        write_kinds(trail, plan, count + bounces, surface[c], kind[c])
     return surface, kind, vertices
+
+
+@njit(cache=True)
+def write_kinds(trail, plan, count, surface, kind):  # type: ignore[no-untyped-def]
+    """Put walls and kinds in place of the entries of a trail, and of the flats (negative) among them."""
+    for d in range(count):
+        if surface[d] >= 0:
+            kind[d] = trail.kind[surface[d]]
+            surface[d] = plan.owner[trail.surface[surface[d]]]
+        else:
+            kind[d] = FLAT
+
+
+@njit(cache=True)
+def transmitted_power(trail, entry, slabs):  # type: ignore[no-untyped-def]
+    """Fraction of the power, however polarised, that an entry of a trail leaves of a horizontal path."""
+    if trail.kind[entry] != WALL:
+        return 1.0
+    at = min(int(trail.cosine[entry] * _COSINES + 0.5), _COSINES)
+    te, tm = slabs.transmission[slabs.material[trail.surface[entry]], at]
+    return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)

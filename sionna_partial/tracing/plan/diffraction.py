@@ -138,7 +138,7 @@ class DiffractionCandidates:
         self._reflections = min(MAX_REFLECTIONS, max_depth - 1)
         self._walls_a_side = min(walls_a_side, self._reflections)
         self._beams: dict[int, tuple[Beams, NDArray[np.uint8]]] = {}
-        self._edges = _edges_of(wedges, room.wall_material)
+        self._edges = edges_of(wedges, room.wall_material)
         if self._reflections >= 0 and len(wedges.edge_m):
             self._arrivals = _arrivals(geometry.plan, self._edges, room, self._walls_a_side)
 
@@ -174,7 +174,7 @@ class DiffractionCandidates:
         return trace_beams_in(self._geometry.plan, receivers, self._wedges.edge_m[group], onward)
 
 
-def _edges_of(wedges: Wedges, wall_material: NDArray[np.int64]) -> _Edges:
+def edges_of(wedges: Wedges, wall_material: NDArray[np.int64]) -> _Edges:
     """Lay out wedges for the search of paths."""
     normals = wedges.normal[: len(wedges.edge_m)]
     face_rad, end_rad = np.arctan2(-normals[:, 0, 0], normals[:, 0, 1]), np.arctan2(normals[:, 1, 0], -normals[:, 1, 1])
@@ -217,10 +217,10 @@ def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no
             for k in range(count[i]):
                 material[i, k] = room.wall_material[walls[i, k]]
         x, y = x - target[0], y - target[1]
-        lit[i], outside = _outside(edges.normals[edge[i]], x, y)
-        good[i] = outside and np.hypot(x, y) > _NEAR_M
+        lit[i], in_front = outside(edges.normals[edge[i]], x, y)
+        good[i] = in_front and np.hypot(x, y) > _NEAR_M
         exterior = edges.exterior_rad[edge[i]]
-        from_0 = _angle_rad(edges.face_rad[edge[i]], exterior, x, y)
+        from_0 = angle_rad(edges.face_rad[edge[i]], exterior, x, y)
         angle[i, 0], angle[i, 1], angle[i, 2], angle[i, 3] = wedge_angle(from_0, exterior)
         for k, from_face in enumerate((from_0, exterior - from_0)):
             faces[i, k] = max(0.0, np.sin(from_face)) if from_face <= np.pi else -1.0
@@ -236,14 +236,14 @@ def _root(parent, node):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _outside(normals, x, y):  # type: ignore[no-untyped-def]
+def outside(normals, x, y):  # type: ignore[no-untyped-def]
     """Whether a point, seen from the edge, is in front of the 0-face of a wedge, and in front of either face."""
     first = normals[0] * x + normals[1] * y > _EXTERIOR_M
     return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
 
 
 @njit(cache=True)
-def _angle_rad(face_rad, exterior_rad, x, y):  # type: ignore[no-untyped-def]
+def angle_rad(face_rad, exterior_rad, x, y):  # type: ignore[no-untyped-def]
     """Angle of a direction from an edge, counted from its 0-face, where rounding may turn 0 into 2 pi."""
     angle = (np.arctan2(y, x) - face_rad) % (2 * np.pi)
     return 0.0 if angle > 0.5 * exterior_rad + np.pi else angle
@@ -278,12 +278,12 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
         after, onward, good = unfold(parent, segment, source, pair_node[i], walls_m, target, walls, points)
         ox, oy = (points[0, 0], points[0, 1]) if after > 0 else (target[0], target[1])
         ox, oy = ox - origin[0], oy - origin[1]
-        if not good or np.hypot(ox, oy) < _NEAR_M or not _outside(normals[edge], ox, oy)[1]:
+        if not good or np.hypot(ox, oy) < _NEAR_M or not outside(normals[edge], ox, oy)[1]:
             continue
         incidence(walls_m, origin, target, walls[:after], points, cosine)
         for k in range(after):
             material[k] = wall_material[walls[k]]
-        departure = wedge_angle(_angle_rad(face_rad[edge], exterior_rad[edge], ox, oy), exterior_rad[edge])
+        departure = wedge_angle(angle_rad(face_rad[edge], exterior_rad[edge], ox, oy), exterior_rad[edge])
         pair = here, start[edge], start[edge + 1], reflections - after, onward
         best[i] = _bound(
             strengths,

@@ -1,0 +1,242 @@
+"""Candidates of floor plans that go through walls and are diffracted once at a vertical edge.
+
+Both legs of such a path are straight in the plan: from the transmitter to the edge, and from there to the receiver,
+with walls to go through on either or on both. Floor and ceiling may reflect it.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.process import in_order, njit
+from sionna_partial.scene.floor_plan import grow
+from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.bounds import Strengths, at_edge, at_flats, utd_terms, wedge_angle
+from sionna_partial.tracing.candidates import Candidates, Wedges
+from sionna_partial.tracing.paths import DIFFRACTION
+from sionna_partial.tracing.plan.crossings import (
+    EDGE,
+    Interior,
+    Limits,
+    Slabs,
+    can_bounce_as,
+    cross_leg,
+    faces_and_kinds,
+    has_long_legs,
+    least_power,
+    trail_of,
+    transmitted_power,
+    weakest_needed,
+    write_kinds,
+)
+from sionna_partial.tracing.plan.diffraction import angle_rad, edges_of, outside
+from sionna_partial.tracing.plan.specular import Room, merge_heights, unfolded_height
+
+_EDGES_AT_ONCE = 16
+
+_ASIDE_M = 1e-3
+"""Distance from an edge at which a leg ends: the walls that meet there are not crossed [m]."""
+
+_VARIANTS = 3
+"""Reflections at floor and ceiling: none, floor, ceiling."""
+
+
+class Arrivals(NamedTuple):
+    """Straight lines from the transmitter to E edges.
+
+    `good` (E,) is whether they come from the sector of the edge and are long enough, `length_m` (E,) their length in
+    the plan, `power` (E,) what walls on them leave, and `crossed` (E,) their number. `angle` (E, 4), `faces` (E, 2) and
+    `lit` (E,) are as for `DiffractionCandidates`.
+    """
+
+    good: Bools
+    length_m: Floats
+    power: Floats
+    crossed: NDArray[np.int64]
+    angle: Floats
+    faces: Floats
+    lit: Bools
+
+
+class CrossedEdgeCandidates:
+    """All paths over one vertical edge, through a wall at least, without reflections at walls."""
+
+    def __init__(
+        self,
+        geometry: SceneGeometry,
+        wedges: Wedges,
+        room: Room,
+        interior: Interior,
+        settings: TraceSettings,
+        slabs: Slabs,
+    ) -> None:
+        self._geometry, self._wedges, self._room, self._interior = geometry, wedges, room, interior
+        self._slabs, self._tolerance_db = slabs, settings.power_tolerance_db
+        self._limits = Limits(settings.max_depth, 0, settings.max_walls, 1.0)
+        self._edges = edges_of(wedges, room.wall_material)
+
+    def blocks(self, strengths: Strengths, found: Floats) -> Iterator[tuple[Candidates, float]]:
+        """Yield the candidates that links need whose other indirect paths have the power `found` (N,)."""
+        if not len(self._wedges.edge_m):
+            return
+        plan, needed = self._geometry.plan, weakest_needed(found, self._tolerance_db)
+        fixed = plan, self._interior, self._room, self._slabs, self._limits
+        arrivals = _arrivals(self._edges, *fixed, trail_of(plan))
+
+        def listed(first: int) -> tuple[Indices, Indices, Indices, Floats]:
+            some = np.arange(first, min(first + _EDGES_AT_ONCE, len(self._wedges.edge_m)))
+            return _listed(some, self._edges, arrivals, strengths, needed, *fixed, trail_of(plan))  # type: ignore[no-any-return]
+
+        parts = list(in_order(listed, range(0, len(self._wedges.edge_m), _EDGES_AT_ONCE)))
+        edge, rx, variant, power = (np.concatenate(column) for column in zip(*parts, strict=True))
+        kept = power >= least_power(rx, power, found, self._tolerance_db)[rx]
+        if not kept.any():
+            return
+        edge, rx, variant = edge[kept], rx[kept], variant[kept]
+        surface, kind, vertices_m = _written(edge, rx, variant, self._edges, *fixed, trail_of(plan))
+        kind, face, vertices_m, same_wall = faces_and_kinds(surface, kind, vertices_m, self._geometry)
+        wedge = np.where(arrivals.lit[edge], edge, edge + len(self._wedges.edge_m)).astype(np.int32)
+        face = np.where(kind == DIFFRACTION, self._wedges.face[wedge, :1], face)
+        yield Candidates(rx.astype(np.int32), kind, face, vertices_m, wedge, self._wedges, same_wall), 1.0
+
+
+@njit(cache=True)
+def _leg_power(trail, start, count, slabs):  # type: ignore[no-untyped-def]
+    """Fraction of the power that the walls leave among some entries of a trail."""
+    power = 1.0
+    for k in range(start, count):
+        power *= transmitted_power(trail, k, slabs)
+    return power
+
+
+@njit(cache=True)
+def _to_edge(plan, interior, tx_m, origin, length, total, trail):  # type: ignore[no-untyped-def]
+    """Write what a line meets from the transmitter to an edge; the number of entries, and of walls."""
+    part = 1.0 - _ASIDE_M / length
+    x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
+    return cross_leg(plan, interior, tx_m[0], tx_m[1], x, y, -1, -1, 0.0, part * length / total, 0, trail)
+
+
+@njit(cache=True)
+def _from_edge(plan, interior, origin, target, length, total, count, trail):  # type: ignore[no-untyped-def]
+    """Add what a line of some length meets from an edge to a receiver likewise."""
+    part = _ASIDE_M / length
+    x, y = origin[0] + part * (target[0] - origin[0]), origin[1] + part * (target[1] - origin[1])
+    done = (total - length + _ASIDE_M) / total
+    return cross_leg(plan, interior, x, y, target[0], target[1], -1, -1, done, 1.0, count, trail)
+
+
+@njit(cache=True)
+def _arrivals(edges, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
+    """Follow the lines from the transmitter to all edges."""
+    count = len(edges.position_m)
+    good, lit = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
+    length, power, crossed = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
+    angle, faces = np.zeros((count, 4)), np.zeros((count, 2))
+    for e in range(count):
+        origin, exterior = edges.position_m[e], edges.exterior_rad[e]
+        x, y = room.tx_m[0] - origin[0], room.tx_m[1] - origin[1]
+        length[e] = np.hypot(x, y)
+        lit[e], in_front = outside(edges.normals[e], x, y)
+        if not in_front or length[e] < 20.0 * _ASIDE_M:
+            continue
+        entries, crossed[e] = _to_edge(plan, interior, room.tx_m, origin, length[e], length[e], trail)
+        good[e] = entries >= 0 and crossed[e] <= limits.walls
+        if good[e]:
+            power[e] = _leg_power(trail, 0, entries, slabs)
+        from_0 = angle_rad(edges.face_rad[e], exterior, x, y)
+        angle[e, 0], angle[e, 1], angle[e, 2], angle[e, 3] = wedge_angle(from_0, exterior)
+        for k, from_face in enumerate((from_0, exterior - from_0)):
+            faces[e, k] = max(0.0, np.sin(from_face)) if from_face <= np.pi else -1.0
+    return Arrivals(good, length, power, crossed, angle, faces, lit)
+
+
+@njit(cache=True, nogil=True)
+def _listed(group, edges, arrivals, strengths, needed, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
+    """Edges, receivers, variants and powers of the paths over some edges that are strong enough."""
+    out, power, used = np.empty((1024, 3), np.int64), np.empty(1024), 0
+    terms, wavelength = np.empty((4, 3)), strengths.wavelength_m
+    largest, coefficients, transition = strengths.largest, strengths.faces, strengths.transition
+    for e in group:
+        if not arrivals.good[e]:
+            continue
+        origin, before, through = edges.position_m[e], arrivals.length_m[e], arrivals.power[e]
+        constants = edges.utd[e, 0], edges.utd[e, 1], edges.utd[e, 2], edges.utd[e, 3], edges.utd[e, 4]
+        arrival = arrivals.angle[e, 0], arrivals.angle[e, 1], arrivals.angle[e, 2], arrivals.angle[e, 3]
+        lit_0, lit_n = arrivals.faces[e, 0], arrivals.faces[e, 1]
+        material = edges.material[e, 0] if arrivals.lit[e] else edges.material[e, 1]
+        for rx in range(len(room.rx_m)):
+            target = room.rx_m[rx]
+            x, y = target[0] - origin[0], target[1] - origin[1]
+            onward = np.hypot(x, y)
+            total = before + onward
+            if through * (wavelength / (4.0 * np.pi * total)) ** 2 < needed[rx] or onward < 20.0 * _ASIDE_M:
+                continue
+            if not outside(edges.normals[e], x, y)[1]:
+                continue
+            departure = wedge_angle(angle_rad(edges.face_rad[e], edges.exterior_rad[e], x, y), edges.exterior_rad[e])
+            utd_terms(constants, arrival, departure, terms)
+            spread = through * wavelength**3 / (64.0 * np.pi**4 * before * onward)
+            boundary = np.sqrt(4.0 * np.pi / wavelength * before * onward / total)
+            level = at_edge(
+                coefficients, material, transition, terms, boundary, lit_0, lit_n, 1.0, 0.0, (1.0, 0.0, 1.0)
+            )
+            if level[0] ** 2 * spread / total < needed[rx]:
+                continue
+            count, crossed = _from_edge(plan, interior, origin, target, onward, total, 0, trail)
+            walls = crossed + arrivals.crossed[e]
+            if count < 0 or walls == 0 or walls > limits.walls:
+                continue
+            behind = _leg_power(trail, 0, count, slabs)
+            for variant in range(_VARIANTS):
+                bounces, first, possible = can_bounce_as(variant, room)
+                if not possible or bounces > limits.depth - 1:
+                    continue
+                height = unfolded_height(room, target, bounces, first)
+                length = np.hypot(total, height)
+                sine, slope = total / length, height / length
+                field = at_edge(
+                    coefficients,
+                    material,
+                    transition,
+                    terms,
+                    boundary * np.sqrt(sine),
+                    lit_0,
+                    lit_n,
+                    sine,
+                    slope,
+                    (1.0, 0.0, 1.0),
+                )
+                strength = at_flats(largest, room.flat_material, slope, bounces, field) ** 2 * spread * behind / length
+                if strength >= needed[rx]:
+                    out, power = grow(out, used + 1), grow(power, used + 1)
+                    out[used, 0], out[used, 1], out[used, 2], power[used] = e, rx, variant, strength
+                    used += 1
+    return out[:used, 0].copy(), out[:used, 1].copy(), out[:used, 2].copy(), power[:used].copy()
+
+
+@njit(cache=True)
+def _written(edge, rx, variants, edges, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
+    """Write paths: surfaces (C, D), kinds of `Trail`, -1 where there is nothing, and vertices (C, D, 3) [m]."""
+    columns = len(trail.surface) + 2
+    surface, kind = np.full((len(rx), columns), -1, np.int32), np.full((len(rx), columns), -1, np.int32)
+    vertices, item = np.zeros((len(rx), columns, 3)), np.arange(len(trail.surface))
+    for c in range(len(rx)):
+        origin, target = edges.position_m[edge[c]], room.rx_m[rx[c]]
+        before = np.hypot(room.tx_m[0] - origin[0], room.tx_m[1] - origin[1])
+        onward = np.hypot(target[0] - origin[0], target[1] - origin[1])
+        total = before + onward
+        count, _ = _to_edge(plan, interior, room.tx_m, origin, before, total, trail)
+        trail.surface[count], trail.kind[count] = 0, EDGE
+        trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = origin[0], origin[1], before / total
+        count, _ = _from_edge(plan, interior, origin, target, onward, total, count + 1, trail)
+        if count < 0 or not has_long_legs(trail, count, total):
+            continue
+        bounces, first, _ = can_bounce_as(variants[c], room)
+        merge_heights(item[:count], trail.points[:count], room, target, bounces, first, surface[c], vertices[c])
+        write_kinds(trail, plan, count + bounces, surface[c], kind[c])
+    return surface, kind, vertices
