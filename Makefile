@@ -20,7 +20,8 @@ demo: $(READY) ## Predict a half-explored demo home, and compare with the truth 
 test: lint ## Check style and types, and run the tests
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2 --dist loadfile
 
-docs: $(READY) ## Build the site, with its notebooks and examples run (build/docs/index.html)
+docs: $(READY) ## Build the site, with its pages, notebooks and examples run (build/docs/index.html)
+	@$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 -m pages tests/test_readme.py
 	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
 	@echo "the site is build/docs/index.html"
 
