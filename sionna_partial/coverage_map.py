@@ -21,7 +21,7 @@ from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
 WALL_PARTS = 6
@@ -154,7 +154,7 @@ def link_columns(
     return columns | {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
 
 
-def provenance(simulation: Simulation, model: Predictor | None) -> dict[str, Any]:
+def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None) -> dict[str, Any]:
     """Global attributes on where the numbers come from; without a model the trace predicts.
 
     No time of day: equal input gives equal files.

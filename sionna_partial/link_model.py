@@ -39,7 +39,7 @@ from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of_each
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
+from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.prediction.wall_losses import WALL_LOSSES, predict_through_walls, wall_loss_db
 from sionna_partial.progress import part_of, reporting
@@ -94,7 +94,7 @@ class LinkModel:
     ----------
     scene : PartialMap, path or Simulation
         The map, or whatever `load_map` reads.
-    predictor : None, "map", "paper", path or Predictor
+    predictor : None, "map", "paper", path, Predictor or any object with ``predict(phi)``
         None is the shipped default, which is read where links are not complete.
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
@@ -146,12 +146,12 @@ class LinkModel:
         return self.simulation.partial
 
     @cached_property
-    def predictor(self) -> Predictor:
+    def predictor(self) -> Predictor | OtherPredictor:
         """The predictor, which is read when it is first needed."""
         model = warm_predictor(self.asked)
         if self._by_wall_losses:
             _log.warning("paths go through walls, which no network was trained for: %s predicts", WALL_LOSSES)
-        else:
+        elif isinstance(model, Predictor):
             _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
 
@@ -161,7 +161,7 @@ class LinkModel:
         return self.asked is None and self.simulation.trace_settings.through_walls
 
     @property
-    def predictor_of_map(self) -> Predictor | None:
+    def predictor_of_map(self) -> Predictor | OtherPredictor | None:
         """The predictor; None on a complete map, where the trace from a known cell is the prediction."""
         return None if self.partial.is_complete else self.predictor
 
@@ -213,7 +213,8 @@ class LinkModel:
         And which of them are complete. Positions have been checked.
         """
         complete = np.concatenate([self._complete(*each_m) for each_m in ends_m])
-        context, found = not complete.all() and self.predictor.settings.networks != "paper", []
+        settings, found = None if complete.all() else self.predictor.settings, []
+        context = not complete.all() and (settings is None or settings.networks != "paper")
         for tx_m, rx_m in ends_m:
             paths = self.simulation.blocks(tx_m, rx_m, report)
             frequency_hz = self.simulation.trace_settings.frequency_hz

@@ -78,6 +78,17 @@ def test_area_is_that_of_the_unknown_cells_in_view(hall):
     assert near.gain_per_m > hole.gain_per_m
 
 
+def test_a_speck_beside_the_robot_is_no_goal(hall):
+    """Unknown cells as of a pillar, 0.2 m wide."""
+    state = hall.state.copy()
+    row, column = hall.cell_index(np.array([at(1.3, 1.9)]))
+    state[row, column] = sp.CellState.UNKNOWN
+    speck = sp.PartialMap(state, hall.resolution_m, hall.origin_m)
+    views = sp.next_views(speck, goal="area", start=at(1.0, 1.9))
+    assert all(np.hypot(*(view.position_m - at(1.3, 1.9))) > 0.5 for view in views)
+    assert len(views) == len(sp.next_views(hall, goal="area", start=at(1.0, 1.9)))
+
+
 def test_transmitters_and_measurements(hall, model):
     tx_m = np.add([TX, (3.0, 2.0, 1.5)], (-2.0, 4.0, 0.0))
     one, two = (sp.next_views(model, tx, goal="state") for tx in (tx_m[0], tx_m))

@@ -50,6 +50,16 @@ ThroughWalls = Annotated[
         show_default=False,
     ),
 ]
+Measured = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="CSV", help="Measured gains, or powers as a phone writes them (x, y, rssi).", show_default=False
+    ),
+]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="NAME=HEADER", help="A header of the CSV: gain_db=level.", show_default=False),
+]
 RxHeight = Annotated[float, typer.Option(help="Height of the receivers [m].")]
 Memory = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
 PredictorName = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
@@ -106,6 +116,17 @@ def parse_material(text: str) -> Material:
         )
     permittivity, conductivity_s_m, thickness_m = map(float, words)
     return Material(permittivity, conductivity_s_m, thickness_m)
+
+
+def read_measurements(path: Path | None, column: list[str] | None) -> Any:
+    """Read the CSV of --measurements, with headers as --column has them; None if there is none."""
+    pairs = [text.partition("=") for text in column or ()]
+    wrong = next((name for name, _, header in pairs if not name or not header), None)
+    if wrong is not None:
+        raise typer.BadParameter(f"--column {wrong!r} is no NAME=HEADER: give gain_db=level.")
+    if path is None:
+        return None
+    return sp.load_measurements(path, columns={name: header for name, _, header in pairs} or None)
 
 
 def settings_of(

@@ -2,7 +2,7 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -26,6 +26,7 @@ def calibrate(
     out: Annotated[
         Path, typer.Option(help="Folder for the calibrated map, the numbers and a picture.", show_default=False)
     ],
+    column: opt.Columns = None,
     material: opt.MaterialText = "",
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     max_depth: opt.MaxDepth = 6,
@@ -39,9 +40,7 @@ def calibrate(
     folder as a map.
     """
     settings = opt.settings_of(frequency, material, max_depth, diffraction, through_walls)
-    from sionna_partial.measurements.measurements import measurements_of
-
-    measured = measurements_of(measurements)
+    measured = opt.read_measurements(measurements, column)
     with opt.reporting_to(out, "loading Sionna RT") as report:
         result = sp.calibrate_materials(
             partial,
@@ -62,6 +61,7 @@ def calibrate(
 def place(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the numbers and a picture.", show_default=False)],
+    count: Annotated[int, typer.Option(help="Number of transmitters; several are placed for the coverage.")] = 1,
     objective: Annotated[Objective, typer.Option(help=_OBJECTIVE_HELP)] = "coverage",
     threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
     height: Annotated[float, typer.Option(help="Height of the transmitter [m].")] = DEFAULT_HEIGHT_M,
@@ -71,31 +71,31 @@ def place(
     predictor: opt.PredictorName = "",
     partial: opt.PartialMap,
 ) -> None:
-    """Find a good position for a transmitter on a partial map.
+    """Find good positions for one transmitter or several on a partial map.
 
-    The folder --out gets the position and the search as JSON, and a picture.
+    The folder --out gets the positions and the search as JSON, and a picture.
     """
+    if count > 1 and objective != "coverage":
+        raise typer.BadParameter(f"--objective {objective} is for one transmitter: leave it out with --count {count}.")
+    options: dict[str, Any] = {"threshold_db": threshold, "tx_height_m": height, "rx_height_m": rx_height, "seed": seed}
+    options |= {"predictor": predictor or None, **settings}
+    result: sp.TransmitterPlacement | sp.NetworkPlacement
     with opt.reporting_to(out, "loading the predictor") as report:
-        result = sp.place_transmitter(
-            partial,
-            objective=objective,
-            threshold_db=threshold,
-            tx_height_m=height,
-            seed=seed,
-            rx_height_m=rx_height,
-            predictor=predictor or None,
-            **settings,
-            progress=report,
-        )
+        if count == 1:
+            result = sp.place_transmitter(partial, objective=objective, **options, progress=report)
+            positions_m, figure = [result.position_m], sp.plot_placement(result)
+        else:
+            result = sp.place_transmitters(partial, count, **options, progress=report)
+            positions_m, figure = [*result.positions_m], sp.plot_network_placement(result)
         with atomic_files(out) as folder:
             result.save(folder / "placement.json")
-            sp.plot_placement(result).savefig(folder / "placement.png")
-    x, y, z = result.position_m
-    if result.settings.objective == "coverage":
-        score = f"{result.score:.1%} of the receivers are predicted above {result.settings.threshold_db:g} dB"
+            figure.savefig(folder / "placement.png")
+    for x, y, z in positions_m:
+        typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m")
+    if objective == "coverage":
+        typer.echo(f"{result.score:.1%} of the receivers are predicted above {threshold:g} dB")
     else:
-        score = f"the worst tenth of the receivers is predicted at {result.score:.1f} dB"
-    typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {score}")
+        typer.echo(f"the worst tenth of the receivers is predicted at {result.score:.1f} dB")
     opt.print_files(out, ["placement.json", "placement.png"])
 
 
@@ -107,7 +107,8 @@ def next_views(
         str,
         typer.Option(metavar="X Y [Z]", help="Transmitter [m]. Default: that of the measurements, or any."),
     ] = "",
-    measurements: Annotated[Path | None, typer.Option(help="CSV of measured gains.", show_default=False)] = None,
+    measurements: opt.Measured = None,
+    column: opt.Columns = None,
     goal: Annotated[str, typer.Option(metavar="coverage|state|area", help="What is to become known.")] = "coverage",
     count: Annotated[int, typer.Option(help="Largest number of poses.")] = 5,
     start: Annotated[
@@ -117,6 +118,8 @@ def next_views(
     threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
     field_of_view: opt.FieldOfView = SensorSettings.field_of_view_deg,
     range_m: opt.Range = SensorSettings.range_m,
+    settings: opt.Settings,
+    predictor: opt.PredictorName = "",
     partial: opt.PartialMap,
 ) -> None:
     """Rank poses where a robot learns most about the coverage per metre driven.
@@ -127,12 +130,14 @@ def next_views(
         views = sp.next_views(
             partial,
             opt.parse_position(tx) if tx else None,
-            measurements,
+            opt.read_measurements(measurements, column),
             goal,
             count,
             start=start,
             threshold_db=threshold,
             sensor=SensorSettings(field_of_view_deg=field_of_view, range_m=range_m),
+            predictor=predictor or None,
+            **settings,
         )
         with atomic_files(out) as folder:
             views.save(folder / "next_views.yaml")

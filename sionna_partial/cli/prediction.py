@@ -30,9 +30,8 @@ def predict(
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
     settings: opt.Settings,
     predictor: opt.PredictorName = "",
-    measurements: Annotated[
-        Path | None, typer.Option(help="CSV of gains measured of this transmitter.", show_default=False)
-    ] = None,
+    measurements: opt.Measured = None,
+    column: opt.Columns = None,
     receivers: Annotated[
         str, typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage.")
     ] = "indoor",
@@ -51,7 +50,7 @@ def predict(
             spacing_m=spacing,
             predictor=predictor or None,
             **settings,
-            measurements=measurements,
+            measurements=opt.read_measurements(measurements, column),
             receivers=receivers,
             memory_gb=memory,
             progress=part_of(report, 0.0, 0.9),

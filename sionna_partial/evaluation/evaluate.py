@@ -158,7 +158,8 @@ def evaluate(
         raise PredictorError(
             f"baselines = {shown(baselines)} is not allowed: give Baselines, or None for those shipped."
         )
-    fitted, paper = baselines or Baselines.load(_baselines_folder(model)), _paper(model)
+    fitted, shipped = baselines or Baselines.load(_baselines_folder(model)), _shipped(model)
+    frequency_hz = model.settings.frequency_hz
     rows, differences, calibrations = [], [], {}
     parts = list(itertools.product(homes, map(float, np.unique(links.stage))))
     with reporting(progress) as report:
@@ -172,8 +173,10 @@ def evaluate(
                     continue
                 some, own = part.take(drawn), prediction.take(drawn)
                 if receivers == "indoor":
-                    others = baseline_predictions(fitted, paper, some.features, model.settings.frequency_hz)
+                    others = baseline_predictions(fitted, shipped.get("paper"), some.features, frequency_hz)
                     predictions = {"predictor": own, **others}
+                    if "map" in shipped:
+                        predictions["map"] = shipped["map"].predict(some.phi)
                 else:
                     predictions = _anywhere(model, some, own)
                 rows += list(_rows(name, receivers, stage, some, predictions))
@@ -181,7 +184,7 @@ def evaluate(
                     differences += list(_differences(receivers, stage, some, predictions))
                     if receivers == "indoor":
                         calibrations[stage] = calibration(own, some.link_state, some.gain_db)
-    notes = tuple(_notes(model, fitted.distance, paper, homes["test"]))
+    notes = tuple(_notes(model, {**shipped, "distance only": fitted.distance}, homes["test"]))
     return Evaluation(model.name, model.fingerprint, homes, tuple(rows), tuple(differences), calibrations, notes)
 
 
@@ -206,14 +209,15 @@ def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> di
     return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 
 
-def _notes(model: Predictor, fitted: Predictor, paper: Predictor | None, test: tuple[str, ...]) -> Iterator[str]:
+def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, ...]) -> Iterator[str]:
     """Which homes the baselines were trained on."""
+    fitted = others["distance only"]
     those = "those" if set(fitted.homes) == set(model.homes) else "others than those"
     yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
-    for name, other in (("The shipped paper's predictor", paper), ("Distance only", fitted)):
-        known = len(set(other.homes) & set(test)) if other else 0
+    for name, other in others.items():
+        known = len(set(other.homes) & set(test))
         if known:
-            yield f"{name} was trained on {known} of the {len(test)} test homes."
+            yield f"{name!r} was trained on {known} of the {len(test)} test homes."
 
 
 def _homes(model: Predictor, links: LinkTable) -> dict[str, tuple[str, ...]]:
@@ -234,11 +238,14 @@ def _baselines_folder(model: Predictor) -> Path:
     return beside if model.name.endswith(".keras") and (beside / MAJORITY_FILE).is_file() else PREDICTORS_FOLDER
 
 
-def _paper(model: Predictor) -> Predictor | None:
-    """Load the paper's predictor; None if it is the same, or differs in frequency or diffraction."""
-    paper = Predictor.load("paper")
-    here, there = (LinkTraces.of_settings(each.settings) for each in (model, paper))
-    return paper if here.is_like(there) and model.fingerprint != paper.fingerprint else None
+def _shipped(model: Predictor) -> dict[str, Predictor]:
+    """Load the shipped predictors, without those that are the same, or differ in frequency or diffraction."""
+    here, every = LinkTraces.of_settings(model.settings), {name: Predictor.load(name) for name in ("paper", "map")}
+    return {
+        name: each
+        for name, each in every.items()
+        if here.is_like(LinkTraces.of_settings(each.settings)) and model.fingerprint != each.fingerprint
+    }
 
 
 def _rows(

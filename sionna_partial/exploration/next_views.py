@@ -30,12 +30,13 @@ from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import POSITIONS, LinkModel, link_model_of, transmitter_positions
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, unknown_pockets
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
 from sionna_partial.planar import largest_part
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
-from sionna_partial.settings import SensorSettings
+from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
 from sionna_partial.simulation.camera import unknown_in_view
 from sionna_partial.simulation.robot import (
     FORWARD_M,
@@ -124,6 +125,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors. Of a transmitter
         at an unknown position, times the relative probability of each of `tx_m`.
     goal : {"coverage", "state", "area"}
+    sensor : SensorSettings
 
     Examples
     --------
@@ -141,6 +143,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
     tx_m: Floats
     uncertainty: xr.DataArray = field(repr=False)
     goal: str
+    sensor: SensorSettings
 
     def __len__(self) -> int:
         """Return the number of poses."""
@@ -200,12 +203,16 @@ def next_views(
     start: ArrayLike | None = None,
     threshold_db: float = -100.0,
     sensor: SensorSettings | None = None,
+    predictor: Predictor | str | Path | None = None,
+    scene_settings: SceneSettings | None = None,
+    trace_settings: TraceSettings | None = None,
 ) -> NextViews:
     """Rank poses from which a robot would lower the uncertainty of a coverage map most per metre driven.
 
     A pose is in the middle of a frontier between free and unknown cells, and looks where most is unknown. A view that
     shows a part of the unobserved part of a link's direct line is expected to lower the uncertainty of that link, as
-    `predict_map` predicts it, by that fraction. Unknown cells count as free until they are seen.
+    `predict_map` predicts it, by that fraction. Unknown cells count as free until they are seen. Unknown pockets into
+    which no robot fits, as in furniture, are no goal.
 
     Parameters
     ----------
@@ -227,6 +234,8 @@ def next_views(
         Path gain above which a receiver is covered [dB].
     sensor : SensorSettings, optional
         What the robot sees in one look.
+    predictor, scene_settings, trace_settings
+        As for `predict_map`.
 
     Returns
     -------
@@ -252,7 +261,7 @@ def next_views(
     >>> len(views), views[0].gain_per_m >= views[1].gain_per_m
     (3, True)
     """
-    model = link_model_of(scene)
+    model = link_model_of(scene, predictor, trace_settings, scene_settings)
     partial = model.partial
     require_choice("goal", goal, GOALS)
     require_whole("count", count, 1, MOST_VIEWS)
@@ -267,15 +276,15 @@ def next_views(
         tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measured)
         uncertainty = _uncertainty(model, tx_m, measured, of)
     none = np.zeros(partial.shape, dtype=bool)
-    radius = ROBOT_RADII_M[0] / partial.resolution_m
-    frontiers = wide_frontiers(
-        find_frontiers(partial.state, cell, partial.resolution_m, radius, none, none), partial.resolution_m
-    )
+    radius, pockets = ROBOT_RADII_M[0] / partial.resolution_m, unknown_pockets(partial.state, partial.resolution_m)
+    state = np.where(pockets, CellState.WALL, partial.state).astype(np.uint8)
+    frontiers = find_frontiers(state, cell, partial.resolution_m, radius, none, none)
+    frontiers = wide_frontiers(frontiers, partial.resolution_m)
     gains = _gains(partial, frontiers, tx_m, uncertainty, sensor)
     views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
     views.sort(key=lambda view: -view.gain_per_m)
     start_m = cell_centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
-    return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal)
+    return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal, sensor)
 
 
 def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | None, sensor: SensorSettings) -> Choice:

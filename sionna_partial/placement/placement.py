@@ -11,7 +11,7 @@ import numpy as np
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
-from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
@@ -19,7 +19,7 @@ from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.placement.area import PlacementArea, placement_area
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.progress import reporting
-from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings
 from sionna_partial.tracing.simulation import Simulation, nearest_m
 
 RECEIVERS = 120
@@ -125,11 +125,15 @@ class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement")
 def place_transmitter(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     *,
+    objective: Objective = "coverage",
+    threshold_db: float = -100.0,
+    tx_height_m: float = DEFAULT_HEIGHT_M,
+    rx_height_m: float = DEFAULT_HEIGHT_M,
+    seed: int = 0,
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
-    **options: Any,
 ) -> TransmitterPlacement:
     """Find the transmitter position that covers a partly known building best, as predicted from what is known.
 
@@ -145,6 +149,15 @@ def place_transmitter(
     ----------
     scene : PartialMap, path, Simulation or LinkModel
         The map, or whatever `load_map` reads.
+    objective : {"coverage", "percentile"}
+        What is to be large: the mean probability that the path gain exceeds the threshold, or the mean predicted gain
+        of the worst tenth of the receivers.
+    threshold_db : float
+        Path gain above which a receiver is covered [dB].
+    tx_height_m, rx_height_m : float
+        Heights of transmitter and receivers [m].
+    seed : int
+        Of the positions that are compared.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
     scene_settings : SceneSettings, optional
@@ -152,9 +165,6 @@ def place_transmitter(
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
         terminals and notebooks after 2 s.
-    **options
-        Fields of `sionna_partial.settings.PlacementSettings`: `objective` ("coverage", the default, or "percentile"),
-        `threshold_db` (-100 dB), `tx_height_m` and `rx_height_m` (1.5 m), and `seed` (0).
 
     Returns
     -------
@@ -181,7 +191,7 @@ def place_transmitter(
     >>> bool(home.state_at(found.position_m) == sp.CellState.FREE)
     True
     """
-    settings = PlacementSettings(**options)
+    settings = PlacementSettings(objective, threshold_db, tx_height_m, rx_height_m, seed)
     search = Search.on(link_model_of(scene, predictor, trace_settings, scene_settings), settings)
     area, simulation, model = search.area, search.model.simulation, search.model.predictor_of_map
     some = area.thinned(RECEIVERS)

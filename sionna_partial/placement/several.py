@@ -1,18 +1,21 @@
 """Where to put several transmitters: candidates drawn together, chosen greedily, then swapped."""
 
 import itertools
+import json
 import math
-from dataclasses import dataclass, replace
+import os
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
-from sionna_partial.checks import Progress, require, require_whole
+from sionna_partial.checks import Progress, require_whole
+from sionna_partial.constants import DEFAULT_HEIGHT_M
 from sionna_partial.display import Pictured
+from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import PlacementArea
@@ -77,17 +80,33 @@ class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placeme
     partial: PartialMap
     settings: PlacementSettings
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write positions, scores and settings as JSON; equal placements give equal files.
+
+        Raises
+        ------
+        OutputError
+            If writing fails.
+        """
+        arrays = {name: getattr(self, name).tolist() for name in ("positions_m", "scores", "candidates_m")}
+        record = arrays | {"score": self.score, "settings": asdict(self.settings)}
+        with atomic_write(path, "w") as stream:
+            stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
+
 
 def place_transmitters(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     count: int = 2,
     *,
     rx: ArrayLike | None = None,
+    threshold_db: float = -100.0,
+    tx_height_m: float = DEFAULT_HEIGHT_M,
+    rx_height_m: float = DEFAULT_HEIGHT_M,
+    seed: int = 0,
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
-    **options: Any,
 ) -> NetworkPlacement:
     """Find positions for several transmitters that together cover a partly known building best.
 
@@ -103,11 +122,8 @@ def place_transmitters(
         Number of transmitters K, up to 16.
     rx : (N, 3) array-like, optional
         Receivers that count [m], all alike. By default those of `place_transmitter`.
-    predictor, scene_settings, trace_settings, progress
+    threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
         As for `place_transmitter`.
-    **options
-        Fields of `sionna_partial.settings.PlacementSettings`: `threshold_db` (-100 dB), `tx_height_m` and
-        `rx_height_m` (1.5 m), and `seed` (0); the objective is "coverage".
 
     Returns
     -------
@@ -127,8 +143,7 @@ def place_transmitters(
     ((2, 3), True)
     """
     require_whole("count", count, 1, MOST_TRANSMITTERS)
-    settings = PlacementSettings(**options)
-    require(settings.objective == "coverage", "objective", settings.objective, "several are placed for 'coverage'.")
+    settings = PlacementSettings("coverage", threshold_db, tx_height_m, rx_height_m, seed)
     search = Search.on(link_model_of(scene, predictor, trace_settings, scene_settings), settings)
     area, partial = search.area, search.model.partial
     if rx is not None:

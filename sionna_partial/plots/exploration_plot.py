@@ -299,7 +299,7 @@ def plot_next_views(views: NextViews) -> Figure:
     if len(views.tx_m):
         _draw_uncertainty(figure, axis, views)
     for rank, view in reversed([*enumerate(views, start=1)]):
-        _draw_view(axis, rank, view)
+        _draw_view(axis, rank, view, views.sensor.field_of_view_deg >= 360.0)
     axis.plot(*views.start_m, marker="o", color=BLUE, markersize=7, markeredgecolor="white", zorder=5)
     axis.plot(*views.tx_m[:, :2].T, markersize=15, zorder=5, **STAR)
     axis.set(xlim=(x0, x1), ylim=(y0, y1), aspect="equal", xlabel="x [m]", ylabel="y [m]")
@@ -323,10 +323,10 @@ def _draw_uncertainty(figure: Figure, axis: Axes, views: NextViews) -> None:
     figure.colorbar(picture, ax=axis, label="uncertainty of the link [bit]", shrink=0.8)
 
 
-def _draw_view(axis: Axes, rank: int, view: NextView) -> None:
+def _draw_view(axis: Axes, rank: int, view: NextView, sees_all: bool) -> None:
     axis.plot(*view.path_m.T, color=BLUE, linewidth=1.0, alpha=0.7, zorder=3.5)
     axis.plot(*view.frontier_m.T, color=RED, marker="s", markersize=2, linestyle="none", zorder=3.6)
-    ends_deg = view.heading_deg + np.array([-0.5, 0.5]) * _VIEW_DEG
+    ends_deg = (0.0, 360.0) if sees_all else view.heading_deg + np.array([-0.5, 0.5]) * _VIEW_DEG
     axis.add_patch(Wedge(tuple(view.position_m), _VIEW_M, *ends_deg, color=YELLOW, alpha=0.8, linewidth=0, zorder=4))
     label = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
     x, y = view.position_m.tolist()

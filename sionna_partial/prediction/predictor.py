@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.checks import Progress
+from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError, SettingsError
@@ -525,7 +525,8 @@ class Predictor(Shown):
         known = " or ".join(map(repr, SHIPPED))
         if not isinstance(name, (str, PathLike)):
             raise PredictorError(
-                f"name_or_path = {name!r} is not a path: give {known}, or the path of a {SUFFIX} file."
+                f"name_or_path = {name!r} is not a path: give {known}, the path of a {SUFFIX} file, or an object with "
+                "predict(phi)."
             )
         path = predictor_path(name)
         if path.suffix != SUFFIX:
@@ -543,13 +544,73 @@ class Predictor(Shown):
         return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
 
 
-def warm_predictor(name_or_path: Predictor | str | PathLike[str] | None) -> Predictor:
-    """Return `Predictor.load`, which reads files of the same name, size and date once in a process.
+class OtherPredictor:
+    """A model of the user's in the place of a `Predictor`: any object with `predict(phi)`.
 
-    Its weights belong to all who load it so: they must not be changed.
+    It gets the `LinkFeatures` of N links that are not certain, and returns a `LinkPrediction`, or a mapping with arrays
+    (N,) `p_los`, `p_nlos`, `p_outage`, and means and standard deviations of the gain [dB]: `gain_mean_db` and
+    `gain_std_db` of all links with a path, or both `gain_los_...` and `gain_nlos_...`. P(indoor) is that of the default
+    predictor, unless the object has `predict_indoor(phi)`.
     """
-    if not isinstance(name_or_path, (str, PathLike, type(None))):
-        return Predictor.load(name_or_path)
+
+    settings: PredictorSettings | None = None
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+        self.name = f"{type(model).__module__}.{type(model).__qualname__}"
+        self.fingerprint = ""
+
+    def predict(self, phi: LinkFeatures) -> LinkPrediction:
+        """Predict links; a PredictorError for arrays that are no distribution."""
+        found = self._model.predict(phi)
+        if isinstance(found, LinkPrediction):
+            found = {column.name: getattr(found, column.name) for column in fields(found)}
+        if not isinstance(found, Mapping):
+            raise PredictorError(f"{self.name}.predict returned {shown(found)}: give a LinkPrediction or a mapping.")
+
+        def column(name: str, other: str = "") -> Floats:
+            if name not in found and other not in found:
+                what = f"{self.name}.predict returned no {name!r}"
+                raise PredictorError(f"{what}: add it, an array of {len(phi)} numbers.")
+            return link_numbers(f"{self.name}.predict: {name}", found[name if name in found else other], phi.shape)
+
+        probabilities = np.stack([column(name) for name in ("p_outage", "p_los", "p_nlos")])
+        sound = np.all(probabilities >= 0.0, axis=0) & (np.abs(probabilities.sum(axis=0) - 1.0) < 1e-3)
+        require_each(
+            np.asarray(sound), f"{self.name}.predict: p_los", probabilities[1], "the three probabilities sum to 1."
+        )
+        means_db, stds_db = (
+            np.stack([column(f"gain_{state}_{name}", f"gain_{name}") for state in ("los", "nlos")])
+            for name in ("mean_db", "std_db")
+        )
+        require_each(
+            np.asarray(stds_db.min(axis=0) >= 0.0), f"{self.name}.predict: std", stds_db.min(axis=0), "give 0 or more."
+        )
+        floor = np.full((1, len(phi)), GAIN_FLOOR_DB)
+        means_db = np.concatenate([floor, np.clip(means_db, GAIN_FLOOR_DB, 0.0)])
+        return LinkPrediction.of_parts(
+            probabilities / probabilities.sum(axis=0), means_db, np.concatenate([0.0 * floor, stds_db])
+        )
+
+    def predict_indoor(self, phi: LinkFeatures) -> Floats:
+        """P(indoor) of links (N,)."""
+        own = getattr(self._model, "predict_indoor", None) or _from_file(None).predict_indoor
+        return np.clip(link_numbers(f"{self.name}.predict_indoor", own(phi), phi.shape), 0.0, 1.0)
+
+
+def warm_predictor(asked: Any) -> Predictor | OtherPredictor:
+    """Return `Predictor.load`, which reads files of the same name, size and date once in a process, or a user's model.
+
+    The weights belong to all who load them so: they must not be changed.
+    """
+    if not isinstance(asked, (str, PathLike, type(None), Predictor)) and callable(getattr(asked, "predict", None)):
+        return OtherPredictor(asked)
+    if not isinstance(asked, (str, PathLike, type(None))):
+        return Predictor.load(asked)
+    return _from_file(asked)
+
+
+def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
     path, name = predictor_path(name_or_path), None if name_or_path is None else str(name_or_path)
     try:
         files = [each.stat() for each in (path, path.with_suffix(".json"))]
