@@ -36,7 +36,7 @@ ROOM_M, BODY_M = 0.6, 0.3
 """Radius of the largest disc in an unknown region from which it may be a room, and of what gets into one [m]."""
 
 POCKET_M = 0.4
-"""Width of an unknown region below which it is no place to look into [m]."""
+"""Edge of a square that an unknown region must hold for a robot to look into it [m]."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
@@ -371,13 +371,14 @@ def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
 
 
 def unknown_pockets(state: States, resolution_m: float) -> Bools:
-    """Unknown cells of regions within the grid that are nowhere wider than `POCKET_M`, as in furniture and pillars."""
+    """Unknown cells of regions within the grid that hold no square of `POCKET_M`, as in furniture and pillars."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
+    size = max(1, math.ceil(POCKET_M / resolution_m - 1e-6))
     regions, count = ndimage.label(unknown, np.ones((3, 3), dtype=bool))
-    depth_m = ndimage.distance_transform_edt(unknown) * resolution_m
-    deepest_m = ndimage.maximum(depth_m, regions, np.arange(count + 1))
-    deepest_m[regions[0, 0]] = np.inf
-    return (unknown & (2.0 * deepest_m < POCKET_M)[regions])[1:-1, 1:-1]
+    wide = np.zeros(count + 1, dtype=bool)
+    wide[regions[ndimage.binary_opening(unknown, np.ones((size, size), dtype=bool))]] = True
+    wide[regions[0, 0]] = True
+    return (unknown & ~wide[regions])[1:-1, 1:-1]
 
 
 def _has_unknown_room(state: States, resolution_m: float) -> bool:
