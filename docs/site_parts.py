@@ -28,6 +28,7 @@ SECTIONS = {
             "docs/placement",
             "docs/next_views",
             "docs/live",
+            "docs/app",
             "docs/differentiable",
         ),
         *("docs/training", "docs/cluster"),

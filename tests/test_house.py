@@ -61,6 +61,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
+    "app": ("session", "page", "server"),
     "cli": ("options", "prediction", "links", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }
@@ -73,7 +74,7 @@ MODULES = tuple(
     module if room in FILES else f"{room}.{module}" for room, modules in ROOMS.items() for module in modules
 )
 
-IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit", "bokeh"}
+IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit", "bokeh", "tornado"}
 """Imported where they are needed, after `load_llvm`, never at the top of a module."""
 
 HEAVY = IN_FUNCTIONS | {
@@ -85,7 +86,8 @@ HEAVY = IN_FUNCTIONS | {
 HOMES = {
     **dict.fromkeys(["drjit", "mitsuba", "sionna"], ("tracing.", "llvm")),
     **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable.", "training")),
-    **dict.fromkeys(["matplotlib", "bokeh"], ("plots.",)),
+    "matplotlib": ("plots.",),
+    "bokeh": ("plots.", "app."),
 }
 """Beginnings of the modules that may import these libraries."""
 
@@ -95,7 +97,7 @@ STRAYS = {
 }
 """Modules that import one of them all the same, and what for."""
 
-PLOTS_ARE_FOR = ("plots.", "cli.", "export", "demo", "reports")
+PLOTS_ARE_FOR = ("plots.", "app.", "cli.", "export", "demo", "reports")
 """Beginnings of the modules that may import plots: they are a leaf."""
 
 LATER = {

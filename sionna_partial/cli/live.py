@@ -1,4 +1,4 @@
-"""The subcommand that keeps up with a robot: live."""
+"""The subcommands that stay up: live, which keeps up with a robot, and app, the page in the browser."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -110,3 +110,26 @@ def _save(last: dict[str, Any], out: Path | None) -> None:
             for name, answer in last.items():
                 sp.save_coverage(answer.coverage, folder / f"{name}.nc")
         opt.print_files(out, [f"{name}.nc" for name in last])
+
+
+def open_app(
+    map_path: Annotated[
+        Path | None, typer.Argument(metavar="[MAP]", help=opt.MAP_HELP + " Default: an example.", show_default=False)
+    ] = None,
+    address: Annotated[
+        str, typer.Option(help="Address to listen at. Only this machine reaches the default.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen at; 0: any free one.")] = 0,
+    browser: Annotated[bool, typer.Option(help="Whether the page is opened in a browser.")] = True,
+) -> None:
+    """Serve a page on which transmitters are dragged over a map, and the coverage follows, until Ctrl-C."""
+    from sionna_partial.app.server import AppServer
+
+    partial = None if map_path is None else sp.load_map(map_path)
+    server = AppServer(partial, str(map_path or ""), address, port)
+    typer.echo(f"open {server.url}")
+    if browser:
+        import webbrowser
+
+        webbrowser.open(server.url)
+    server.run()

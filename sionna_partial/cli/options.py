@@ -18,11 +18,11 @@ from sionna_partial.files import require_writable
 from sionna_partial.progress import reporting
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
-_MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
+MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
 _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
 _MATERIAL_HELP = "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
 
-Map = Annotated[Path, typer.Argument(metavar="MAP", help=_MAP_HELP, show_default=False)]
+Map = Annotated[Path, typer.Argument(metavar="MAP", help=MAP_HELP, show_default=False)]
 Strict = Annotated[bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")]
 HeightBand = Annotated[
     tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help=_BAND_HELP, show_default=False)

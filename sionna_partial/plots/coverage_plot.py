@@ -1,5 +1,6 @@
-"""Figures of coverage maps, and of networks of several transmitters."""
+"""Figures of coverage maps, of networks of several transmitters, and a report of one page."""
 
+import io
 import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ _NETWORK_WIDTH_IN, _NETWORK_DPI = 10.0, 130
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
+_A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -21.0, -10.0), 0.9
 
 
 @dataclass(frozen=True)
@@ -375,6 +377,78 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
             Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
         )
     legend_below(figure, handles, columns=4 if located else None)
+
+
+def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float) -> bytes:
+    """Return a page (PDF) on the coverage of named transmitters: maps, covered area by received power, uncertainty.
+
+    Equal maps give equal bytes.
+    """
+    maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
+    figure = Figure(figsize=_A4_IN, layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(1.0, 1.05))
+    pictures, words = parts
+    axes = pictures.subplots(1, 2, sharey=True)
+    power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
+    strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
+    above = [
+        probability_above(one, float(np.clip(threshold_dbm - each, GAIN_FLOOR_DB, 0.0)))
+        for one, each in zip(maps.values(), powers_dbm, strict=True)
+    ]
+    level = Layer("", lambda _: _taken(power, strongest), Normalize(-130.0, -30.0), "viridis", "dBm")
+    probability = Layer("", lambda _: _taken(np.stack(above), strongest), Normalize(0.0, 1.0), "cividis", "probability")
+    titles = "Mean received power", f"P(received power > {threshold_dbm:g} dBm)"
+    for axis, layer, title in zip(axes, (level, probability), titles, strict=True):
+        _draw(axis, next(iter(maps.values())), layer)
+        axis.plot(coverage[TX_COORDINATES[0]], coverage[TX_COORDINATES[1]], zorder=4, **_STAR)
+        axis.set_title(title, fontsize="medium")
+        axis.label_outer()
+        pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, location="bottom", label=layer.label)
+    figure.suptitle(headline("Radio coverage", maps))
+    axis = words.subplots()
+    axis.set_axis_off()
+    text = _report_text(coverage, maps, powers_dbm, threshold_dbm)
+    axis.text(0.02, 1.0, text, va="top", family="monospace", fontsize=8, parse_math=False, transform=axis.transAxes)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
+    return stream.getvalue()
+
+
+def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
+    """Take one of (T, ny, nx) for each (ny, nx)."""
+    return np.take_along_axis(values, index[None], axis=0)[0]
+
+
+def _report_text(coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float) -> str:
+    """Return settings, covered area by received power, and what the numbers are worth."""
+    lines, attributes = [], coverage.attrs
+    for (name, one), eirp_dbm in zip(maps.items(), powers_dbm, strict=True):
+        x, y, z = one.attrs["transmitter_m"]
+        lines.append(f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) m, EIRP {eirp_dbm:g} dBm")
+    lines.append(f"Receivers: {attributes['rx_height_m']:g} m high, {attributes['spacing_m']:g} m apart")
+    lines.append(f"Map: {attributes['map_observed_fraction']:.0%} observed. Predictor: {attributes['predictor']}")
+    lines += ["", f"Share of the floor above a received power with probability {_LIKELY:g}, by transmitter"]
+    lines.append("  above [dBm]   " + "".join(f"{name[:16]:>18}" for name in maps))
+    for level_dbm in threshold_dbm + _REPORTED_DB:
+        share = coverage.radio.area(level_dbm, probability=_LIKELY, eirp_dbm=powers_dbm)["fraction"]
+        both = (f"{float(seen):>7.0%} /{float(every):>5.0%}" for seen, every in zip(*share.to_numpy(), strict=True))
+        lines.append(f"  {level_dbm:>7g}       " + "".join(each.rjust(18) for each in both))
+    lines.append("  (observed floor / all floor, unobserved floor weighted by the probability that it is indoors)")
+    std_db = coverage["gain_std_db"].to_numpy()
+    observed = np.broadcast_to(coverage["observed"].to_numpy() == 1, std_db.shape) & np.isfinite(std_db)
+    spreads = [
+        f"{std_db[where].mean():.1f} dB on the {what} floor"
+        for what, where in (("observed", observed), ("unobserved", ~observed & np.isfinite(std_db)))
+        if where.any() and not (attributes["map_complete"] and what == "unobserved")
+    ]
+    lines += ["", "Uncertainty: the mean standard deviation of the path gain is", f"{', '.join(spreads)}."]
+    if attributes["map_complete"]:
+        lines.append("The map is complete: the numbers are a ray trace of it. Errors of walls' positions, of their")
+        lines.append("material and of furniture that the map does not show are not in that deviation.")
+    else:
+        lines.append("Rays were traced in the observed part; the rest is a distribution learned from other buildings.")
+        lines.append("An area counts where that distribution exceeds the power with the probability above.")
+    return "\n".join(lines)
 
 
 def plot_network(network: xr.Dataset) -> Figure:

@@ -4,6 +4,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,9 @@ THRESHOLD_DB = -100.0
 
 _WIDTH, _HEIGHT, _SHORTEST, _COLOURS, _STEPS = 760, 1000, 60, 256, 1024
 _LAYERS = ("link_state", "p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db", "p_above", "best_server")
-_STATES = ["outage", "LOS", "NLOS"]
+STATES = ["outage", "LOS", "NLOS"]
+"""Words for link states."""
+
 _STRONGEST = "best server"
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
@@ -120,13 +123,13 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
     from bokeh.models.widgets.sliders import Slider
 
     layers = {name: layer for name, layer in coverage_layers(THRESHOLD_DB).items() if name in _LAYERS}
-    words, one = {"link_state": _STATES}, next(iter(maps.values()))
+    words, one = {"link_state": STATES}, next(iter(maps.values()))
     if len(maps) > 1:
         layers["best_server"] = _best_server(maps)
         words["best_server"] = [*maps]
     source, shown, plot = _source(maps, layers), IndexFilter(indices=[0]), _empty_plot(one)
     geometry = {"source": source, "view": CDSView(filter=shown)} | _rectangle(one)
-    parts = {name: _add_layer(plot, geometry, name, layer, words.get(name, ())) for name, layer in layers.items()}
+    parts = {name: add_layer(plot, geometry, name, layer, words.get(name, ())) for name, layer in layers.items()}
     _add_hover(plot, [images[0] for images in parts.values()], words)
     _add_map(plot, maps)
     titles = {name: layers[name].title for name in _LAYERS if name in layers}
@@ -145,6 +148,30 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
     plot.title.text += f": {servers[0][1]}"
     server.js_on_change("value", CustomJS(args={"shown": shown, "server": server}, code=_SERVE), show)
     return column(row(server, choice, slider), plot)
+
+
+def radio_layers(servers: int) -> dict[str, Layer]:
+    """Return layers of a transmitter with its power, or of the strongest of so many, by the name of their variable."""
+    known = coverage_layers(THRESHOLD_DB)
+    level = Normalize(-130.0, -30.0), "viridis", "dBm; an outage counts \N{MINUS SIGN}150 dB of gain"
+    ratio, numbers = (Normalize(-20.0, 50.0), "viridis", "dB"), Normalize(0, servers - 1)
+    added: dict[str, tuple[str, Normalize, str | ListedColormap, str]] = {
+        "power_mean_dbm": ("Mean received power", *level),
+        "snr_mean_db": ("Mean SNR", *ratio),
+        "p_above": ("P(received power > threshold)", Normalize(0.0, 1.0), "cividis", "probability"),
+        "sinr_mean_db": ("Mean SINR of the strongest", *ratio),
+        "best_server": ("Strongest transmitter", numbers, ListedColormap(server_colours(servers)), ""),
+    }
+    layers = {name: known[name] for name in ("link_state", "gain_mean_db", "gain_std_db")}
+    return layers | {
+        name: Layer(title, itemgetter(name), norm, cmap, label) for name, (title, norm, cmap, label) in added.items()
+    }
+
+
+def server_codes(count: int) -> list[str]:
+    """Return the colours of so many transmitters as a browser has them."""
+    cmap = ListedColormap(server_colours(count))
+    return [to_hex(cmap(number)) for number in range(count)]
 
 
 def _empty_plot(coverage: xr.Dataset) -> Any:
@@ -207,7 +234,9 @@ def _rectangle(coverage: xr.Dataset) -> dict[str, float]:
     return {"x": x0, "y": y0, "dw": x1 - x0, "dh": y1 - y0}
 
 
-def _add_layer(plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str]) -> list[Any]:
+def add_layer(
+    plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str], side: Any = "right"
+) -> list[Any]:
     """Draw a layer, of numbers or of words, with its colour bar, and return both; the first layer alone is visible."""
     from bokeh.models import FixedTicker, LinearColorMapper
     from bokeh.models.annotations.legends import ColorBar
@@ -224,7 +253,7 @@ def _add_layer(plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, 
     if words:
         bar.ticker = FixedTicker(ticks=[*range(len(words))])
         bar.major_label_overrides = dict(enumerate(words))
-    plot.add_layout(bar, "right")
+    plot.add_layout(bar, side)
     return [image, bar]
 
 

@@ -1,0 +1,524 @@
+"""The page of the app: what a session has, drawn by Bokeh, and what is clicked, given to the session."""
+
+import functools
+import html
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, Answer, Session
+from sionna_partial.constants import CellState
+from sionna_partial.errors import SionnaPartialError
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.coverage_plot import extent_m, outside
+from sionna_partial.plots.coverage_viewer import STATES, add_layer, radio_layers, server_codes
+from sionna_partial.resources import demo_homes
+
+_LAYERS = radio_layers(MOST_TRANSMITTERS)
+_WALLS = {"": "opaque from 24 GHz on", "opaque": "opaque", "through": "paths go through"}
+_COMPUTED_FOR = {"": "the partial map", "1": "the whole home (truth)"}
+_MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
+_PROBABILITY = 0.9
+_STRONGEST = "the strongest"
+_FILE_NAMES = {"png": "PNG", "html": "HTML", "nc": "NetCDF", "tif": "GeoTIFF", "yaml": "ROS map", "pdf": "Report (PDF)"}
+
+_TOOLTIPS = (
+    ("x, y", "$x{0.00} m, $y{0.00} m"),
+    ("likeliest state", "@link_state{custom}"),
+    ("LOS, NLOS, outage", "@p_los{0.00}, @p_nlos{0.00}, @p_outage{0.00}"),
+    ("path gain", "@gain_mean_db{0.0} ± @gain_std_db{0.0} dB"),
+    ("received power", "@power_mean_dbm{0.0} dBm"),
+    ("SNR", "@snr_mean_db{0.0} dB"),
+    ("P(above threshold)", "@p_above{0.00}"),
+)
+_HOVERED = ("p_los", "p_nlos", "p_outage")
+
+_UPLOAD = "document.getElementById(id).click()"
+_COPY = "navigator.clipboard ? navigator.clipboard.writeText(area.value) : 0"
+
+TEMPLATE = """\
+{% block title %}Radio coverage{% endblock %}
+{% block postamble %}
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="referrer" content="no-referrer">
+<style>
+  body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #f6f7f8 }
+  main { display: grid; grid-template-columns: minmax(0, 1fr) 21rem; gap: 1rem; max-width: 90rem;
+    margin: auto; padding: 0.8rem;
+    box-sizing: border-box }
+  h1 { font-size: 1.15rem; margin: 0; grid-column: 1 / -1 }
+  h2 { font-size: 0.95rem; margin: 0 0 0.4rem }
+  section { background: white; border: 1px solid #d5d9de; border-radius: 8px; padding: 0.7rem; margin-bottom: 0.8rem }
+  @media (max-width: 52rem) { main { grid-template-columns: minmax(0, 1fr); padding: 0.4rem } }
+</style>
+{% endblock %}
+{% block contents %}
+<main>
+  <h1>Radio coverage of a partly known building</h1>
+  <div>
+    <section aria-label="Status">{{ embed(roots.status) }}</section>
+    <section aria-label="Map with transmitters and coverage">{{ embed(roots.choices) }}
+      {{ embed(roots.picture) }}</section>
+    <section aria-labelledby="files"><h2 id="files">Download and repeat</h2>{{ embed(roots.files) }}</section>
+  </div>
+  <div>
+    <section aria-labelledby="map"><h2 id="map">Map</h2>{{ embed(roots.map) }}</section>
+    <section aria-labelledby="tx"><h2 id="tx">Transmitters</h2>{{ embed(roots.transmitters) }}</section>
+    <section aria-labelledby="radio"><h2 id="radio">Radio</h2>{{ embed(roots.radio) }}</section>
+    <section aria-labelledby="robot"><h2 id="robot">Robot and measurements</h2>{{ embed(roots.robot) }}</section>
+  </div>
+</main>
+<input type="file" id="map-file" multiple hidden accept="{{ map_suffixes }}" aria-label="Map files">
+<input type="file" id="csv-file" hidden accept=".csv" aria-label="Measurements">
+<script>
+  for (const [id, kind] of [["map-file", "map"], ["csv-file", "measurements"]]) {
+    const input = document.getElementById(id)
+    input.onchange = async () => {
+      const form = new FormData()
+      let size = 0
+      for (const file of input.files) { form.append("file", file); size += file.size }
+      input.value = ""
+      if (size > {{ most_bytes }}) return alert("Too large: start sionna-partial app with the map's path.")
+      const answer = await fetch("{{ files_url }}/" + kind, { method: "POST", body: form })
+      if (!answer.ok) alert(await answer.text())
+    }
+  }
+</script>
+{% endblock %}
+"""
+
+
+class Page:
+    """What one window shows.
+
+    Parameters
+    ----------
+    document : bokeh.document.Document
+    files_url : str
+        Under which its files are downloaded.
+    """
+
+    def __init__(self, document: Any, files_url: str) -> None:
+        self._files_url = files_url
+        self.session = Session(document.add_next_tick_callback, self.show)
+        self._is_showing = False
+        self._drawn: dict[str, Any] = {}
+        self._make_picture()
+        self._make_choices()
+        self._make_controls()
+        for name, model in self._roots().items():
+            model.name = name
+            document.add_root(model)
+
+    # What is made once
+
+    def _make_picture(self) -> None:
+        from bokeh.models import ColumnDataSource, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
+        from bokeh.plotting import figure
+
+        self._ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
+        self._values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *_LAYERS, *_HOVERED)})
+        self._points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
+        self._ways = ColumnDataSource({"xs": [], "ys": []})
+        self._poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
+        plot: Any = figure(
+            x_range=DataRange1d(range_padding=0.02),
+            y_range=DataRange1d(range_padding=0.02),
+            match_aspect=True,
+            sizing_mode="scale_width",
+            aspect_ratio=1.2,
+            x_axis_label="x [m]",
+            y_axis_label="y [m]",
+            tools="pan,wheel_zoom,box_zoom,reset",
+            active_drag=None,
+            active_scroll=None,
+            background_fill_color="#d9dce0",
+        )
+        self.plot = plot
+        plot.toolbar.logo, plot.grid.visible = None, False
+        where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
+        colours = LinearColorMapper(palette=["#ffffff", "#000000", "#b9bec4", "#e4e6e9"], low=-0.5, high=3.5)
+        walls = LinearColorMapper(palette=["#00000000", "#000000", "#00000000", "#ffffff60"], low=-0.5, high=3.5)
+        plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
+        geometry = {"source": self._values, **where}
+        self._parts = {
+            name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
+        }
+        plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
+        plot.multi_line("xs", "ys", source=self._ways, line_color="black", line_dash="dashed", line_width=2)
+        plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
+        plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
+        points = plot.scatter(
+            "x", "y", source=self._points, marker="star", size=24, fill_color="colour", line_color="black"
+        )
+        plot.text("x", "y", text="name", source=self._points, x_offset=13, **_LABEL)
+        tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
+        hover = HoverTool(
+            renderers=[parts[0] for parts in self._parts.values()],
+            tooltips=[*_TOOLTIPS],
+            formatters={"@link_state": _state_words()},
+        )
+        plot.add_tools(hover, tool)
+        plot.toolbar.active_tap = tool
+        self._points.on_change("data", self._on_points)
+        self._points.selected.on_change("indices", self._on_selected)
+
+    def _make_choices(self) -> None:
+        from bokeh.models.widgets.inputs import Select
+        from bokeh.models.widgets.markups import Div
+        from bokeh.models.widgets.sliders import Slider
+
+        self.layer = self._on(
+            Select(title="Layer", name="layer", value="p_above", options=self._options(1)), lambda _: self.show()
+        )
+        self.which = self._on(Select(title="Of", value=""), lambda _: self.show())
+        self.truth = self._on(
+            Select(
+                title="Computed for",
+                value="",
+                options=list[Any](_COMPUTED_FOR.items()),
+            ),
+            lambda _: self.show(),
+        )
+        self.threshold = self._on(
+            Slider(title="Threshold [dBm]", start=-130, end=-30, step=1, value=-80),
+            lambda value: self.session.set(threshold_dbm=float(value)),
+        )
+        self.message = Div(
+            name="message", sizing_mode="stretch_width", html_attributes={"role": "status", "aria-live": "polite"}
+        )
+        self.summary = Div(name="summary", sizing_mode="stretch_width")
+        self.cancel = self._button("Cancel", lambda: self.session.cancel(), button_type="danger", width=90)
+
+    def _make_controls(self) -> None:
+        from bokeh.models.widgets.inputs import Select, Spinner, TextAreaInput, TextInput
+        from bokeh.models.widgets.markups import Div
+
+        homes: list[Any] = [("", "choose one"), *((name, name) for name in demo_homes())]
+        self.example = self._on(Select(title="Example home", options=homes), self._open_example)
+        self.map_text = Div(sizing_mode="stretch_width")
+        self.chosen = self._on(Select(title="Transmitter"), self._choose)
+        self.name = self._on(TextInput(title="Name"), lambda value: self._change(new_name=value))
+        self.fields = {
+            name: self._on(
+                Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[00]"),
+                functools.partial(self._change_field, name),
+                "value_throttled",
+            )
+            for name, title, step, low, high in (
+                ("x_m", "x [m]", 0.25, None, None),
+                ("y_m", "y [m]", 0.25, None, None),
+                ("z_m", "Height [m]", 0.1, 0, 100),
+                ("eirp_dbm", "EIRP [dBm]", 1, -100, 100),
+            )
+        }
+        self.walls = self._on(
+            Select(title="Walls", options=list[Any](_WALLS.items()), value=""),
+            lambda value: self.session.set(through_walls={"": None, "opaque": False, "through": True}[value]),
+        )
+        self.radio = {
+            name: self._on(
+                Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[000]"),
+                functools.partial(self._set_field, name, unit),
+                "value_throttled",
+            )
+            for name, title, unit, step, low, high in (
+                ("frequency_hz", "Frequency [GHz]", 1e9, 0.1, 0.1, 300),
+                ("bandwidth_hz", "Bandwidth [MHz]", 1e6, 10, 0.01, 10_000),
+                ("rx_height_m", "Receiver height [m]", 1.0, 0.1, 0, 100),
+                ("spacing_m", "Between receivers [m]", 1.0, 0.05, 0.05, 10),
+            )
+        }
+        self.links = Div(name="links", sizing_mode="stretch_width", stylesheets=[_LINKS])
+        self.python = TextAreaInput(title="The same in Python", rows=8, stylesheets=[_CODE], name="python")
+
+    def _roots(self) -> dict[str, Any]:
+        from bokeh.layouts import column, row
+        from bokeh.models import CustomJS, Row
+
+        def pair(*models: Any) -> Row:
+            for model in models:
+                model.sizing_mode, model.width = "stretch_width", None
+            return row(*models, sizing_mode="stretch_width")
+
+        def wide(*models: Any) -> Any:
+            for model in models:
+                model.sizing_mode = "stretch_width"
+            return column(*models, sizing_mode="stretch_width")
+
+        session = self.session
+        upload_map, upload_csv, copy = (
+            self._button(name)
+            for name in ("Open a map file\u2026", "Learn from measurements (CSV)\u2026", "Copy as Python")
+        )
+        upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
+        upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
+        copy.js_on_click(CustomJS(args={"area": self.python}, code=_COPY))
+        self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
+        x, y, z, eirp = self.fields.values()
+        frequency, bandwidth, height, spacing = self.radio.values()
+        return {
+            "status": column(row(self.message, self.cancel, sizing_mode="stretch_width"), sizing_mode="stretch_width"),
+            "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth), self.summary),
+            "picture": self.plot,
+            "map": wide(self.example, upload_map, self.map_text),
+            "transmitters": wide(
+                pair(self.chosen, self.name),
+                pair(x, y),
+                pair(z, eirp),
+                pair(
+                    self._button("Add", lambda: session.add()),
+                    self._button("Remove", lambda: session.remove(session.chosen)),
+                ),
+                self._button("Place it for me", lambda: session.place(), button_type="primary"),
+            ),
+            "radio": wide(pair(frequency, bandwidth), self.walls, pair(height, spacing)),
+            "robot": wide(self.more, self._button("Best next views", lambda: session.find_views()), upload_csv),
+            "files": wide(self.links, self.python, copy),
+        }
+
+    def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
+        """Give what is chosen to a function; what is refused is shown."""
+
+        def changed(_name: str, _old: Any, new: Any) -> None:
+            if not self._is_showing and new is not None:
+                self._guarded(take, new)
+
+        model.on_change(attribute, changed)
+        return model
+
+    def _button(self, label: str, take: Callable[[], object] | None = None, **style: Any) -> Any:
+        from bokeh.models.widgets.buttons import Button
+
+        button = Button(label=label, name=label, **style)
+        if take is not None:
+            button.on_click(lambda _: self._guarded(take))
+        return button
+
+    def _guarded(self, take: Callable[..., object], *given: Any) -> None:
+        try:
+            take(*given)
+        except SionnaPartialError as error:
+            self.session.refuse(error)
+
+    # What is clicked
+
+    def _on_points(self, _name: str, _old: Any, new: Any) -> None:
+        if not self._is_showing:
+            self._guarded(self.session.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
+
+    def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
+        """Choose what is clicked; nothing stays selected, or it would be dragged with the next one."""
+        if new and not self._is_showing:
+            self._choose(self._points.data["name"][new[-1]])
+            self._points.selected.indices = []
+
+    def _open_example(self, name: str) -> None:
+        if name:
+            self.session.open_example(name)
+
+    def _choose(self, name: str) -> None:
+        if name in self.session.transmitters:
+            self.session.chosen = name
+        self.show()
+
+    def _change_field(self, name: str, value: float) -> None:
+        self._change(**{name: float(value)})
+
+    def _set_field(self, name: str, unit: float, value: float) -> None:
+        self.session.set(**{name: float(value) * unit})
+
+    def _change(self, **values: Any) -> None:
+        self.session.change(self.session.chosen, **values)
+
+    # What changes
+
+    def show(self) -> None:
+        """Draw what the session has."""
+        self._is_showing = True
+        try:
+            self._show_status()
+            self._once("map", (id(self.session.partial),), self._show_map)
+            self._show_transmitters()
+            self._show_answer()
+            self._once("views", (id(self.session.views),), self._show_views)
+        finally:
+            self._is_showing = False
+
+    def _once(self, name: str, key: tuple[Any, ...], draw: Callable[[], None]) -> None:
+        """Draw what has changed alone."""
+        if self._drawn.get(name) != key:
+            draw()
+            self._drawn[name] = key
+
+    def _show_status(self) -> None:
+        status = self.session.status
+        text = html.escape(status.message)
+        if status.fraction is not None:
+            text = f'<progress max="1" value="{status.fraction:.2f}" aria-label="progress"></progress> {text}'
+        colour = "#a1232f" if status.is_error else "#1a1a1a"
+        self.message.text = f'<span style="color:{colour}">{text}</span>'
+        self.cancel.visible = status.fraction is not None
+
+    def _show_map(self) -> None:
+        partial, session = self.session.partial, self.session
+        if partial is None:
+            return
+        cells = hatched_pixels(partial)
+        x0, y0, x1, y1 = partial.bounds_m
+        self._ground.data = {"cells": [cells], "x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
+        self.plot.aspect_ratio = min(max((x1 - x0) / (y1 - y0), 0.7), 1.8)
+        seen = "complete" if partial.is_complete else f"{partial.observed_fraction:.0%} observed"
+        size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m, cells of {partial.resolution_m:g} m"
+        robot = f"; robot after {session.steps} steps" if session.home is not None else ""
+        self.map_text.text = f"<b>{html.escape(session.title)}</b>: {size}, {seen}{robot}"
+        self.more.disabled = session.home is None
+        self.example.value = session.title if session.home is not None else ""
+        self.truth.visible = session.home is not None
+
+    def _show_transmitters(self) -> None:
+        session = self.session
+        names = [*session.transmitters]
+        each = [*session.transmitters.values()]
+        colours = server_codes(MOST_TRANSMITTERS)
+        rows = {
+            "x": [tx.x_m for tx in each],
+            "y": [tx.y_m for tx in each],
+            "name": names,
+            "colour": colours[: len(names)],
+        }
+        self._once(
+            "points", (repr(rows), repr(self._points.data)), functools.partial(setattr, self._points, "data", rows)
+        )
+        self._drawn["points"] = repr(rows), repr(self._points.data)
+        self.chosen.options, self.chosen.value = [*names], session.chosen
+        self.name.value = session.chosen
+        chosen = session.transmitters.get(session.chosen)
+        for name, field in self.fields.items():
+            field.value, field.disabled = (None, True) if chosen is None else (getattr(chosen, name), False)
+        self.name.disabled = chosen is None
+        options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
+        if self.which.options != options:  # of several, first what a receiver gets
+            self.which.options, self.which.value = options, options[0][0]
+        self.layer.options = self._options(len(names))
+        if self.layer.value not in [value for value, _ in self.layer.options]:
+            self.layer.value = "p_above"
+        settings = session.settings
+        for name, unit in (("frequency_hz", 1e9), ("bandwidth_hz", 1e6), ("rx_height_m", 1.0), ("spacing_m", 1.0)):
+            self.radio[name].value = getattr(settings, name) / unit
+        self.walls.value = {None: "", False: "opaque", True: "through"}[settings.through_walls]
+        self.python.value = session.python()
+
+    def _options(self, transmitters: int) -> list[Any]:
+        return [
+            (name, layer.title)
+            for name, layer in _LAYERS.items()
+            if transmitters > 1 or name not in ("sinr_mean_db", "best_server")
+        ]
+
+    def _show_answer(self) -> None:
+        answer, name, threshold_dbm = self.session.answer, self.which.value, self.session.settings.threshold_dbm
+        self._once("answer", (id(answer), name, threshold_dbm, self.truth.value), self._show_values)
+        for layer, parts in self._parts.items():
+            for part in parts:
+                part.visible = layer == self.layer.value and answer is not None
+        self.plot.title.text = (
+            ""
+            if answer is None
+            else _LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
+            + ("" if answer.is_final else " (coarse)")
+        )
+
+    def _show_values(self) -> None:
+        answer, session = self.session.answer, self.session
+        if answer is None:
+            self._values.data = {name: [] for name in self._values.data}
+            self.summary.text = self.links.text = ""
+            return
+        one = answer.layers_of(self.which.value, session.settings.threshold_dbm, truth=bool(self.truth.value))
+        x0, x1, y0, y1 = extent_m(one)
+        valid = (one["valid"].to_numpy() == 1) & ~outside(one)
+        row, column = np.indices(valid.shape)
+        if valid.any():  # a wall thinner than a cell leaves none without a value, for the eye alone
+            apart, (row, column) = distance_transform_edt(~valid, return_indices=True)
+            valid = apart < 2.0
+        columns: dict[str, Any] = {"x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
+        for name in (*self._parts, *_HOVERED):
+            values = one[name].to_numpy() if name in one else np.full(valid.shape, np.nan)
+            columns[name] = [np.where(valid, values[row, column], np.nan).astype(np.float32)]
+        self._values.data = columns
+        self._parts["best_server"][1].major_label_overrides = dict(
+            enumerate(map(str, answer.coverage["tx"].to_numpy()))
+        )
+        self.summary.text = _summary(answer, session.settings.threshold_dbm)
+        links = (
+            f'<a href="{self._files_url}/{kind}" download="{FILES[kind]}">{_FILE_NAMES[kind]}</a>' for kind in FILES
+        )
+        self.links.text = " ".join(links) if answer.is_final else ""
+
+    def _show_views(self) -> None:
+        views = self.session.views or ()
+        self._ways.data = {"xs": [view.path_m[:, 0] for view in views], "ys": [view.path_m[:, 1] for view in views]}
+        self._poses.data = {
+            "x": [view.position_m[0] for view in views],
+            "y": [view.position_m[1] for view in views],
+            "angle": [math.radians(view.heading_deg - 90.0) for view in views],
+            "rank": [str(number) for number in range(1, len(views) + 1)],
+        }
+
+
+_LABEL: dict[str, Any] = {
+    "text_baseline": "middle",
+    "text_font_size": "13px",
+    "background_fill_color": "white",
+    "background_fill_alpha": 0.75,
+}
+_MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
+_CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
+_LINKS = (
+    "a { display: inline-block; padding: 0.25em 0.7em; margin: 0.15em; border: 1px solid #93a1b0; border-radius: 6px }"
+)
+
+
+def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
+    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown; 3 is a hatch."""
+    merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
+    ny, nx = (math.ceil(n / merge) for n in partial.shape)
+    padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
+    padded[: partial.shape[0], : partial.shape[1]] = partial.state
+    blocks = padded.reshape(ny, merge, nx, merge)
+    free = np.where((blocks == CellState.FREE).any(axis=(1, 3)), CellState.FREE, CellState.UNKNOWN)
+    cells = np.where((blocks == CellState.WALL).any(axis=(1, 3)), CellState.WALL, free).astype(np.uint8)
+    finer = max(1, round(_FEWEST_PIXELS / max(cells.shape)))
+    cells = cells.repeat(finer, axis=0).repeat(finer, axis=1)
+    row, column = np.indices(cells.shape)
+    stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
+    return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
+
+
+def _summary(answer: Answer, threshold_dbm: float) -> str:
+    """Say how much of the floor is covered, and in a home that is known, how good the prediction is."""
+    area = answer.coverage.radio.area(threshold_dbm, probability=_PROBABILITY, eirp_dbm=answer.eirp_dbm)["fraction"]
+    shares = (
+        f"<b>{html.escape(str(name))}</b> {float(seen):.0%} of the observed floor, {float(every):.0%} of all"
+        for name, seen, every in zip(answer.coverage["tx"].to_numpy(), *area.to_numpy(), strict=True)
+    )
+    text = f"Above {threshold_dbm:g} dBm with probability {_PROBABILITY:g}: {'; '.join(shares)}."
+    found = answer.agreement()
+    if found is not None:
+        text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
+    return text + " Hatched: not observed."
+
+
+def _words(name: str) -> list[str]:
+    return {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}.get(name, [])
+
+
+def _state_words() -> Any:
+    from bokeh.models import CustomJSHover
+
+    return CustomJSHover(code=f"return {STATES!r}[value] ?? 'no receiver'")

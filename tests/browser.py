@@ -1,0 +1,111 @@
+"""Headless Chromium, driven by its DevTools protocol over a WebSocket."""
+
+import base64
+import itertools
+import json
+import shutil
+import subprocess
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from websockets.sync.client import connect
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+class Tab:
+    """One page."""
+
+    def __init__(self, socket: Any, downloads: Path, width: int, height: int) -> None:
+        self._socket, self._numbers = socket, itertools.count(1)
+        self.send("Page.enable")
+        self.send("Runtime.enable")
+        self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
+        self.resize(width, height)
+
+    def send(self, method: str, **given: Any) -> Any:
+        number = next(self._numbers)
+        self._socket.send(json.dumps({"id": number, "method": method, "params": given}))
+        while True:
+            answer = json.loads(self._socket.recv(timeout=120))
+            if answer.get("id") == number:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def resize(self, width: int, height: int, *, mobile: bool = False) -> None:
+        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile)
+
+    def open(self, url: str) -> None:
+        self.send("Page.navigate", url=url)
+
+    def run(self, code: str) -> Any:
+        found = self.send("Runtime.evaluate", expression=code, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found
+        return found["result"].get("value")
+
+    def wait(self, code: str, seconds: float = 60.0) -> Any:
+        """Return the first true value of an expression."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            found = self.run(f"(() => {{ try {{ return {code} }} catch {{ return null }} }})()")
+            if found:
+                return found
+            time.sleep(0.05)
+        raise TimeoutError(code)
+
+    def mouse(self, kind: str, x: float, y: float) -> None:
+        held = {"button": "left", "clickCount": 1} if kind != "mouseMoved" else {}
+        self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
+
+    def click(self, x: float, y: float) -> None:
+        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+            self.mouse(kind, x, y)
+
+    def drag(self, x0: float, y0: float, x1: float, y1: float) -> None:
+        self.mouse("mouseMoved", x0, y0)
+        self.mouse("mousePressed", x0, y0)
+        for part in (0.2, 0.6, 1.0):
+            x, y = x0 + part * (x1 - x0), y0 + part * (y1 - y0)
+            self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+        self.mouse("mouseReleased", x1, y1)
+
+    def choose_files(self, selector: str, *paths: Path) -> None:
+        root = self.send("DOM.getDocument")["root"]["nodeId"]
+        node = self.send("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
+        self.send("DOM.setFileInputFiles", nodeId=node, files=[str(path) for path in paths])
+
+    def screenshot(self, path: Path, *, whole: bool = False) -> None:
+        self.send("Page.bringToFront")
+        picture = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"]
+        path.write_bytes(base64.b64decode(picture))
+
+
+@contextmanager
+def chromium(folder: Path) -> Iterator[Any]:
+    """Start a browser and yield what opens tabs in it."""
+    assert CHROMIUM
+    options = ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run")
+    ports = folder / "profile" / "DevToolsActivePort"
+    command = [CHROMIUM, *options, "--remote-debugging-port=0", f"--user-data-dir={ports.parent}", "about:blank"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with ExitStack() as stack:
+        stack.callback(process.wait, 20)
+        stack.callback(process.terminate)
+        while not (ports.exists() and len(ports.read_text().split()) == 2):
+            assert process.poll() is None
+            time.sleep(0.1)
+        port = ports.read_text().split()[0]
+
+        def open_tab(url: str, width: int = 1280, height: int = 1000) -> Tab:
+            request = urllib.request.Request(f"http://127.0.0.1:{port}/json/new?about:blank", method="PUT")
+            with urllib.request.urlopen(request) as answer:
+                address = json.load(answer)["webSocketDebuggerUrl"]
+            tab = Tab(stack.enter_context(connect(address, max_size=None)), folder, width, height)
+            tab.open(url)
+            return tab
+
+        yield open_tab

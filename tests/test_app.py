@@ -1,0 +1,389 @@
+"""The app: what a window computes and in which order, what is sent to it, who may open it, the page in a browser."""
+
+import io
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, Tab, chromium
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+import sionna_partial as sp
+from sionna_partial.app.session import FILES, Session, Transmitter, stored_map
+from sionna_partial.errors import MapError, SettingsError
+
+ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
+ROOM[1:20, 20] = 1
+PARTIAL = sp.map_from_array(ROOM, 0.1)
+
+
+class Window:
+    """A session whose thread is the test's."""
+
+    def __init__(self) -> None:
+        self.came = threading.Event()
+        self.waiting: list[Callable[[], None]] = []
+        self.seen: list[tuple[bool, tuple[str, ...]]] = []
+        self.session = Session(self._later, self._look)
+
+    def _later(self, function: Callable[[], None]) -> None:
+        self.waiting.append(function)
+
+    def _look(self) -> None:
+        answer = self.session.answer
+        if answer is not None:
+            now = answer.is_final, tuple(answer.coverage["tx"].to_numpy())
+            self.seen += [now] if self.seen[-1:] != [now] else []
+
+    def settle(self) -> str:
+        """Do what waits until no job is left, and return the last message."""
+        end = time.monotonic() + 120.0
+        while self.session.status.fraction is not None and time.monotonic() < end:
+            while self.waiting:
+                self.waiting.pop(0)()
+            time.sleep(0.005)
+        return self.session.status.message
+
+
+@pytest.fixture
+def window() -> Iterator[Window]:
+    made = Window()
+    made.session.open_map(PARTIAL, "room.yaml")
+    made.session.settings = replace(made.session.settings, spacing_m=0.5)
+    yield made
+    made.session.close()
+
+
+class TestJobs:
+    def test_coarse_then_fine(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        assert window.settle() == "Ready."
+        assert window.seen == [(False, ("tx1",)), (True, ("tx1",))]
+
+    def test_a_newer_job_is_the_last_that_is_seen(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.put([("tx1", 1.0, 1.0)])
+        window.settle()
+        assert {names for _, names in window.seen} == {("tx1",)}
+        assert window.session.answer is not None
+        assert window.session.answer.network is None
+
+    def test_what_an_older_job_has_found_is_dropped(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        while not window.waiting or window.session.status.fraction is None:
+            time.sleep(0.01)
+        window.session.remove("tx1")
+        window.settle()
+        for late in window.waiting:
+            late()
+        assert window.session.answer is None
+        assert "Click on the map" in window.session.status.message
+
+    def test_cancel_ends_a_job_and_its_thread(self, window: Window) -> None:
+        running, ended = threading.Event(), threading.Event()
+
+        def work(report: Any) -> Iterator[Callable[[], None]]:
+            try:
+                while True:
+                    running.set()
+                    report(0.5, "working")
+            finally:
+                ended.set()
+            yield lambda: None
+
+        window.session.begin(work)
+        assert running.wait(60)
+        window.session.cancel()
+        assert ended.wait(60)
+        assert window.session.status.message == "Cancelled."
+        window.session.put([("", 1.0, 1.0)])
+        assert window.settle() == "Ready."
+
+    @pytest.mark.parametrize(
+        ("place", "message"), [((2.05, 1.0), "is inside a wall"), ((9.0, 1.0), "outside the map")], ids=str
+    )
+    def test_what_cannot_be_is_said(self, window: Window, place: tuple[float, float], message: str) -> None:
+        window.session.put([("", *place)])
+        assert message in window.settle()
+        assert window.session.status.is_error
+
+    def test_windows_do_not_mix(self, window: Window) -> None:
+        other = Window()
+        other.session.open_map(PARTIAL, "other.yaml")
+        other.session.put([("", 3.0, 1.0), ("", 1.0, 2.5)])
+        window.session.put([("", 1.0, 1.0)])
+        assert window.settle() == other.settle() == "Ready."
+        assert [*window.session.transmitters] == ["tx1"]
+        assert [*other.session.transmitters] == ["tx1", "tx2"]
+
+
+class TestTransmitters:
+    def test_name_height_and_power(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.session.change("tx1", new_name="door", z_m=2.0, eirp_dbm=30.0)
+        window.session.put([("door", 1.5, 1.0)])
+        assert window.session.transmitters == {"door": Transmitter(1.5, 1.0, 2.0, 30.0)}
+        window.settle()
+
+    @pytest.mark.parametrize("name", ["", "a b", "../x", "tx2", "<b>"])
+    def test_names_that_are_none(self, window: Window, name: str) -> None:
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        with pytest.raises(SettingsError):
+            window.session.change("tx1", new_name=name)
+        window.settle()
+
+    def test_power_threshold_and_layers(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.change("tx2", eirp_dbm=40.0)
+        window.settle()
+        answer = window.session.answer
+        assert answer is not None
+        best = answer.layers_of("", -60.0)
+        one, two = (answer.layers_of(name, -60.0) for name in ("tx1", "tx2"))
+        powers = [each["power_mean_dbm"].to_numpy() for each in (one, two)]
+        np.testing.assert_array_equal(best["power_mean_dbm"], np.where(powers[1] > powers[0], powers[1], powers[0]))
+        above = answer.coverage.isel(tx=1).radio.probability_above(-100.0)
+        np.testing.assert_allclose(two["p_above"], above, atol=1e-6)
+        assert np.isfinite(best["sinr_mean_db"].to_numpy()[best["valid"].to_numpy()]).all()
+
+    def test_it_is_placed(self, window: Window) -> None:
+        window.session.place()
+        assert window.settle() == "Ready."
+        assert [*window.session.transmitters] == ["tx1"]
+
+
+class TestRobot:
+    def test_prediction_meets_the_truth(self, window: Window) -> None:
+        window.session.open_example("apartment")
+        window.settle()
+        session = window.session
+        assert (session.steps, [*session.transmitters]) == (100, ["tx1"])
+        session.set(spacing_m=0.6)
+        session.explore_more(400)
+        window.settle()
+        assert session.steps == 500
+        assert session.answer is not None
+        found = session.answer.agreement()
+        assert found is not None
+        assert found[0] > 0.9
+        session.find_views()
+        window.settle()
+        assert session.views is not None
+
+    def test_a_map_has_no_robot(self, window: Window) -> None:
+        with pytest.raises(SettingsError, match="examples alone"):
+            window.session.explore_more()
+
+
+class TestFiles:
+    def test_each_kind(self, window: Window) -> None:
+        with pytest.raises(SettingsError, match="no coverage yet"):
+            window.session.file("png")
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        starts = {
+            "png": b"\x89PNG",
+            "html": b"<!doctype html",
+            "nc": b"\x89HDF",
+            "tif": b"II*",
+            "yaml": b"PK",
+            "pdf": b"%PDF",
+        }
+        for kind in FILES:
+            content = window.session.file(kind)
+            assert content.startswith(starts[kind])
+            assert content == window.session.file(kind)
+        with zipfile.ZipFile(io.BytesIO(window.session.file("yaml"))) as archive:
+            assert archive.namelist() == ["coverage.pgm", "coverage.yaml"]
+
+    def test_python_computes_the_same(self, window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        sp.save_map(PARTIAL, "room.yaml")
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.change("tx2", eirp_dbm=30.0)
+        window.session.set(frequency_hz=5.2e9, through_walls=False)
+        window.settle()
+        names: dict[str, Any] = {}
+        exec(window.session.python(), names)
+        assert window.session.answer is not None
+        assert names["coverage"].identical(window.session.answer.coverage)
+
+    def test_measurements_without_a_transmitter_are_of_the_chosen_one(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        window.session.learn(b"x,y,rssi\n1.5,2.0,-60\n3.0,2.5,-70\n")
+        window.settle()
+        assert window.session.measured is not None
+        assert "measured.csv" in window.session.python()
+        window.session.put([("tx1", 3.0, 1.0)])
+        window.settle()
+        assert window.session.measured is None
+
+    def test_spoilt_measurements(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.session.learn(b"\xff\x00")
+        assert "measured.csv" in window.settle()
+        assert window.session.status.is_error
+
+
+def uploaded(tmp_path: Path) -> list[tuple[str, bytes]]:
+    sp.save_map(PARTIAL, tmp_path / "room.yaml")
+    return [(name, (tmp_path / name).read_bytes()) for name in ("room.yaml", "room.pgm")]
+
+
+class TestUploads:
+    def test_ros_map_under_names_of_ours(self, window: Window, tmp_path: Path) -> None:
+        (sheet, text), (image, pixels) = uploaded(tmp_path)
+        files = [("../../etc/" + sheet, text), ("C:\\" + image, pixels)]
+        (tmp_path / "in").mkdir()
+        stored_map(files, tmp_path / "in")
+        assert sorted(path.name for path in (tmp_path / "in").iterdir()) == ["map.pgm", "map.yaml"]
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as archive:
+            for name, content in files:
+                archive.writestr(name, content)
+        for given in (files, [("room.zip", packed.getvalue())]):
+            window.session.upload_map(given)
+            window.settle()
+            assert window.session.partial == PARTIAL
+
+    @pytest.mark.parametrize(
+        "files",
+        [
+            [("map.exe", b"")],
+            [("map", b"")],
+            [("a.yaml", b""), ("b.yml", b"")],
+            [("a.npz", b""), ("b.pgm", b"")],
+            [("a.pgm", b""), ("b.pgm", b""), ("c.yaml", b"")],
+            [("a.zip", b"no zip")],
+        ],
+        ids=lambda files: "+".join(name for name, _ in files),
+    )
+    def test_other_files_are_refused(self, files: list[tuple[str, bytes]], tmp_path: Path) -> None:
+        with pytest.raises(MapError):
+            stored_map(files, tmp_path)
+        assert not [*tmp_path.iterdir()]
+
+    def test_images_of_the_server_are_not_read(self, window: Window, tmp_path: Path) -> None:
+        (_, text), _ = uploaded(tmp_path)
+        secret = text.replace(b"room.pgm", str(tmp_path / "room.pgm").encode())
+        window.session.upload_map([("a.yaml", secret)])
+        window.settle()
+        assert window.session.status.is_error
+
+    def test_spoilt_map(self, window: Window) -> None:
+        window.session.upload_map([("a.npz", b"PK\x03\x04 nothing")])
+        window.settle()
+        assert window.session.status.is_error
+        assert window.session.partial is PARTIAL
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Address of an app with a room, in a process of its own."""
+    folder = tmp_path_factory.mktemp("app")
+    sp.save_map(PARTIAL, folder / "room.yaml")
+    command = [sys.executable, "-m", "sionna_partial", "app", "room.yaml", "--no-browser"]
+    root = str(Path(sp.__file__).parents[1])
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder, env=environment) as server:
+        assert server.stdout is not None
+        yield server.stdout.readline().split()[1]
+        server.terminate()
+
+
+def status_of(url: str, data: bytes | None = None) -> int:
+    try:
+        with urllib.request.urlopen(url, data, timeout=60) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+class TestServer:
+    def test_its_address_cannot_be_guessed(self, url: str) -> None:
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/[\w-]{32}", url)
+        host = url.rpartition("/")[0]
+        assert status_of(url) == 200
+        assert {status_of(host + path) for path in ("/", "/wrong", "/wrong/ws", "/files/x/png")} == {404}
+
+    def test_files_of_no_window(self, url: str) -> None:
+        assert status_of(f"{url}/files/guessed/png") == 404
+        assert status_of(f"{url}/files/guessed/map", b"") == 404
+
+    def test_other_sites_get_no_socket(self, url: str) -> None:
+        with (
+            pytest.raises(InvalidStatus, match="403"),
+            connect(url.replace("http", "ws", 1) + "/ws", origin=Origin("http://evil.example")),
+        ):
+            pass
+
+    def test_port_that_is_taken(self, url: str) -> None:
+        port = url.split(":")[2].split("/")[0]
+        command = [sys.executable, "-m", "sionna_partial", "app", "--no-browser", "--port", port]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
+        assert ended.returncode == 2
+        assert "choose another --port" in ended.stderr
+        assert "Traceback" not in ended.stderr
+
+
+_MODEL = "Bokeh.documents[0].get_model_by_name"
+_READY = f"{_MODEL}('message').text.includes('Ready')"
+_WALK = "const walk = n => [n, ...[...(n.shadowRoot?.children ?? []), ...n.children].flatMap(walk)]"
+_PIXEL = f"""(() => {{ const view = Bokeh.index.get({_MODEL}('picture')), box = view.el.getBoundingClientRect()
+return [box.left + view.frame.x_scale.compute(X), box.top + view.frame.y_scale.compute(Y)] }})()"""
+
+
+def pixel(tab: Tab, x_m: float, y_m: float) -> tuple[float, float]:
+    x, y = tab.run(_PIXEL.replace("X", str(x_m)).replace("Y", str(y_m)))
+    return x, y
+
+
+def press(tab: Tab, label: str) -> None:
+    """Press a button as soon as it is there."""
+    button = f"walk(document.body).find(n => n.tagName == 'BUTTON' && n.textContent.trim() == {label!r})"
+    there = f"(async () => {{ {_WALK}; while (!{button}?.offsetWidth) await new Promise(requestAnimationFrame)"
+    tab.run(f"{there}; {button}.click() }})()")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
+    with chromium(tmp_path) as open_tab:
+        tab = open_tab(url)
+        tab.wait(f"{_MODEL}('message').text.includes('Click on the map')")
+        tab.wait(f"Bokeh.index.get({_MODEL}('picture')).frame.bbox.width > 100")
+        tab.click(*pixel(tab, 1.0, 1.0))
+        tab.wait(_READY)
+        tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 3.0, 2.0))
+        tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3) < 0.1")
+        tab.wait(_READY)
+        assert tab.run(f"{_MODEL}('points').data.name.length") == 1
+        links = re.findall('href="([^"]+)"', tab.run(f"{_MODEL}('links').text"))
+        assert {link.rpartition("/")[2] for link in links} == {*FILES}
+        assert status_of(url.rpartition("/")[0] + links[0]) == 200
+
+        uploaded(tmp_path)
+        tab.choose_files("#map-file", tmp_path / "room.yaml", tmp_path / "room.pgm")
+        tab.wait(f"{_MODEL}('points').data.name.length == 0")
+        other = open_tab(url, 390, 844)
+        other.wait(f"{_MODEL}('message').text.includes('Click on the map')")
+        assert other.run("document.documentElement.scrollWidth <= 390")
+        press(tab, "Place it for me")
+        press(tab, "Cancel")
+        tab.wait(f"{_MODEL}('message').text.includes('Cancelled')")
+        assert other.run(f"{_MODEL}('points').data.name.length") == 0
