@@ -1,5 +1,7 @@
 """Coverage: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

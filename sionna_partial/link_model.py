@@ -1,5 +1,7 @@
 """LinkModel: a map, its simulation and a predictor -> the prediction of any links, kept warm between calls."""
 
+from __future__ import annotations
+
 import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -446,7 +448,7 @@ def _measurement_attributes(measured: Measurements, source: _Transmitter) -> dic
 
 
 def link_model_of(
-    scene: "PartialMap | str | Path | Simulation | LinkModel",
+    scene: PartialMap | str | Path | Simulation | LinkModel,
     predictor: Predictor | str | Path | None = None,
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,

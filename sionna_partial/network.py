@@ -1,5 +1,7 @@
 """Networks of several transmitters: coverage maps -> best server, SINR and rate, with their uncertainty."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import asdict
 from typing import Any

@@ -9,6 +9,7 @@ import sys
 import tomllib
 from collections.abc import Iterator
 from importlib import import_module, metadata
+from inspect import isfunction, signature
 from pathlib import Path
 from types import CodeType, ModuleType
 
@@ -266,7 +267,13 @@ class TestPublicNames:
             value = getattr(sionna_partial, name)
             assert not isinstance(value, ModuleType)
             assert getattr(value, "__name__", name) == name
-            assert name in dir(sionna_partial)
+        assert dir(sionna_partial) == sorted(sionna_partial.__all__)
+
+    def test_signatures_show_names_of_types(self) -> None:
+        functions = [getattr(sionna_partial, name) for name in sionna_partial.__all__]
+        shown = {each.__name__: str(signature(each)) for each in functions if isfunction(each)}
+        assert "tx: 'ArrayLike" in shown["predict_map"]
+        assert not [name for name, text in shown.items() if "_SupportsArray" in text]
 
     def test_unknown_name(self) -> None:
         with pytest.raises(AttributeError, match="module 'sionna_partial' has no attribute 'teleport'"):

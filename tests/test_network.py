@@ -170,5 +170,3 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
         sp.plot_network_placement(network)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="count"):
         sp.place_transmitters(sp.map_from_array([[0]], 1.0), 0)
-    with pytest.raises(SettingsError, match="coverage"):
-        sp.place_transmitters(sp.map_from_array([[0]], 1.0), 2, objective="percentile")

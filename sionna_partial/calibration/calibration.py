@@ -1,5 +1,7 @@
 """Materials from measured gains, with their uncertainty: map + measurements -> MaterialCalibration."""
 
+from __future__ import annotations
+
 import logging
 import math
 from collections.abc import Sequence

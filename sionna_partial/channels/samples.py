@@ -1,5 +1,7 @@
 """Draws of the channels of links on a partial map: what the paths may be in the building."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -67,7 +69,7 @@ class ChannelSamples(Shown):
     link_state: States
     gain_db: Floats
     memory_gb: float
-    _draws: "_Draws" = field(repr=False)
+    _draws: _Draws = field(repr=False)
 
     def __len__(self) -> int:
         """Return the number of draws n."""
@@ -107,19 +109,19 @@ class ChannelSamples(Shown):
         columns |= {name: getattr(self, name).reshape(len(tx_m), -1) for name in ("link_state", "gain_db")}
         return replace(traced, tx=tx_m, **columns)
 
-    def cir(self, **options: Any) -> "xr.Dataset":
+    def cir(self, **options: Any) -> xr.Dataset:
         """Return channel impulse responses as `TracedLinks.cir` does, along a first dimension "draw"."""
         return self._by_draw(self.drawn.cir(**self._tiled(options)))
 
-    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> "xr.Dataset":
+    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> xr.Dataset:
         """Return channel frequency responses as `TracedLinks.cfr` does, along a first dimension "draw"."""
         return self._by_draw(self.drawn.cfr(frequencies_hz, **self._tiled(options)))
 
-    def beam_gains(self, codebook: ArrayLike, rx_codebook: ArrayLike | None = None, **options: Any) -> "xr.Dataset":
+    def beam_gains(self, codebook: ArrayLike, rx_codebook: ArrayLike | None = None, **options: Any) -> xr.Dataset:
         """Return gains of pairs of beams as `TracedLinks.beam_gains` does, along a first dimension "draw"."""
         return self._by_draw(self.drawn.beam_gains(codebook, rx_codebook, **self._tiled(options)))
 
-    def spreads(self) -> "xr.Dataset":
+    def spreads(self) -> xr.Dataset:
         """Return delay and angular spreads as `TracedLinks.spreads` does, along a first dimension "draw".
 
         Examples
@@ -140,7 +142,7 @@ class ChannelSamples(Shown):
             return options
         return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
 
-    def _by_draw(self, found: "xr.Dataset") -> "xr.Dataset":
+    def _by_draw(self, found: xr.Dataset) -> xr.Dataset:
         """Fold links, or transmitters, into draws and those of each draw."""
         along = "link" if "link" in found.dims else "tx"
         if found.sizes[along]:

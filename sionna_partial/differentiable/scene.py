@@ -19,6 +19,8 @@ What gradients include, and what they do not:
 - There are first derivatives alone: TensorFlow refuses those of derivatives.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -164,7 +166,7 @@ class DifferentiableScene:
         names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in names for weight in self.networks[name].trainable_variables]
 
-    def links(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> "DifferentiableLinks":
+    def links(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> DifferentiableLinks:
         """Trace the links from a transmitter to N receivers.
 
         Parameters
@@ -276,7 +278,7 @@ class DifferentiableLinks:
         return tensor
 
     @cached_property
-    def _legs(self) -> "_Legs":
+    def _legs(self) -> _Legs:
         return _Legs(self._scene.partial, self._paths)
 
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:

@@ -1,5 +1,7 @@
 """Robot simulator: a complete home -> what a robot has seen of it after so many steps."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Sequence
@@ -86,7 +88,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
         seen = (self.states == _FREE).sum(axis=(1, 2))
         return np.minimum(1.0, seen / (self.home.state == _FREE).sum())
 
-    def at(self, steps: Sequence[int]) -> "Exploration":
+    def at(self, steps: Sequence[int]) -> Exploration:
         """Return the exploration with only some of its `steps`.
 
         Raises

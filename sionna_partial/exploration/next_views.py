@@ -1,5 +1,7 @@
 """Where a robot should drive next for a better coverage map: partial map -> ranked poses."""
 
+from __future__ import annotations
+
 import math
 import os
 from collections.abc import Sequence

@@ -106,7 +106,7 @@ def _plain_storage(files: Iterable[Path]) -> Iterator[None]:
     """Raise a ValueError for storage whose reader would not end: views in SQLite, huge chunks and arrays in MCAP."""
     for file in files:
         if file.suffix == ".db3":
-            with closing(sqlite3.connect(f"file:{file.absolute()}?immutable=1", uri=True)) as database:
+            with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as database:
                 if database.execute("SELECT 1 FROM sqlite_master WHERE type = 'view'").fetchone():
                     raise ValueError("it has views in place of tables")
         if file.suffix == ".mcap":

@@ -1,5 +1,7 @@
 """Maps in and out: files, NumPy arrays, and the maps of simulators and SLAM."""
 
+from __future__ import annotations
+
 import io
 import json
 import os

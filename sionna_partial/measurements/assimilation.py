@@ -1,5 +1,7 @@
 """Predictions that measurements correct: a Gaussian process on the residuals, correlated over the length of walks."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -175,7 +177,7 @@ class _Sample(NamedTuple):
     group: NDArray[np.intp]
 
     @classmethod
-    def of(cls, measured: Measurements) -> "_Sample":
+    def of(cls, measured: Measurements) -> _Sample:
         received = measured.gain_db > measured.sensitivity_db
         first, group, size = grouped(measured.rx, received, MOST_POINTS)
         return cls(measured, measured.rx[first], received[first], size, group)
@@ -277,7 +279,7 @@ class Assimilation(Shown):
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
         p_powers: float | None = None,
         through_walls: bool = False,
-    ) -> "Assimilation":
+    ) -> Assimilation:
         """Fit the process to measurements.
 
         Parameters

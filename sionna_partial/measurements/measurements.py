@@ -1,5 +1,7 @@
 """Measured path gains at known positions: mappings, data frames and CSV files -> Measurements."""
 
+from __future__ import annotations
+
 import logging
 import math
 import os
@@ -121,7 +123,7 @@ class Measurements(Shown):
         """Return the number of links N."""
         return len(self.gain_db)
 
-    def take(self, index: NDArray[np.generic]) -> "Measurements":
+    def take(self, index: NDArray[np.generic]) -> Measurements:
         """Return the links that an index array or a mask (N,) selects."""
         std_db = None if self.std_db is None else self.std_db[index]
         return Measurements(self.tx[index], self.rx[index], self.gain_db[index], std_db, self.sensitivity_db)

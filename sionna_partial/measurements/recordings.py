@@ -1,5 +1,7 @@
 """Rosbags: where the robot was, and received powers as measurements."""
 
+from __future__ import annotations
+
 import math
 import os
 import warnings
@@ -39,7 +41,7 @@ class _Track(NamedTuple):
     position_m: NDArray[np.float64]
     rotation: Rotation
 
-    def at(self, time_s: NDArray[np.float64]) -> "_Track":
+    def at(self, time_s: NDArray[np.float64]) -> _Track:
         """Interpolate; beyond the ends the first and the last pose stay."""
         position_m = np.column_stack([np.interp(time_s, self.time_s, axis) for axis in self.position_m.T])
         if len(self.time_s) == 1:
@@ -48,7 +50,7 @@ class _Track(NamedTuple):
         return _Track(self.parent, time_s, position_m, Slerp(self.time_s, self.rotation)(inside_s))
 
 
-def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, frame: str | None = None) -> "xr.Dataset":
+def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, frame: str | None = None) -> xr.Dataset:
     """Read where the robot was from a rosbag.
 
     Parameters
@@ -95,7 +97,7 @@ def measurements_from_bag(
     pose_topic: str | None = None,
     frame: str | None = None,
     rx_height_m: float = DEFAULT_HEIGHT_M,
-) -> "xr.Dataset":
+) -> xr.Dataset:
     """Read received powers from a rosbag as the table of measurements that `calibrate_materials` takes.
 
     Receivers are where the robot was at the stamps of the powers, interpolated between its poses. Where powers have
@@ -168,7 +170,7 @@ def measurements_from_bag(
     return xr.Dataset({name: ("link", values) for name, values in columns.items()})
 
 
-def _pose_table(track: _Track) -> "xr.Dataset":
+def _pose_table(track: _Track) -> xr.Dataset:
     import xarray as xr
 
     x, y, z, w = track.rotation.as_quat().T

@@ -1,5 +1,7 @@
 """Where to put several transmitters: candidates drawn together, chosen greedily, then swapped."""
 
+from __future__ import annotations
+
 import itertools
 import json
 import math

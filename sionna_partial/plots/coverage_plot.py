@@ -206,8 +206,13 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 
 
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
-    """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque."""
+    """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque.
+
+    Of a partial map it says that gains are those of receivers indoors, unless they are of receivers anywhere.
+    """
     attributes = next(iter(maps.values())).attrs
+    if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
+        what = f"{what} if indoors"
     walls = f", {attributes['walls']}" if "walls" in attributes else ""
     return f"{what}: {transmitter_text(maps)}, {attributes['frequency_hz'] / 1e9:g} GHz{walls}"
 
@@ -240,7 +245,7 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
         colours = ScalarMappable(layer.norm, layer.cmap)
         side, pad = ("bottom", pad_below) if pad_below else ("right", 0.05)
         bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=_beyond(layer))
-        bar.set_label(layer.label)
+        bar.set_label(layer.label.replace("; ", ";\n"))
     elif layer.norm is None:
         _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
 
@@ -518,7 +523,8 @@ def _draw_network(
     axis.imshow(shown, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)
     axis.imshow(shade(wall_cells(network)), extent=extent, origin="lower", zorder=3)
     unseen = ~network["observed"].to_numpy().astype(bool)
-    axis.contour(network["x"], network["y"], unseen, levels=[0.5], colors="0.7", linewidths=0.8)
+    if min(unseen.shape) > 1:
+        axis.contour(network["x"], network["y"], unseen, levels=[0.5], colors="0.7", linewidths=0.8)
     x, y, _ = (network[name].to_numpy() for name in TX_COORDINATES)
     axis.plot(x, y, zorder=4, **_STAR)
     axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")

@@ -1,5 +1,7 @@
 """Pictures of an exploration: what the robot has seen, its trajectory and field of view, and where to drive next."""
 
+from __future__ import annotations
+
 import io
 import math
 import os

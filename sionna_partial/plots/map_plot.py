@@ -1,5 +1,7 @@
 """Figure of a map, with the positions of radios."""
 
+from __future__ import annotations
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D

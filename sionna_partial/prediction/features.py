@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
-from sionna_partial.checks import require_bool, require_type
+from sionna_partial.checks import number_of, require_bool, require_type, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
@@ -366,6 +366,9 @@ class LinkFeatures(Shown):
         require_each(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
         remedy = f"clip gains at {GAIN_FLOOR_DB:g} dB, the gain of an outage."
         require_each(self.gain_db >= GAIN_FLOOR_DB, "gain_db", self.gain_db, remedy)
+        if self.frequency_hz is not None and not 1e6 <= number_of(self.frequency_hz) <= 1e12:
+            what = f"frequency_hz = {shown(self.frequency_hz)} is not allowed"
+            raise PredictorError(f"{what}: give a frequency in Hz, or None for that of the predictor.")
         if self.context is not None and len(self.context) != count:
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
 

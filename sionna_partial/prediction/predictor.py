@@ -1,5 +1,7 @@
 """Predictor: LinkFeatures -> LinkPrediction, by the paper's networks or by those that read maps and paths."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
@@ -166,7 +168,7 @@ class LinkPrediction(Shown):
         )
 
     @classmethod
-    def of_trace(cls, phi: LinkFeatures) -> "LinkPrediction":
+    def of_trace(cls, phi: LinkFeatures) -> LinkPrediction:
         """Return the trace itself as the prediction, as on a complete map (paper, eq. 9): no uncertainty is left.
 
         The components of link states that a link is not in have its traced gain, too.
@@ -175,7 +177,7 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
     @classmethod
-    def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> "LinkPrediction":
+    def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
         """Return the trace on a nearly complete map, with its uncertainty (`TraceErrors`), of links with a context.
 
         Known walls exclude LOS as everywhere. The regions that they separate do not make outages certain.
@@ -215,17 +217,17 @@ class LinkPrediction(Shown):
             probability = probability + p_state * np.where(spread, normal, above_db > 0.0)
         return probability
 
-    def take(self, index: NDArray[np.generic] | slice) -> "LinkPrediction":
+    def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
 
     @classmethod
-    def concatenate(cls, parts: Sequence["LinkPrediction"]) -> "LinkPrediction":
+    def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
         """Return the links of all `parts`, one part after the other."""
         return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
 
     @classmethod
-    def mixture(cls, parts: Sequence["LinkPrediction"], weights: Floats) -> "LinkPrediction":
+    def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
         """Return the mixture of K distributions of the same links, given weights (K,) or (K, N), which sum to 1."""
         if len(parts) == 1:
             return parts[0]
@@ -239,16 +241,16 @@ class LinkPrediction(Shown):
         variance = (fractions * (stds_db**2 + (means_db - mean_db) ** 2)).sum(axis=0)
         return cls.of_parts(probabilities / probabilities.sum(axis=0), mean_db, np.sqrt(variance))
 
-    def reshaped(self, shape: tuple[int, ...]) -> "LinkPrediction":
+    def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
         """Return the same links in another shape, as (T, N)."""
         return LinkPrediction(*(getattr(self, column.name).reshape(shape) for column in fields(self)))
 
-    def where(self, taken: Bools, other: "LinkPrediction") -> "LinkPrediction":
+    def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
         columns = (column.name for column in fields(self))
         return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
 
-    def anywhere(self, p_indoor: ArrayLike) -> "LinkPrediction":
+    def anywhere(self, p_indoor: ArrayLike) -> LinkPrediction:
         """Return the distribution for receivers that may be outdoors, where every link is in outage.
 
         By total probability (paper, "Indoor-Outdoor Estimation"), the probabilities of LOS and NLOS are those of a
@@ -317,7 +319,7 @@ class Predictor(Shown):
     array([1., 0.])
     """
 
-    model: "keras.Model" = field(repr=False)
+    model: keras.Model = field(repr=False)
     archive: bytes = field(repr=False)
     settings: PredictorSettings
     homes: tuple[str, ...] = ()
@@ -346,7 +348,7 @@ class Predictor(Shown):
         homes: Sequence[str] = (),
         settings: PredictorSettings | None = None,
         progress: Progress | bool | None = None,
-    ) -> "Predictor":
+    ) -> Predictor:
         """Train on links of known truth; the same links and settings give the same weights.
 
         Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, and by the
@@ -403,7 +405,7 @@ class Predictor(Shown):
         versions = {"keras": keras.__version__, "backend": keras.backend.backend(), "numpy": np.__version__}
         return cls(model, pack(model), settings, tuple(map(str, homes)), links, versions=versions)
 
-    def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> "Predictor":
+    def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> Predictor:
         """Return this predictor with P(indoor) trained (paper, "Indoor-Outdoor Estimation").
 
         A receiver that the map shows in a free cell is indoors for certain. `predict_map` and `evaluate` take P(indoor)
@@ -501,7 +503,7 @@ class Predictor(Shown):
         write_files(Path(path), self.archive, card)
 
     @classmethod
-    def load(cls, name_or_path: "Predictor | str | PathLike[str] | None" = None) -> "Predictor":
+    def load(cls, name_or_path: Predictor | str | PathLike[str] | None = None) -> Predictor:
         """Load a predictor; nothing in its files is executed.
 
         Parameters

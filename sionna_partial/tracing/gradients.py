@@ -1,5 +1,7 @@
 """Derivatives of the path gain of links, with respect to transmitter, materials and frequency."""
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from pathlib import Path

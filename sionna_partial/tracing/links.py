@@ -1,5 +1,7 @@
 """Traced links: the paths of every link in arrays, and as tables."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
@@ -102,7 +104,7 @@ class TracedLinks(Shown):
         synthetic_array: bool = True,
         normalize_delays: bool = True,
         memory_gb: float = MEMORY_GB,
-    ) -> "xr.Dataset":
+    ) -> xr.Dataset:
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
         Nothing is traced again. Paths that matter little between vertically polarised, isotropic antennas are left out
@@ -151,7 +153,7 @@ class TracedLinks(Shown):
         options = {key: value for key, value in locals().items() if key != "self"}
         return later("channels.responses:cir")(self, **options)
 
-    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> "xr.Dataset":
+    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> xr.Dataset:
         """Return the channel frequency response of each link, as `sionna.rt.Paths.cfr` does.
 
         Parameters
@@ -181,7 +183,7 @@ class TracedLinks(Shown):
         """
         return later("channels.responses:cfr")(self, frequencies_hz, **options)
 
-    def taps(self, bandwidth_hz: float, l_min: int = -6, l_max: int | None = None, **options: Any) -> "xr.Dataset":
+    def taps(self, bandwidth_hz: float, l_min: int = -6, l_max: int | None = None, **options: Any) -> xr.Dataset:
         """Return the taps of a channel that is filtered to a bandwidth, as `sionna.rt.Paths.taps` does.
 
         Parameters
@@ -222,7 +224,7 @@ class TracedLinks(Shown):
         tx_orientation_rad: ArrayLike | None = None,
         rx_orientation_rad: ArrayLike | None = None,
         memory_gb: float = MEMORY_GB,
-    ) -> "xr.Dataset":
+    ) -> xr.Dataset:
         """Return the gain of every pair of beams of each link.
 
         The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, whose coefficients A are those of `cir`
@@ -262,7 +264,7 @@ class TracedLinks(Shown):
         options = {key: value for key, value in locals().items() if key != "self"}
         return later("channels.beams:beam_gains")(self, **options)
 
-    def to_xarray(self) -> "xr.Dataset":
+    def to_xarray(self) -> xr.Dataset:
         """Return the links and their paths as a labelled Dataset.
 
         Its dimensions are "rx", "tx" where there are several transmitters, "path" and "interaction". Variables have
@@ -307,7 +309,7 @@ class TracedLinks(Shown):
             table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
         return table
 
-    def spreads(self) -> "xr.Dataset":
+    def spreads(self) -> xr.Dataset:
         """Return delay and angular spreads, K-factor and path loss of each link.
 
         Paths are weighted by ``|a|^2``, their power between isotropic, vertically polarised antennas.

@@ -1,5 +1,7 @@
 """Simulation: the paths from transmitters to receivers in a map, found by Sionna RT."""
 
+from __future__ import annotations
+
 import itertools
 import logging
 import math
@@ -335,7 +337,7 @@ class Simulated(Protocol):
 
 
 def simulation_of(
-    scene: "PartialMap | str | Path | Simulation | Simulated",
+    scene: PartialMap | str | Path | Simulation | Simulated,
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
 ) -> Simulation:
@@ -349,7 +351,7 @@ def simulation_of(
 
 
 def trace_links(
-    scene: "PartialMap | str | Path | Simulation | Simulated",
+    scene: PartialMap | str | Path | Simulation | Simulated,
     tx: ArrayLike,
     rx: ArrayLike,
     *,

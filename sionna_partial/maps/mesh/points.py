@@ -1,5 +1,7 @@
 """Point clouds (PCD, PLY, LAS, LAZ, XYZ, arrays) -> PartialMap, read in parts and kept as occupied voxels."""
 
+from __future__ import annotations
+
 import io
 import itertools
 import math
