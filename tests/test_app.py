@@ -357,7 +357,7 @@ def pixel(tab: Tab, x_m: float, y_m: float) -> tuple[float, float]:
 def press(tab: Tab, label: str) -> None:
     """Press a button as soon as it is there."""
     button = f"walk(document.body).find(n => n.tagName == 'BUTTON' && n.textContent.trim() == {label!r})"
-    there = f"(async () => {{ {_WALK}; while (!{button}?.offsetWidth) await new Promise(requestAnimationFrame)"
+    there = f"(async () => {{ {_WALK}; while (!{button}?.offsetWidth) await new Promise(done => setTimeout(done, 10))"
     tab.run(f"{there}; {button}.click() }})()")
 
 
@@ -383,6 +383,7 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         other = open_tab(url, 390, 844)
         other.wait(f"{_MODEL}('message').text.includes('Click on the map')")
         assert other.run("document.documentElement.scrollWidth <= 390")
+        tab.send("Page.bringToFront")
         press(tab, "Place it for me")
         press(tab, "Cancel")
         tab.wait(f"{_MODEL}('message').text.includes('Cancelled')")
