@@ -36,7 +36,7 @@ _FEWEST_DRAWS, _LINKS_AT_ONCE = 64, 1000
 
 @dataclass(frozen=True, eq=False)
 class JointLatents:
-    """Standard normal latents of links on a map, alike for links through the same unknown cells."""
+    """Standard normal latents of links on a map, correlated for links through the same unknown cells."""
 
     partial: PartialMap
 

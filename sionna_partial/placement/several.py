@@ -113,7 +113,7 @@ def place_transmitters(
     """Find positions for several transmitters that together cover a partly known building best.
 
     Candidates are positions all over the free cells that see different receivers. Their links are drawn together
-    (`JointLatents`), so that two transmitters behind one unseen wall do not count as two chances. The transmitters are
+    (`JointLatents`), so that two transmitters behind one unseen wall are correlated. The transmitters are
     chosen one after the other, each where it adds most, and then swapped for other candidates while that helps.
 
     Parameters
@@ -123,7 +123,7 @@ def place_transmitters(
     count : int
         Number of transmitters K, up to 16.
     rx : (N, 3) array-like, optional
-        Receivers that count [m], all alike. By default those of `place_transmitter`.
+        Receivers that count [m], with equal weights. By default those of `place_transmitter`.
     threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
         As for `place_transmitter`.
 

@@ -151,7 +151,7 @@ def leave_cells(
 
 @njit(cache=True, nogil=True)
 def _fill_fractions(state: States, alike: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats) -> None:
-    """Add the fractions of segments in cells of each state to `fractions` (N, 3), over alike cells at once."""
+    """Add the fractions of segments in cells of each state to `fractions` (N, 3), over cells of one state at once."""
     ny, nx = state.shape
     for i in range(len(ends)):
         segment = segment_between(starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])

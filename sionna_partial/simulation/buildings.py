@@ -160,9 +160,9 @@ def _hall_and_offices(rng: Rng, outline: Polygon, room_m2: float) -> tuple[list[
     return parts_of(outline.difference(strip)), offices
 
 
-def _columns(rng: Rng, rooms: list[Polygon], chance: float) -> list[Polygon]:
+def _columns(rng: Rng, rooms: list[Polygon], probability: float) -> list[Polygon]:
     """Columns on a grid in the large rooms, for some buildings."""
-    if rng.random() >= chance:
+    if rng.random() >= probability:
         return []
     large = union_of([room.buffer(-1.0) for room in rooms if room.area > _COLUMNED_ROOM_M2])
     half_m, apart_m, start_m = rng.uniform(0.12, 0.4), rng.uniform(4.0, 12.0, 2), rng.uniform(0.0, 12.0, 2)

@@ -227,7 +227,7 @@ def _images(parent, plane, planes, tx, margin):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _depth_first(parent):  # type: ignore[no-untyped-def]
-    """Order of the sequences in which those that begin alike are together."""
+    """Order of the sequences in which those with the same first planes are together."""
     child, beside = np.full(len(parent) + 1, -1, np.int32), np.empty(len(parent), np.int32)
     for node in range(len(parent) - 1, -1, -1):
         beside[node], child[parent[node] + 1] = child[parent[node] + 1], node
