@@ -63,7 +63,8 @@ class SmoothLengths:
 def _even_patches(mask: Bools) -> NDArray[np.int32]:
     """Return how far the next uneven patch is in every direction, corners included; 0 in uneven patches.
 
-    A patch is what four cell centres enclose, and even if their cells are of one state: the interpolation is constant there.
+    A patch is what four cell centres enclose, and even if their cells are of one state: there the interpolation is
+    constant.
     """
     around = mask[:-1, :-1].astype(np.int8) + mask[:-1, 1:] + mask[1:, :-1] + mask[1:, 1:]
     even = around % 4 == 0

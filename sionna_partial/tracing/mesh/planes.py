@@ -25,7 +25,7 @@ _FACE_TOLERANCE_M = 1e-3
 class FaceBins(NamedTuple):
     """F faces of P planes, sorted into B square bins of each plane.
 
-    `axes` (P, 2) are the two coordinates in which the faces of a plane are distinguished, in which `low_m` (P, 2) is the
+    `axes` (P, 2) are the two coordinates that distinguish the faces of a plane, in which `low_m` (P, 2) is the
     corner of its bins and `edge_m` (P,) their size; `columns` (P,) is their number in a row, and `first_bin` (P + 1,)
     the first bin. `start` (B + 1,) and `face` are the faces that reach into each bin, one bin after the other, and
     `corner_m` (F, 3, 2) the corners of the faces in the coordinates of their planes.
