@@ -234,6 +234,12 @@ class TestFiles:
         window.settle()
         assert window.session.measured is None
 
+    def test_measurements_of_another_transmitter(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.session.learn(b"tx_x,tx_y,x,y,rssi\n3,1,1.5,2.0,-60\n")
+        assert "move one to (3, 1, 1.5)" in window.settle()
+        assert window.session.measured is None
+
     def test_spoilt_measurements(self, window: Window) -> None:
         window.session.put([("", 1.0, 1.0)])
         window.session.learn(b"\xff\x00")

@@ -342,10 +342,10 @@ class Page:
         self._is_showing = True
         try:
             self._show_status()
-            self._once("map", (id(self.session.partial),), self._show_map)
+            self._once("map", (self.session.partial, self.session.title, self.session.steps), self._show_map)
             self._show_transmitters()
             self._show_answer()
-            self._once("views", (id(self.session.views),), self._show_views)
+            self._once("views", (self.session.views,), self._show_views)
         finally:
             self._is_showing = False
 
@@ -422,16 +422,16 @@ class Page:
 
     def _show_answer(self) -> None:
         answer, name, threshold_dbm = self.session.answer, self.which.value, self.session.settings.threshold_dbm
-        self._once("answer", (id(answer), name, threshold_dbm, self.truth.value), self._show_values)
+        self._once("answer", (answer, name, threshold_dbm, self.truth.value), self._show_values)
         for layer, parts in self._parts.items():
             for part in parts:
                 part.visible = layer == self.layer.value and answer is not None
-        self.plot.title.text = (
-            ""
-            if answer is None
-            else _LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
-            + ("" if answer.is_final else " (coarse)")
-        )
+        title = _LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
+        if answer is not None and not answer.is_final:
+            title += " (coarse)"
+        elif answer is not None and self.truth.value:
+            title += ", the whole home" if answer.truth is not None else ", the partial map"
+        self.plot.title.text = "" if answer is None else title
 
     def _show_values(self) -> None:
         answer, session = self.session.answer, self.session

@@ -374,11 +374,12 @@ class Session:
         self.transmitters, self.views = transmitters, None
         if self.chosen not in transmitters:
             self.chosen = next(iter(transmitters), "")
-        places_m = np.array([each.position_m for each in transmitters.values()]).reshape(-1, 3)
-        if self.measured is not None:
-            apart_m = np.linalg.norm(self.measured.tx[:, None] - places_m, axis=2)
-            self.measured = self.measured if (apart_m <= SAME_TX_M).any() else None
+        self.measured = self.measured if self.measured is not None and self._is_of_ours(self.measured) else None
         self.predict()
+
+    def _is_of_ours(self, measured: Measurements) -> bool:
+        places_m = np.array([each.position_m for each in self.transmitters.values()]).reshape(-1, 3)
+        return bool((np.linalg.norm(measured.tx[:, None] - places_m, axis=2) <= SAME_TX_M).any())
 
     def _new_name(self, taken: Sequence[str]) -> str:
         return next(name for name in map("tx{}".format, itertools.count(1)) if name not in taken)
@@ -468,6 +469,12 @@ class Session:
         tx_m = dict(self._tx_m())[self.chosen]
 
         def take(measured: Measurements) -> None:
+            if not self._is_of_ours(measured):
+                place = ", ".join(f"{each:g}" for each in measured.tx[0])
+                remedy = f"move one to ({place}), where that of the first one is."
+                self.cancel()
+                self.refuse(f"no transmitter is within {SAME_TX_M:g} m of those of the measurements: {remedy}")
+                return
             self.measured = measured
             self.predict()
 
