@@ -2,7 +2,6 @@
 
 from sionna_partial.calibration.calibration import MaterialCalibration as MaterialCalibration
 from sionna_partial.calibration.calibration import calibrate_materials as calibrate_materials
-from sionna_partial.channels.beams import dft_codebook as dft_codebook
 from sionna_partial.channels.files import load_channels as load_channels
 from sionna_partial.channels.files import save_channels as save_channels
 from sionna_partial.channels.samples import ChannelSamples as ChannelSamples
@@ -69,6 +68,10 @@ from sionna_partial.settings import SceneSettings as SceneSettings
 from sionna_partial.settings import SensorSettings as SensorSettings
 from sionna_partial.settings import TraceSettings as TraceSettings
 from sionna_partial.simulation.homes import make_home as make_home
+from sionna_partial.tracing.antennas import Antenna as Antenna
+from sionna_partial.tracing.antennas import AntennaPattern as AntennaPattern
+from sionna_partial.tracing.antennas import dft_codebook as dft_codebook
+from sionna_partial.tracing.antennas import load_antenna as load_antenna
 from sionna_partial.tracing.gradients import GainGradients as GainGradients
 from sionna_partial.tracing.gradients import gain_gradients as gain_gradients
 from sionna_partial.tracing.links import TracedLinks as TracedLinks

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB
-from sionna_partial.link_model import RECEIVERS, LinkModel, link_model_of
+from sionna_partial.link_model import RECEIVERS, LinkModel, TxAntenna, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -22,6 +22,7 @@ def predict_map(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike | Mapping[str, ArrayLike] | None = None,
     *,
+    tx_antenna: TxAntenna = None,
     rx_height_m: float = DEFAULT_HEIGHT_M,
     spacing_m: float = 0.15,
     predictor: Predictor | str | Path | None = None,
@@ -56,6 +57,10 @@ def predict_map(
         Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx0",
         "tx1" and so on, or as in the mapping. None if it is not known: then `measurements` are of one transmitter,
         1.5 m high unless they have its z.
+    tx_antenna : Antenna, AntennaPattern or str, a sequence of these or mapping of names to them, optional
+        Antenna of the transmitter, or of each of several; isotropic and vertically polarised by default. Gains are then
+        those of the antenna and the path together. Link states are those of the paths, whatever the antenna: a link
+        in a null of the pattern has a low gain, and is no outage.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
@@ -114,6 +119,7 @@ def predict_map(
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
     return model.coverage(
         tx,
+        tx_antenna=tx_antenna,
         rx_height_m=rx_height_m,
         spacing_m=spacing_m,
         measurements=measurements,

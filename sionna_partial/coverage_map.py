@@ -22,6 +22,7 @@ from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor
+from sionna_partial.tracing.antennas import MAX_GAIN_DBI
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
 WALL_PARTS = 6
@@ -36,6 +37,9 @@ MAX_RECEIVERS = 2_000_000
 TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
 """Positions [m] along the dimension "tx" of the maps of several transmitters."""
 
+ANTENNA = "tx_antenna"
+"""Attribute of the map of one transmitter, coordinate along "tx" of several: its antenna."""
+
 _OF_ALL = ("observed", "cell_state", "wall_parts")
 """Variables that do not depend on the transmitter."""
 
@@ -44,7 +48,7 @@ _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a rece
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
 """Attributes that are needed beside the position of the transmitter, and what they are above."""
 
-_RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0), "std": (0.0, 1e3), "m": (0.0, 1e15)}
+_RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
 """Values of probabilities, gains, standard deviations and lengths; reflections may take near links past 0 dB."""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
@@ -229,11 +233,14 @@ def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.
 def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
     """Join the maps of several transmitters along a dimension "tx"."""
     positions_m = np.array([each.attrs.pop("transmitter_m") for each in maps])
-    coordinates = {
+    antennas = "tx", [each.attrs.pop(ANTENNA) for each in maps]
+    coordinates: dict[str, Any] = {
         name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
     }
     joined = xr.concat([each.drop_vars(_OF_ALL) for each in maps], "tx", combine_attrs="drop_conflicts")
-    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords({"tx": names, **coordinates})
+    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords(
+        {"tx": names, ANTENNA: antennas, **coordinates}
+    )
 
 
 def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
@@ -247,6 +254,8 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
         raise SettingsError(f"coverage has the transmitters {names}: choose one, as by coverage.isel(tx=0).")
     if {"tx", *TX_COORDINATES} <= coverage.coords.keys():
         position_m = np.array([float(coverage[name]) for name in TX_COORDINATES])
+        if ANTENNA in coverage.coords:
+            coverage = coverage.assign_attrs({ANTENNA: str(coverage[ANTENNA].to_numpy())}).drop_vars(ANTENNA)
         coverage = coverage.drop_vars(("tx", *TX_COORDINATES)).assign_attrs(transmitter_m=position_m)
     missing = [name for name in ATTRIBUTES if name not in coverage or coverage[name].dims != ("y", "x")]
     missing += [name for name in ("x", "y") if name not in coverage.coords]
@@ -539,9 +548,12 @@ def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
         return f"{len(maps)} transmitters"
     (coverage,) = maps.values()
     position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
+    antenna = str(coverage.attrs.get(ANTENNA, "iso"))
     if "p_transmitter" in coverage:
-        return f"transmitter near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"
-    return f"transmitter at ({position}) m"
+        position = f"near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"
+    else:
+        position = f"at ({position}) m"
+    return f"transmitter {position}" + (f", {antenna}" if antenna != "iso" else "")
 
 
 def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:

@@ -13,7 +13,7 @@ from rasterio import Affine
 from rasterio.io import MemoryFile
 
 from sionna_partial.constants import NO_RECEIVER
-from sionna_partial.coverage_map import ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
+from sionna_partial.coverage_map import ANTENNA, ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5, write_netcdf
 from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
@@ -222,7 +222,7 @@ def _bands(coverage: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray
 
 def _encode_csv(coverage: xr.Dataset) -> bytes:
     dimensions = [name for name in ("tx", "y", "x") if name in coverage.dims]
-    variables = coverage[list(TABLE_VARIABLES)].drop_vars(TX_COORDINATES, errors="ignore")
+    variables = coverage[list(TABLE_VARIABLES)].drop_vars((ANTENNA, *TX_COORDINATES), errors="ignore")
     table = variables.to_dataframe(dim_order=dimensions).reset_index()
     for name in LINK_STATES:
         table[name] = table[name].astype("UInt8").where(table["valid"])

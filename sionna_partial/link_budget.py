@@ -20,7 +20,8 @@ RATES = ("wifi6", "wifi7", "nr")
 _BITS = (0.5, 1, 1.5, 2, 3, 4, 4.5, 5, 6, 20 / 3, 7.5, 25 / 3, 9, 10)
 _SENSITIVITY_DBM = (-82, -79, -77, -74, -70, -66, -65, -64, -59, -57, -54, -52, -49, -46)
 """Coded bits of a subcarrier, and minimum receiver sensitivity at 20 MHz, of MCS 0 to 11 (IEEE 802.11ax-2021, clause
-27.3.20.2) and 12 and 13 (IEEE 802.11be-2024, clause 36.3.21.2)."""
+27.3.20.2) and 12 and 13 (IEEE 802.11be-2024, clause 36.3.21.2). The first twelve were compared with published copies of
+the standard's table, the last two were not: they go on in steps of 3 dB."""
 
 _SENSITIVITY_HZ, _NOISE_FIGURE_DB, _SYMBOL_S = 20e6, 10.0, 13.6e-6
 """Bandwidth and noise figure of these sensitivities, with 5 dB of implementation loss; symbol with guard interval."""
@@ -31,13 +32,14 @@ _SUBCARRIERS = {20e6: 234, 40e6: 468, 80e6: 980, 160e6: 1960, 320e6: 3920}
 _NR_QPSK = (120, 157, 193, 251, 308, 379, 449, 526, 602, 679)
 _NR_16QAM = (340, 378, 434, 490, 553, 616, 658)
 _NR_64QAM = (466, 517, 567, 616, 666, 719, 772, 822, 873, 910, 948)
-"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1); MCS 17, which is no faster than 16, is left out."""
+"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1, compared with published copies); MCS 17, which is no faster
+than 16, is left out."""
 
 _NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
 """Overhead of the downlink (3GPP TS 38.306, clause 4.1.2)."""
 
 _NR_SHANNON = 0.6
-"""Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A)."""
+"""Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A, which is of LTE up to 4.4 bit/s/Hz)."""
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import xarray as xr
@@ -27,6 +27,7 @@ from sionna_partial.checks import (
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.coverage_map import (
+    ANTENNA,
     Receivers,
     coverage_map,
     grid_receivers,
@@ -41,11 +42,14 @@ from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import Measurements, measurements_of_each
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
+from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.prediction.wall_losses import WALL_LOSSES, predict_through_walls, wall_loss_db
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.antennas import Antenna, AntennaPattern
+from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.simulation import Simulation, checked_positions, clear_of_walls, nearest_m, simulation_of
 
 RECEIVERS = ("indoor", "anywhere")
@@ -75,6 +79,10 @@ _LOCATING = 0.3
 
 _LEAST_DEPTH = 2
 """Interactions from which on a trace is like those of the training."""
+
+OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
+TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
+"""Antennas of transmitters: one of all, or one for each."""
 
 _log = logging.getLogger(__name__)
 
@@ -138,7 +146,7 @@ class LinkModel:
         if isinstance(scene, Simulation):
             self._settings = scene.trace_settings, scene.scene_settings
         self.asked = predictor
-        self._latest: dict[tuple[bytes, bytes], PredictedLinks] = {}
+        self._latest: dict[tuple[bytes, bytes, Antenna], PredictedLinks] = {}
         if predictor is not None:
             warm_predictor(predictor)
 
@@ -174,7 +182,14 @@ class LinkModel:
         """
         if partial != self.partial:
             self.simulation = Simulation(partial, *self._settings)
+            self.__dict__.pop("_every_path", None)
             self._latest.clear()
+
+    @cached_property
+    def _every_path(self) -> Simulation:
+        """The simulation without a tolerance: paths that are weak without an antenna may be strong with it."""
+        settings = replace(self.simulation.trace_settings, power_tolerance_db=0.0)
+        return Simulation(self.partial, settings, self.simulation.scene_settings)
 
     def predict(self, tx: ArrayLike, rx: ArrayLike) -> LinkPrediction:
         """Trace and predict links.
@@ -214,12 +229,16 @@ class LinkModel:
 
         And which of them are complete. Positions have been checked.
         """
+        return self._predict_paths(ends_m, [self.simulation.blocks(*each_m, report) for each_m in ends_m])
+
+    def _predict_paths(
+        self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]
+    ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         complete = np.concatenate([self._complete(*each_m) for each_m in ends_m])
+        frequency_hz = self.simulation.trace_settings.frequency_hz
         settings, found = None if complete.all() else self.predictor.settings, []
         context = not complete.all() and (settings is None or settings.networks != "paper")
-        for tx_m, rx_m in ends_m:
-            paths = self.simulation.blocks(tx_m, rx_m, report)
-            frequency_hz = self.simulation.trace_settings.frequency_hz
+        for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
             found.append(features_of_paths(self.partial, tx_m, rx_m, paths, frequency_hz, context=context))
         phi = LinkFeatures.concatenate(found)
         return phi, self.predict_features(phi, complete), complete
@@ -234,17 +253,26 @@ class LinkModel:
             return predict_through_walls(phi, wall_loss_db(material, settings.frequency_hz)).where(complete, trace)
         return self.predictor.predict(phi).where(complete, trace)
 
-    def links(self, tx_m: Floats, rx_m: Floats, report: Progress = no_progress) -> PredictedLinks:
+    def links(
+        self, tx_m: Floats, rx_m: Floats, report: Progress = no_progress, antenna: Antenna | None = None
+    ) -> PredictedLinks:
         """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept."""
-        key = tx_m.tobytes(), rx_m.tobytes()
+        antenna = Antenna.of(antenna)
+        key = tx_m.tobytes(), rx_m.tobytes(), antenna
         if key not in self._latest:
-            self._latest[key] = self._new_links(tx_m, rx_m, report)
+            self._latest[key] = self._new_links(tx_m, rx_m, report, antenna)
             for oldest in [*self._latest][:-KEPT_BLOCKS]:
                 del self._latest[oldest]
         return self._latest[key]
 
-    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress) -> PredictedLinks:
-        phi, prediction, complete = self.predict_each([(tx_m, rx_m)], report)
+    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna) -> PredictedLinks:
+        if antenna.is_isotropic:
+            phi, prediction, complete = self.predict_each([(tx_m, rx_m)], report)
+        else:
+            sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m)
+            paths = sums.added(self._every_path.blocks(tx_m, rx_m, report, polarisations=2))
+            phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
+            phi, prediction = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         free = self.partial.state_at(rx_m) == CellState.FREE
         return PredictedLinks(phi, prediction, np.where(free, 1.0, p_indoor))
@@ -253,6 +281,7 @@ class LinkModel:
         self,
         tx: ArrayLike | Mapping[str, ArrayLike] | None = None,
         *,
+        tx_antenna: TxAntenna = None,
         rx_height_m: float = DEFAULT_HEIGHT_M,
         spacing_m: float = 0.15,
         measurements: Any = None,
@@ -271,6 +300,7 @@ class LinkModel:
         frequency_hz = self.simulation.trace_settings.frequency_hz
         to_be_found = tx is None and measurements is not None
         names, positions_m = (None, np.empty((0, 3))) if to_be_found else transmitter_positions(self.partial, tx)
+        antennas = antennas_of(tx_antenna, names)
         sources_m = [positions_m] if to_be_found else [each[None] for each in positions_m]
         grids = [grid_receivers(self.partial, tx_m, rx_height_m, spacing_m, frequency_hz) for tx_m in sources_m]
         at_once = _receivers_at_once(self.partial, grids[0], memory_gb)
@@ -280,9 +310,12 @@ class LinkModel:
         with reporting(progress) as report:
             report(0.0, "building the scene")
             for number, (tx_m, grid, measured) in enumerate(zip(sources_m, grids, measured_of_each, strict=True)):
+                antenna = antennas[number]
                 part = part_of(report, number / len(grids), (number + 1) / len(grids))
-                posterior = _located(self, measured, at_once, part) if to_be_found and measured is not None else None
-                source = _transmitter_of(self, posterior or tx_m[0], measured, at_once)
+                posterior = (
+                    _located(self, measured, at_once, antenna, part) if to_be_found and measured is not None else None
+                )
+                source = _transmitter_of(self, posterior or tx_m[0], measured, at_once, antenna)
                 if posterior is not None:
                     positions_m = source.tx_m
                     grid = grid_receivers(self.partial, positions_m, rx_height_m, spacing_m, frequency_hz)
@@ -292,7 +325,7 @@ class LinkModel:
                 ]
                 values = {name: np.concatenate([each[name] for each in blocks]) for name in blocks[0]}
                 complete = all(self._complete(each_m, grids[0].rx_m).all() for each_m in positions_m)
-                where = {"transmitter_m": source.position_m, **attributes}
+                where = {"transmitter_m": source.position_m, ANTENNA: str(antenna), **attributes}
                 of_all = provenance(self.simulation, None if complete else self.predictor) | where
                 of_all |= {"predictor": WALL_LOSSES} if self._by_wall_losses and not complete else {}
                 of_all |= {} if measured is None else _measurement_attributes(measured, source)
@@ -320,6 +353,17 @@ def transmitter_positions(
     names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
     require_names("names of tx", names)
     return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)
+
+
+def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]:
+    """Return the antenna of each transmitter; `names` is None for one."""
+    if names is None or isinstance(tx_antenna, (Antenna, AntennaPattern, str, type(None))):
+        return [Antenna.of(tx_antenna)] * len(names or [""])  # type: ignore[arg-type]
+    remedy = f"give one antenna for all transmitters, or one for each of {', '.join(names)}."
+    by_name = tx_antenna if isinstance(tx_antenna, Mapping) else {}
+    sequence = isinstance(tx_antenna, Sequence) and len(tx_antenna) == len(names)
+    require(sequence or {*by_name} == {*names}, "tx_antenna", tx_antenna, remedy)
+    return [Antenna.of(by_name[name] if by_name else tx_antenna[at]) for at, name in enumerate(names)]  # type: ignore[index]
 
 
 def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
@@ -355,12 +399,16 @@ def _receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: flo
 
 @dataclass(frozen=True)
 class _Transmitter:
-    """Possible positions (T, 3) [m] with weights (T,), the measurements assimilated for each, and the best estimate."""
+    """Possible positions (T, 3) [m] with weights (T,), the measurements assimilated for each, and the best estimate.
+
+    And its antenna.
+    """
 
     tx_m: Floats
     weights: Floats
     assimilations: Sequence[Assimilation]
     position_m: Floats
+    antenna: Antenna
 
 
 def _averaged(
@@ -377,7 +425,7 @@ def _averaged(
                 done = (start + (index + fraction) / len(tx_m) * at_once) / len(rx_m)
                 report(min(0.99, begin + (1.0 - begin) * done), message)
 
-            links = model.links(each_m, block_m, within)
+            links = model.links(each_m, block_m, within, transmitter.antenna)
             if transmitter.assimilations:
                 updated = transmitter.assimilations[index].update(block_m, links.prediction)
                 links = links._replace(prediction=updated)
@@ -387,14 +435,20 @@ def _averaged(
         yield found[nearest]._replace(prediction=mixture, p_indoor=p_indoor)
 
 
-def _prior(model: LinkModel, tx_m: Floats, rx_m: Floats, at_once: int) -> tuple[LinkPrediction, Floats]:
+def _prior(
+    model: LinkModel, tx_m: Floats, rx_m: Floats, at_once: int, antenna: Antenna
+) -> tuple[LinkPrediction, Floats]:
     """Predict the links to any number of receivers (N, 3) [m], and the probability that each is indoors."""
-    blocks = [model.links(tx_m, rx_m[start : start + at_once]) for start in range(0, len(rx_m), at_once)]
+    blocks = [
+        model.links(tx_m, rx_m[start : start + at_once], no_progress, antenna) for start in range(0, len(rx_m), at_once)
+    ]
     p_indoor = np.concatenate([links.p_indoor for links in blocks])
     return LinkPrediction.concatenate([links.prediction for links in blocks]), p_indoor
 
 
-def _located(model: LinkModel, measured: Measurements, at_once: int, report: Progress) -> TransmitterPosterior:
+def _located(
+    model: LinkModel, measured: Measurements, at_once: int, antenna: Antenna, report: Progress
+) -> TransmitterPosterior:
     """Find a transmitter from what was measured of it."""
     measured_at, limit_m = cKDTree(measured.rx), nearest_m(model.simulation.trace_settings.frequency_hz)
 
@@ -402,13 +456,17 @@ def _located(model: LinkModel, measured: Measurements, at_once: int, report: Pro
         return clear_of_walls(model.partial, points_m) & (measured_at.query(points_m)[0] >= limit_m)
 
     def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:
-        return _prior(model, tx_m, rx_m, at_once)
+        return _prior(model, tx_m, rx_m, at_once, antenna)
 
     return locate_transmitter(model.partial, measured, allowed, predict, part_of(report, 0.0, _LOCATING))
 
 
 def _transmitter_of(
-    model: LinkModel, where: Floats | TransmitterPosterior, measured: Measurements | None, at_once: int
+    model: LinkModel,
+    where: Floats | TransmitterPosterior,
+    measured: Measurements | None,
+    at_once: int,
+    antenna: Antenna,
 ) -> _Transmitter:
     """Assimilate the measurements for a position (3,) [m], or for several that are drawn from a posterior."""
     if isinstance(where, TransmitterPosterior):
@@ -424,11 +482,11 @@ def _transmitter_of(
     assimilations = []
     if measured is not None:
         for each_m, each_p in zip(tx_m, p_powers, strict=True):
-            prior, _ = _prior(model, each_m, measured.rx, at_once)
+            prior, _ = _prior(model, each_m, measured.rx, at_once, antenna)
             settings = model.simulation.trace_settings
             of_trace: Any = {"frequency_hz": settings.frequency_hz, "through_walls": settings.through_walls}
             assimilations.append(Assimilation.fit(model.partial, each_m, measured, prior, p_powers=each_p, **of_trace))
-    return _Transmitter(tx_m, weights, assimilations, position_m)
+    return _Transmitter(tx_m, weights, assimilations, position_m, antenna)
 
 
 def _measurement_attributes(measured: Measurements, source: _Transmitter) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from sionna_partial.checks import (
     require_whole,
 )
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
+from sionna_partial.coverage_map import ANTENNA, COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
 from sionna_partial.errors import SettingsError
 from sionna_partial.link_budget import LinkBudget, transmit_powers_dbm
 from sionna_partial.maps.partial_map import PartialMap
@@ -193,5 +193,7 @@ def _labelled(
         layer[..., valid] = values
         layers[name] = (("tx", "y", "x")[3 - layer.ndim :], layer, VARIABLES[name])
     kept = coverage[["cell_state", "observed", "wall_parts"]]
-    kept = kept.assign_coords({name: coverage[name] for name in ("tx", *TX_COORDINATES)})
+    kept = kept.assign_coords(
+        {name: coverage[name] for name in ("tx", *TX_COORDINATES, ANTENNA) if name in coverage.coords}
+    )
     return kept.assign(layers).assign_attrs(title="Predicted network in a partially observed environment", **settings)

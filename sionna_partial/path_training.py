@@ -10,18 +10,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.channels.path_model import (
+from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.exploration.explore import explore
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import traced_unobserved_m
+from sionna_partial.prediction.paper_networks import import_keras
+from sionna_partial.prediction.path_model import (
     STATES,
     LinkGeometry,
     PathModel,
     survival_inputs,
     wrapped,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.exploration.explore import explore
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import traced_unobserved_m
-from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.antennas import directions
 from sionna_partial.tracing.links import TracedLinks, path_gain_db

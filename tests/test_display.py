@@ -35,7 +35,7 @@ PLACEMENT = sp.TransmitterPlacement(
 )
 SETTINGS = (
     *(sp.SceneSettings, sp.TraceSettings, sp.SensorSettings, sp.DatasetSettings, sp.Material),
-    *(sp.PredictorSettings, sp.PlacementSettings, sp.LiveSettings),
+    *(sp.PredictorSettings, sp.PlacementSettings, sp.LiveSettings, sp.Antenna),
 )
 
 

@@ -1,4 +1,4 @@
-"""Beams: DFT codebooks, and the gain of every pair of beams of a link."""
+"""Beams: the gain of every pair of beams of a link."""
 
 import itertools
 import math
@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.channels.responses import WORK_BYTES, ArrayPaths, labelled, require_memory
-from sionna_partial.checks import real_array, require, require_whole
+from sionna_partial.checks import real_array, require
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB
 from sionna_partial.errors import SettingsError
 from sionna_partial.tracing.antennas import Antennas
@@ -17,9 +17,6 @@ from sionna_partial.tracing.links import path_gain_db
 
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import TracedLinks
-
-MAX_ANTENNAS = 4096
-"""Largest number of antennas of a codebook."""
 
 PATHS_AT_ONCE = 20_000
 """Number of paths whose beams are computed together at most, in no more than `WORK_BYTES`."""
@@ -29,41 +26,6 @@ _BEAM_BYTES, _PAIR_BYTES = 32, 48
 
 MAX_WEIGHT = 1e6
 """Largest magnitude of a weight: powers are of single precision."""
-
-
-def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.complex128]:
-    """Return the beams of a planar array that are orthogonal to each other, as weights of its antennas.
-
-    Parameters
-    ----------
-    rows, columns : int
-        Those of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
-    polarisations : int
-        2 for a dual-polarised array: beams of the first polarisation come first.
-
-    Returns
-    -------
-    (polarisations * rows * columns, polarisations * rows * columns) complex128 array
-        One beam of unit power in each row.
-
-    Raises
-    ------
-    SettingsError
-        For numbers that are none of an array.
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> sp.dft_codebook(8, 8).shape
-    (64, 64)
-    """
-    for name, value in (("rows", rows), ("columns", columns)):
-        require_whole(name, value, 1, MAX_ANTENNAS)
-    require_whole("polarisations", polarisations, 1, 2)
-    count = polarisations * rows * columns
-    require(count <= MAX_ANTENNAS, "rows, columns", (rows, columns), f"give {MAX_ANTENNAS} antennas at most.")
-    vertical, horizontal = (np.fft.fft(np.eye(size)) / np.sqrt(size) for size in (rows, columns))
-    return np.kron(np.eye(polarisations), np.kron(horizontal, vertical)).astype(np.complex128)
 
 
 def beam_gains(

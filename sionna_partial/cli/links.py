@@ -31,6 +31,18 @@ def network(
     tx_power: Annotated[
         list[float], typer.Option(help="Transmit power [dBm]; once for all, or once for each.", show_default="20")
     ] = [20.0],  # noqa: B006
+    tx_antenna: Annotated[
+        list[str],
+        typer.Option(
+            metavar="PATTERN|FILE", help="As for predict; once for all, or once for each.", show_default="iso"
+        ),
+    ] = ["iso"],  # noqa: B006
+    azimuth: Annotated[
+        list[float], typer.Option(help="Of the antennas, counterclockwise from x [degree].", show_default="0")
+    ] = [0.0],  # noqa: B006
+    tilt: Annotated[
+        list[float], typer.Option(help="Of the antennas, below the horizon [degree].", show_default="0")
+    ] = [0.0],  # noqa: B006
     noise_figure: Annotated[float, typer.Option(help="Of the receivers [dB].")] = 7.0,
     bandwidth: Annotated[float, typer.Option(help="Bandwidth [Hz].")] = 100e6,
     load: Annotated[float, typer.Option(help="Fraction of time in which an interferer transmits.")] = 1.0,
@@ -47,11 +59,16 @@ def network(
 
     positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
     powers_dbm = transmit_powers_dbm(tx_power[0] if len(tx_power) == 1 else tx_power, len(positions))
+    antennas = [
+        opt.parse_antenna(*each)
+        for each in zip(*(opt.for_each(values, len(positions)) for values in (tx_antenna, azimuth, tilt)), strict=True)
+    ]
     budget = LinkBudget(noise_figure, bandwidth, load, sinr_threshold)
     with opt.reporting_to(out, "loading the predictor") as report:
         coverage = sp.predict_map(
             partial,
             positions,
+            tx_antenna=antennas,
             rx_height_m=rx_height,
             spacing_m=spacing,
             predictor=predictor or None,

@@ -62,6 +62,11 @@ Columns = Annotated[
 ]
 RxHeight = Annotated[float, typer.Option(help="Height of the receivers [m].")]
 Memory = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
+TxAntenna = Annotated[
+    str, typer.Option(metavar="PATTERN|FILE", help="iso, dipole, hw_dipole, tr38901, or an MSI file (.msi, .pln).")
+]
+Azimuth = Annotated[float, typer.Option(help="Of the antenna, counterclockwise from x [degree].")]
+Tilt = Annotated[float, typer.Option(help="Of the antenna, below the horizon [degree].")]
 PredictorName = Annotated[str, typer.Option(help="'map', 'paper', or a .keras file. Default: 'map'.")]
 FieldOfView = Annotated[float, typer.Option(help="Field of view of the robot, up to 360 [degree].")]
 Range = Annotated[float, typer.Option("--range", help="Range of its sensor [m].")]
@@ -127,6 +132,19 @@ def read_measurements(path: Path | None, column: list[str] | None) -> Any:
     if path is None:
         return None
     return sp.load_measurements(path, columns={name: header for name, _, header in pairs} or None)
+
+
+def parse_antenna(text: str, azimuth_deg: float, downtilt_deg: float) -> Any:
+    """Antenna from the name of a pattern, or the path of an MSI file, and where it points."""
+    pattern = sp.load_antenna(text) if Path(text).suffix else text
+    return sp.Antenna(pattern, azimuth_deg, downtilt_deg)
+
+
+def for_each(values: Sequence[Any], count: int) -> Sequence[Any]:
+    """Values of an option that is given once for all transmitters, or once for each."""
+    if len(values) not in (1, count):
+        raise typer.BadParameter(f"{len(values)} values for {count} transmitters: give one for all, or one for each.")
+    return values if len(values) == count else [*values] * count
 
 
 def settings_of(

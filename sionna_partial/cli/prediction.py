@@ -26,6 +26,9 @@ def predict(
     tx: Annotated[
         str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given.")
     ] = "",
+    tx_antenna: opt.TxAntenna = "iso",
+    azimuth: opt.Azimuth = 0.0,
+    tilt: opt.Tilt = 0.0,
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
     settings: opt.Settings,
@@ -40,12 +43,13 @@ def predict(
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
-    position = opt.parse_position(tx) if tx else None
+    position, antenna = opt.parse_position(tx) if tx else None, opt.parse_antenna(tx_antenna, azimuth, tilt)
     suffixes = [_parse_format(name) for name in formats]
     with opt.reporting_to(out, "loading the predictor") as report:
         coverage = sp.predict_map(
             partial,
             position,
+            tx_antenna=antenna,
             rx_height_m=rx_height,
             spacing_m=spacing,
             predictor=predictor or None,

@@ -27,7 +27,7 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage_map import TX_COORDINATES, probability_above
+from sionna_partial.coverage_map import ANTENNA, TX_COORDINATES, probability_above
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
@@ -399,7 +399,7 @@ def _uncertainty(
     near = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
     used = measured if near or len(tx_m) == 1 else None
     coverage = model.coverage(tx_m, spacing_m=spacing_m, measurements=used, progress=False)
-    return _described(_entropy(coverage, threshold_db).drop_vars(("tx", *TX_COORDINATES)), spacing_m)
+    return _described(_entropy(coverage, threshold_db).drop_vars(("tx", ANTENNA, *TX_COORDINATES)), spacing_m)
 
 
 def _located(model: LinkModel, measured: Measurements, threshold_db: float | None) -> tuple[Floats, xr.DataArray]:

@@ -1,21 +1,44 @@
-"""Antenna arrays of Sionna RT as NumPy arrays: positions, orientations, and patterns in the directions of paths."""
+"""Antennas: patterns, measured ones too, arrays of Sionna RT as NumPy arrays, and the transmit antenna of a map."""
 
-from dataclasses import dataclass
-from typing import Any
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import real_array, require, require_choice, require_whole
+from sionna_partial.checks import (
+    Checked,
+    Within,
+    real_array,
+    require,
+    require_choice,
+    require_number,
+    require_type,
+    require_whole,
+)
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.display import Shown
 from sionna_partial.errors import SettingsError
+from sionna_partial.files import read_bytes
 from sionna_partial.tracing.engine import load_sionna, to_device
-from sionna_partial.tracing.paths import zenith_azimuth
+from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
 
 PATTERNS, POLARISATIONS = ("iso", "dipole", "hw_dipole", "tr38901"), ("V", "H", "VH", "cross")
 """Antenna patterns and polarisations that Sionna RT has."""
+
+MAX_ANTENNAS = 4096
+"""Largest number of antennas of a codebook."""
+
+MAX_GAIN_DBI, MAX_LOSS_DB = 60.0, 200.0
+"""Largest gain of a pattern, and how far below it a direction may be."""
+
+_DIPOLE_DBI = 2.15
+_FILE_BYTES, _FILE_ANGLES = 1_000_000, 3600
+_PHASES_AT_ONCE = 2_000_000
 
 
 def planar_array(rows: int, columns: int, pattern: str = "iso", polarization: str = "V") -> Any:
@@ -25,6 +48,41 @@ def planar_array(rows: int, columns: int, pattern: str = "iso", polarization: st
     for name, value in (("rows", rows), ("columns", columns)):
         require_whole(name, value, 1, 1024)
     return load_sionna().PlanarArray(num_rows=rows, num_cols=columns, pattern=pattern, polarization=polarization)
+
+
+def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.complex128]:
+    """Return the beams of a planar array that are orthogonal to each other, as weights of its antennas.
+
+    Parameters
+    ----------
+    rows, columns : int
+        Those of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
+    polarisations : int
+        2 for a dual-polarised array: beams of the first polarisation come first.
+
+    Returns
+    -------
+    (polarisations * rows * columns, polarisations * rows * columns) complex128 array
+        One beam of unit power in each row.
+
+    Raises
+    ------
+    SettingsError
+        For numbers that are none of an array.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sp.dft_codebook(8, 8).shape
+    (64, 64)
+    """
+    for name, value in (("rows", rows), ("columns", columns)):
+        require_whole(name, value, 1, MAX_ANTENNAS)
+    require_whole("polarisations", polarisations, 1, 2)
+    count = polarisations * rows * columns
+    require(count <= MAX_ANTENNAS, "rows, columns", (rows, columns), f"give {MAX_ANTENNAS} antennas at most.")
+    vertical, horizontal = (np.fft.fft(np.eye(size)) / np.sqrt(size) for size in (rows, columns))
+    return np.kron(np.eye(polarisations), np.kron(horizontal, vertical)).astype(np.complex128)
 
 
 @dataclass(frozen=True)
@@ -89,12 +147,246 @@ class Antennas:
         return np.einsum("pji,pj->pi", self.rotation[end], vectors)
 
 
+@dataclass(frozen=True, eq=False)
+class AntennaPattern(Shown):
+    """Power pattern of an antenna from its horizontal and vertical cut, vertically polarised.
+
+    The loss in a direction is the sum of both cuts, at most the largest of them (3GPP TR 38.901, table 7.3-1).
+
+    Parameters
+    ----------
+    name : str
+    gain_dbi : float
+        Gain in the main direction [dBi].
+    horizontal_db, vertical_db : (360,) array-like
+        How far below it the gain is at 0, 1, ... 359 degrees [dB]: counterclockwise from the main direction seen from
+        above, and downwards from the horizon.
+
+    Raises
+    ------
+    SettingsError
+        For a gain above 60 dBi, or cuts of another shape or with values outside 0 to 200 dB.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> sector = sp.AntennaPattern.sector(gain_dbi=15.0, horizontal_beamwidth_deg=65.0, vertical_beamwidth_deg=10.0)
+    >>> float(sector.horizontal_db[65 // 2].round(1)), float(sector.horizontal_db[180])
+    (2.9, 30.0)
+    """
+
+    name: str
+    gain_dbi: float
+    horizontal_db: Floats
+    vertical_db: Floats
+
+    def __post_init__(self) -> None:
+        named = isinstance(self.name, str) and 0 < len(self.name) <= 100 and self.name.isprintable()
+        require(named, "name", self.name, "give up to 100 printable characters.")
+        require_number("gain_dbi", self.gain_dbi, -MAX_GAIN_DBI, MAX_GAIN_DBI)
+        for name in ("horizontal_db", "vertical_db"):
+            remedy = f"give 360 losses below the largest gain, 0 to {MAX_LOSS_DB:g} dB."
+            values = real_array(name, getattr(self, name), SettingsError, remedy).astype(np.float64)
+            require(values.shape == (360,), name, f"array of shape {values.shape}", remedy)
+            good = (values >= 0.0) & (values <= MAX_LOSS_DB)
+            require(bool(good.all()), name, values[~good][:1], remedy)
+            object.__setattr__(self, name, values)
+
+    @classmethod
+    def sector(
+        cls,
+        gain_dbi: float = 8.0,
+        horizontal_beamwidth_deg: float = 65.0,
+        vertical_beamwidth_deg: float = 65.0,
+        front_to_back_db: float = 30.0,
+    ) -> "AntennaPattern":
+        """Return the pattern of 3GPP TR 38.901, table 7.3-1, whose values are the defaults, or one like it."""
+        require_number("front_to_back_db", front_to_back_db, 0.0, MAX_LOSS_DB)
+        angle_deg, cuts = (np.arange(360.0) + 180.0) % 360.0 - 180.0, []
+        widths = {
+            "horizontal_beamwidth_deg": horizontal_beamwidth_deg,
+            "vertical_beamwidth_deg": vertical_beamwidth_deg,
+        }
+        for name, width_deg in widths.items():
+            require_number(name, width_deg, 0.0, 360.0, open_low=True)
+            cuts.append(np.minimum(12.0 * (angle_deg / width_deg) ** 2, front_to_back_db))
+        return cls(f"sector of {horizontal_beamwidth_deg:g} x {vertical_beamwidth_deg:g} deg", gain_dbi, *cuts)
+
+    def amplitude(self, local_rad: Floats) -> NDArray[np.complex128]:
+        """Square root (P,) of the gain towards zenith and azimuth (P, 2)."""
+        down_deg, left_deg = np.degrees(local_rad[:, 0]) - 90.0, np.degrees(local_rad[:, 1])
+        cuts = ((left_deg, self.horizontal_db), (down_deg, self.vertical_db))
+        loss_db = sum(np.interp(angle_deg, np.arange(360), cut, period=360.0) for angle_deg, cut in cuts)
+        largest_db = max(cut.max() for _, cut in cuts)
+        return np.asarray(10.0 ** ((self.gain_dbi - np.minimum(loss_db, largest_db)) / 20.0), np.complex128)
+
+
+def load_antenna(path: str | Path) -> AntennaPattern:
+    """Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
+
+    A gain without unit is in dBd, as the format has it. Horizontal angles are clockwise from the main direction,
+    vertical ones from the horizon downwards. An electrical tilt is in the cuts.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read, is larger than 1 MB, or lacks its gain or one of the cuts.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import sionna_partial as sp
+    >>> cut = "2\\n0 0.0\\n180 25.0\\n"
+    >>> _ = Path("panel.msi").write_text(f"NAME panel\\nGAIN 9.0 dBi\\nHORIZONTAL {cut}VERTICAL {cut}")
+    >>> sp.load_antenna("panel.msi").gain_dbi
+    9.0
+    """
+    remedy = "give an MSI Planet file with GAIN, HORIZONTAL and VERTICAL."
+    lines = read_bytes(path, "antenna", SettingsError, _FILE_BYTES, remedy).decode("utf-8", "replace").splitlines()
+    cuts: dict[str, Floats] = {}
+    header: dict[str, str] = {}
+    rows = iter(enumerate(lines, start=1))
+    for number, line in rows:
+        key, _, value = line.strip().partition(" ") if " " in line.strip() else line.strip().partition("\t")
+        if key.upper() in ("HORIZONTAL", "VERTICAL"):
+            count = int(value) if value.strip().isascii() and value.strip().isdigit() and len(value.strip()) < 5 else 0
+            where = f"antenna, line {number}"
+            require(
+                2 <= count <= _FILE_ANGLES, where, line, f"give {key} and the number of angles, 2 to {_FILE_ANGLES}."
+            )
+            cuts[key.upper()] = _cut([text for _, (_, text) in zip(range(count), rows, strict=False)], count, where)
+        else:
+            header.setdefault(key.upper(), value.strip())
+    missing = {"GAIN", "HORIZONTAL", "VERTICAL"} - {*header, *cuts}
+    require(not missing, f"antenna '{path}' without", sorted(missing), remedy)
+    gain, unit = ([*header["GAIN"].split(), "dBd"])[:2] if header["GAIN"] else ("", "dBd")
+    require(
+        unit.lower() in ("dbd", "dbi") and _is_finite(gain), "GAIN", header["GAIN"], "give a number and dBd or dBi."
+    )
+    name = "".join(each for each in header.get("NAME", Path(path).stem) if each.isprintable())[:100] or "antenna"
+    clockwise = cuts["HORIZONTAL"]
+    left = np.roll(clockwise[::-1], 1)
+    return AntennaPattern(name, float(gain) + (_DIPOLE_DBI if unit.lower() == "dbd" else 0.0), left, cuts["VERTICAL"])
+
+
+def _cut(lines: list[str], count: int, where: str) -> Floats:
+    """Losses (360,) [dB] at whole degrees of a cut with so many lines of angle and loss."""
+    pairs = [line.split() for line in lines]
+    remedy = f"{count} lines of angle [degree] and loss [dB] follow, the angles increasing from 0 to 360."
+    good = len(pairs) == count and all(len(pair) == 2 and all(map(_is_finite, pair)) for pair in pairs)
+    angle_deg, loss_db = np.array(pairs, dtype=np.float64).T if good else np.zeros((2, 1))
+    rising = bool((np.diff(angle_deg) > 0.0).all()) and angle_deg[0] >= 0.0 and angle_deg[-1] <= 360.0
+    require(good and rising, where, lines[:2], remedy)
+    return np.interp(np.arange(360.0), angle_deg, loss_db, period=360.0)
+
+
+def _is_finite(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+@dataclass(frozen=True)
+class Antenna(Checked):
+    """Antenna of a transmitter: a pattern or a planar array of it with a beam, and where it points.
+
+    Parameters
+    ----------
+    pattern : {"iso", "dipole", "hw_dipole", "tr38901"} or AntennaPattern
+        A pattern of Sionna RT, one from `AntennaPattern.sector`, or a measured one from `load_antenna`.
+    azimuth_deg : float
+        Counterclockwise from x, as seen from above [degree].
+    downtilt_deg : float
+        Below the horizon; negative for an elevation [degree].
+    rows, columns : int
+        Of the array, whose antennas are half a wavelength apart.
+    beam : int
+        Row of ``dft_codebook(rows, columns)``; 0 is the beam in the main direction.
+
+    Raises
+    ------
+    SettingsError
+        For a value out of range.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> print(sp.Antenna("tr38901", azimuth_deg=90.0, downtilt_deg=10.0, rows=8, columns=4))
+    tr38901, 8 x 4, beam 0, azimuth 90 deg, downtilt 10 deg
+    """
+
+    pattern: str | AntennaPattern = "iso"
+    azimuth_deg: Annotated[float, Within(-360.0, 360.0)] = 0.0
+    downtilt_deg: Annotated[float, Within(-90.0, 90.0)] = 0.0
+    rows: Annotated[int, Within(1, 64)] = 1
+    columns: Annotated[int, Within(1, 64)] = 1
+    beam: Annotated[int, Within(0, MAX_ANTENNAS - 1)] = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.pattern, AntennaPattern):
+            require_choice("pattern", self.pattern, PATTERNS)
+        count = self.rows * self.columns
+        require(self.beam < count, "beam", self.beam, f"an array of {count} antennas has beams up to {count - 1}.")
+
+    @classmethod
+    def of(cls, value: "Antenna | AntennaPattern | str | None") -> "Antenna":
+        """Return an antenna as it is, or one of a pattern that points along x."""
+        if isinstance(value, (str, AntennaPattern, type(None))):
+            return cls("iso" if value is None else value)
+        require_type("tx_antenna", value, cls, "give sp.Antenna(...), the name of a pattern, or an AntennaPattern.")
+        return value
+
+    def __str__(self) -> str:
+        """Return what it is, for titles and attributes."""
+        pattern = self.pattern
+        parts = [f"{pattern.name}, {pattern.gain_dbi:g} dBi" if isinstance(pattern, AntennaPattern) else pattern]
+        parts += [f"{self.rows} x {self.columns}, beam {self.beam}"] if self.rows * self.columns > 1 else []
+        if parts != ["iso"] or self.downtilt_deg:
+            parts += [f"azimuth {self.azimuth_deg:g} deg", f"downtilt {self.downtilt_deg:g} deg"]
+        return ", ".join(parts)
+
+    @property
+    def is_isotropic(self) -> bool:
+        """Whether it is one upright isotropic antenna, as of links without any."""
+        return str(self) == "iso"
+
+    def fields(self, angles_rad: Floats, frequency_hz: float) -> NDArray[np.complex128]:
+        """Field (P, 2) along the world's theta and phi, in directions of zenith and azimuth (P, 2)."""
+        measured = isinstance(self.pattern, AntennaPattern)
+        array = planar_array(self.rows, self.columns, "iso" if measured else str(self.pattern))
+        turned = np.radians([self.azimuth_deg, self.downtilt_deg, 0.0])
+        antennas = Antennas.of("tx", array, turned, count=1, frequency_hz=frequency_hz)
+        antennas = replace(antennas, patterns=[self.pattern]) if measured else antennas
+        weights = dft_codebook(self.rows, self.columns)[self.beam]
+        radians, at_once = 2j * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S, max(1, _PHASES_AT_ONCE // len(weights))
+        found = np.zeros((len(angles_rad), 2), np.complex128)
+        for start in range(0, len(angles_rad), at_once):
+            here = slice(start, start + at_once)
+            one = np.zeros(len(angles_rad[here]), np.intp)
+            phases = np.exp(radians * antennas.advance_m(angles_rad[here], one)) @ weights
+            found[here] = antennas.fields(angles_rad[here], one)[:, 0] * phases[:, None]
+        return found
+
+    def gain(self, angles_rad: Floats, frequency_hz: float) -> Floats:
+        """Gain (P,) of vertical polarisation towards zenith and azimuth (P, 2)."""
+        return np.asarray(np.abs(self.fields(angles_rad, frequency_hz)[:, 0]) ** 2)
+
+    def power(self, paths: SolvedPaths, frequency_hz: float) -> Floats:
+        """Power (P,) of paths that were traced for both polarisations, at isotropic, vertical receivers."""
+        fields = self.fields(paths.departure_rad, frequency_hz)
+        return np.asarray(np.abs(np.einsum("pi,pi->p", paths.transfer[:, 0], fields)) ** 2)
+
+
 def _evaluated(pattern: Any, local_rad: Floats) -> list[NDArray[np.complex128]]:
     """Zenith and azimuth component (P,) of a pattern, which Sionna RT evaluates."""
     import mitsuba as mi
 
     if not len(local_rad):  # Dr.Jit would abort
         return [np.zeros(0, np.complex128)] * 2
+    if isinstance(pattern, AntennaPattern):
+        return [pattern.amplitude(local_rad), np.zeros(len(local_rad), np.complex128)]
     angles = (to_device(mi.Float, column.astype(np.float32)) for column in local_rad.T)
     return [np.zeros(len(local_rad)) + (part.real.numpy() + 1j * part.imag.numpy()) for part in pattern(*angles)]
 

@@ -174,9 +174,9 @@ class Simulation:
             report(1.0, "traced")
         return found
 
-    def blocks(self, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[SolvedPaths]:
+    def blocks(self, tx_m: Floats, rx_m: Floats, report: Progress, polarisations: int = 1) -> Iterator[SolvedPaths]:
         """Find all paths from a transmitter (3,) to receivers (N, 3) that have been checked, some at a time."""
-        for group in self._groups(tx_m[None], rx_m, [np.arange(len(rx_m))], report):
+        for group in self._groups(tx_m[None], rx_m, [np.arange(len(rx_m))], report, polarisations):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 

@@ -69,6 +69,8 @@ CALLS = {
     "TracedLinks.taps": {"self": "links()", "bandwidth_hz": "1e8"},
     "TracedLinks.beam_gains": {"self": "links()", "codebook": "np.ones((1, 1))"},
     "TracedLinks.to_dataframe": {"self": "links()"},
+    "load_antenna": {"path": "valid('antenna.msi', folder)"},
+    "Antenna": {"pattern": "'tr38901'", "azimuth_deg": "30.0", "rows": "2", "columns": "2", "beam": "1"},
     "dft_codebook": {"rows": "4", "columns": "4"},
     "sample_channels": {"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]", "n": "5", "predictor": "'paper'"},
     "ChannelSamples.links": {"self": "samples()", "draw": "0"},
@@ -145,6 +147,7 @@ SPOILS = (
 KINDS = (
     *("cloud.las", "cloud.laz", "cloud.pcd", "cloud.xyz", "plan.dxf", "drive.bag", "drive.mcap", "drive.db3"),
     *("map.yaml", "map.pgm", "map.npz", "mesh.ply", "mesh.obj", "scene.xml", "scene folder", "measurements.csv"),
+    *("antenna.msi",),
     *("predictor.keras", "predictor.json", "coverage.nc", "channels.nc", "dataset.parquet", "dataset.json"),
 )
 

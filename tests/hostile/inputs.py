@@ -158,6 +158,12 @@ def _csv(folder: Path) -> Path:
     return path
 
 
+def _antenna(folder: Path) -> Path:
+    path, cut = folder / "antenna.msi", "".join(f"{angle} {min(angle, 360 - angle) / 6}\n" for angle in range(360))
+    path.write_text(f"NAME a\nGAIN 9 dBi\nHORIZONTAL 360\n{cut}VERTICAL 360\n{cut}", encoding="ascii")
+    return path
+
+
 def _predictor(folder: Path) -> Path:
     shipped = Path(sp.__file__).parent / "predictors"
     for suffix in ("keras", "json"):
@@ -310,6 +316,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
     "mesh.obj": (_obj, lambda path: sp.load_map(path, resolution_m=0.2)),
     "scene.xml": (_scene, lambda path: sp.load_map(path, resolution_m=0.2)),
     "scene folder": (_scene, lambda path: sp.load_map(path.parent)),
+    "antenna.msi": (_antenna, sp.load_antenna),
     "measurements.csv": (_csv, lambda path: sp.calibrate_materials(room(), path)),
     "predictor.keras": (_predictor, sp.Predictor.load),
     "predictor.json": (

@@ -7,7 +7,8 @@ Predictability as Revealed by Naturally Occurring Analogues, 1969). `path_traini
 """
 
 import io
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields, replace
 from functools import cache, cached_property
 from pathlib import Path
 
@@ -17,16 +18,19 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.constants import CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.inputs import free_space_gain_db
+from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.process import core_count
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.tracing.links import TracedLinks
-from sionna_partial.tracing.paths import DIFFRACTION, zenith_azimuth
+from sionna_partial.tracing.antennas import Antenna
+from sionna_partial.tracing.links import TracedLinks, path_gain_db
+from sionna_partial.tracing.paths import DIFFRACTION, SolvedPaths, zenith_azimuth
 
 STATES = (LinkState.LOS, LinkState.NLOS)
 
@@ -39,6 +43,12 @@ unobserved length, gain of the surviving paths above that of the link [dB], whet
 
 _NEARLY = 0.3
 """How much less alike than the most alike, as a fraction, an analogue may be."""
+
+_TURN_DEG = (6, 3)
+"""Steps of zenith and azimuth in which directions of departure are counted [degree]."""
+
+_RARE = 1e-4
+"""Fraction of the power below which a direction does not count."""
 
 _WEAKEST_DB = -30.0
 _MAX_BYTES = 20_000_000
@@ -158,6 +168,22 @@ class PathModel:
         chosen = (quantile * order.shape[1]).astype(np.intp)
         return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]
 
+    def departures_deg(self, state: LinkState) -> tuple[Indices, Floats]:
+        """Zenith and azimuth from the direct line (K, 2) [degree] in which unseen paths depart, and their power (K,).
+
+        The mean over all analogues of a state, which are as often mirrored as not.
+        """
+        first = self.first[: self.los_count + 1] if state == LinkState.LOS else self.first[self.los_count :]
+        here, counts = slice(first[0], first[-1]), np.diff(first)
+        total = np.add.reduceat(np.append(self.fraction[here], 0.0).astype(np.float64), first[:-1] - first[0])
+        weight = self.fraction[here] / np.repeat(total, counts)
+        turned_deg = np.degrees(self.departure_rad[here].astype(np.float64))
+        both_deg = np.concatenate([turned_deg, turned_deg * [1.0, -1.0]])
+        bins, index = np.unique(np.round(both_deg / _TURN_DEG).astype(np.intp), axis=0, return_inverse=True)
+        power = np.bincount(index.ravel(), np.tile(weight, 2))
+        kept = power > _RARE * power.sum()
+        return bins[kept] * _TURN_DEG, power[kept] / power[kept].sum()
+
     @cached_property
     def _trees(self) -> tuple[tuple[cKDTree, int], ...]:
         los_count = int(self.los_count)
@@ -181,3 +207,58 @@ class PathModel:
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             weights = tuple(stored[f"weights{number}"].astype(np.float64) for number in range(6))
             return cls(weights, **{column.name: stored[column.name] for column in fields(cls)[1:]})
+
+
+class AntennaLinks:
+    """Links from (3,) to (N, 3) [m] with an antenna at the transmitter, while their paths are traced.
+
+    Traced paths count with the antenna's field where they depart, the direct line of a link in LOS with that in its
+    direction, and what else is predicted with the mean over the directions of analogues. `paths` are traced for both
+    polarisations.
+    """
+
+    def __init__(self, antenna: Antenna, frequency_hz: float, tx_m: Floats, rx_m: Floats) -> None:
+        self.antenna, self.frequency_hz = antenna, frequency_hz
+        self._direct_rad = zenith_azimuth(rx_m - tx_m)
+        self._power, self._indirect, self._indirect_alone = np.zeros((3, len(rx_m)))
+
+    def added(self, blocks: Iterable[SolvedPaths]) -> Iterator[SolvedPaths]:
+        """Add paths as they are found, and pass them on."""
+        for paths in blocks:
+            power, indirect = self.antenna.power(paths, self.frequency_hz), ~paths.is_direct
+            np.add.at(self._power, paths.path_rx, power)
+            np.add.at(self._indirect, paths.path_rx[indirect], power[indirect])
+            np.add.at(self._indirect_alone, paths.path_rx[indirect], paths.power[indirect])
+            yield paths
+
+    def predict(
+        self, phi: LinkFeatures, prediction: LinkPrediction, complete: Bools
+    ) -> tuple[LinkFeatures, LinkPrediction]:
+        """Return features and prediction with the antenna, from those without; the link states stay."""
+        phi = replace(phi, gain_db=path_gain_db(self._power))
+        trace = LinkPrediction.of_trace(phi)
+        if complete.all():
+            return phi, trace
+        probabilities, means_db, stds_db = prediction.by_state
+        free_space = 10.0 ** (free_space_gain_db(phi.distance_m, self.frequency_hz) / 10.0)
+        direct, table = self.antenna.gain(self._direct_rad, self.frequency_hz), self._table()
+        for state in STATES:
+            sight = free_space * (state == LinkState.LOS)
+            alone, known = sight + self._indirect_alone, sight * direct + self._indirect
+            whole = np.maximum(10.0 ** (means_db[state] / 10.0), alone)
+            change_db = path_gain_db((known + (whole - alone) * self._spread(state, table)) / whole)
+            means_db[state] = np.maximum(means_db[state] + change_db, GAIN_FLOOR_DB)
+        return phi, LinkPrediction.of_parts(probabilities, means_db, stds_db).where(complete, trace)
+
+    def _table(self) -> Floats:
+        """Gain in all whole degrees of zenith and azimuth (181, 360)."""
+        angles_deg = np.stack(np.meshgrid(np.arange(181.0), np.arange(360.0), indexing="ij"), axis=-1)
+        return self.antenna.gain(np.radians(angles_deg.reshape(-1, 2)), self.frequency_hz).reshape(181, 360)
+
+    def _spread(self, state: LinkState, table: Floats) -> Floats:
+        """Mean gain (N,) over the directions in which unseen paths depart."""
+        zenith_deg, azimuth_deg = np.round(np.degrees(self._direct_rad)).astype(np.intp).T
+        mean = np.zeros(len(zenith_deg))
+        for (down, left), power in zip(*PathModel.load().departures_deg(state), strict=True):
+            mean += power * table[np.clip(zenith_deg + down, 0, 180), (azimuth_deg + left) % 360]
+        return mean

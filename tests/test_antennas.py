@@ -1,0 +1,173 @@
+"""Antennas in coverage maps: against stock Sionna RT, known patterns, and what the unseen paths see of them."""
+
+import inspect
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray as xr
+from test_trace import _half_seen_room, _room
+from typer.testing import CliRunner
+
+import sionna_partial as sp
+from sionna_partial.cli.app import app
+from sionna_partial.errors import SettingsError
+from sionna_partial.scene.scene import export_scene
+from sionna_partial.tracing.engine import load_sionna
+
+TX, DEPTH = (1.03, 2.93, 1.4), 2
+SECTOR = sp.Antenna("tr38901", azimuth_deg=-70.0, downtilt_deg=25.0)
+PANEL = sp.Antenna("tr38901", azimuth_deg=200.0, downtilt_deg=-10.0, rows=2, columns=4, beam=5)
+LINES = "".join(f"{angle} {min(30.0, 12 * (min(angle, 360 - angle) / 65) ** 2):.2f}\n" for angle in range(360))
+MSI = f"NAME made\nGAIN 12.0 dBd\nTILT ELECTRICAL\nHORIZONTAL 360\n{LINES}VERTICAL 360\n{LINES}"
+
+
+def coverage_of(partial: sp.PartialMap, antenna: Any = None, **options: Any) -> xr.Dataset:
+    settings = sp.TraceSettings(max_depth=DEPTH, diffraction=False)
+    return sp.predict_map(partial, TX, tx_antenna=antenna, spacing_m=0.9, trace_settings=settings, **options)
+
+
+def stock_gain_db(antenna: sp.Antenna, rx_m: np.ndarray, folder: Path) -> np.ndarray:
+    """Gains that Sionna RT's public solver finds, with phases of the array as the beam has them."""
+    rt = load_sionna()
+    scene = rt.load_scene(str(export_scene(_room(), folder / "scene") / "scene.xml"), merge_shapes=False)
+    scene.frequency = 28e9
+    scene.tx_array = rt.PlanarArray(
+        num_rows=antenna.rows, num_cols=antenna.columns, pattern="tr38901", polarization="V"
+    )
+    scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    turned = [float(angle) for angle in np.radians([antenna.azimuth_deg, antenna.downtilt_deg, 0.0])]
+    scene.add(rt.Transmitter("tx", position=[*TX], orientation=turned))
+    gains_db, weights = [], sp.dft_codebook(antenna.rows, antenna.columns)[antenna.beam]
+    for position in rx_m:
+        scene.remove("rx")
+        scene.add(rt.Receiver("rx", position=position.tolist()))
+        options = {"refraction": False, "samples_per_src": 200_000, "max_num_paths_per_src": 1_000_000}
+        paths = rt.PathSolver(deterministic=True)(scene, max_depth=DEPTH, **options)
+        real, imaginary = (part.numpy()[0, 0, 0] for part in paths.a)
+        power = np.sum(np.abs(weights @ (real + 1j * imaginary)) ** 2)
+        gains_db.append(10 * np.log10(max(power, 1e-15)))
+    return np.array(gains_db)
+
+
+@pytest.mark.parametrize("antenna", [SECTOR, PANEL], ids=str)
+def test_a_complete_map_is_stock_sionna_rt(antenna: sp.Antenna, tmp_path: Path) -> None:
+    rows = coverage_of(_room(), antenna).stack(at=("y", "x"))
+    rows = rows.isel(at=np.flatnonzero(rows["valid"] == 1))
+    rx_m = np.stack([rows["x"], rows["y"], np.full(rows.sizes["at"], 1.5)], axis=1)
+    expected_db = stock_gain_db(antenna, rx_m, tmp_path)
+    for name in ("gain_mean_db", "partial_gain_db"):
+        np.testing.assert_allclose(rows[name], expected_db, atol=0.1)
+
+
+def test_what_is_seen_and_unseen_changes_as_the_pattern_says() -> None:
+    """Seven dB everywhere are seven dB of every state; turned away, what is unseen loses less than the direct line."""
+    flat = sp.AntennaPattern("flat", 7.0, np.zeros(360), np.zeros(360))
+    alone, louder = (coverage_of(_half_seen_room(), each) for each in (None, flat))
+    for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
+        np.testing.assert_allclose(louder[name] - alone[name], np.where(alone["valid"], 7.0, np.nan), atol=0.1)
+    away = coverage_of(_half_seen_room(), sp.Antenna(sp.AntennaPattern.sector(0.0, 30.0, 90.0), 180.0))
+    unseen = (alone["observed"] == 0) & (alone["x"] > 4.5)
+    los_db, nlos_db = ((away[f"gain_{state}_mean_db"] - alone[f"gain_{state}_mean_db"]) for state in ("los", "nlos"))
+    assert float(los_db.where(unseen).mean()) < float(nlos_db.where(unseen).mean()) - 3.0
+    assert -30.0 < float(nlos_db.where(unseen).mean()) < -3.0
+    for name in ("p_los", "p_nlos", "p_outage"):
+        np.testing.assert_allclose(away[name], alone[name], atol=0.02)
+
+
+def test_a_warm_model_keeps_antennas_apart() -> None:
+    settings = sp.TraceSettings(max_depth=1, diffraction=False)
+    model = sp.LinkModel(_room(), trace_settings=settings)
+    first, other, again = (model.coverage(TX, spacing_m=1.0, tx_antenna=each) for each in ("iso", SECTOR, "iso"))
+    xr.testing.assert_identical(first, again)
+    assert float(abs(other["gain_mean_db"] - first["gain_mean_db"]).max()) > 5.0
+    model.update(_half_seen_room())
+    fresh = sp.predict_map(_half_seen_room(), TX, spacing_m=1.0, tx_antenna=SECTOR, trace_settings=settings)
+    xr.testing.assert_identical(model.coverage(TX, spacing_m=1.0, tx_antenna=SECTOR), fresh)
+
+
+def test_one_antenna_for_each_transmitter(tmp_path: Path) -> None:
+    antennas = {"a": SECTOR, "b": None}
+    tx = {"a": TX, "b": (4.5, 1.0, 1.4)}
+    found = sp.predict_map(_room(), tx, tx_antenna=antennas, spacing_m=1.0)
+    sp.save_coverage(found, tmp_path / "coverage.nc")
+    texts = [str(SECTOR), "iso"]
+    for each in (found, sp.load_coverage(tmp_path / "coverage.nc"), sp.network_map(found, n=2)):
+        assert each["tx_antenna"].to_numpy().tolist() == texts
+    alone = sp.predict_map(_room(), TX, tx_antenna=SECTOR, spacing_m=1.0)
+    np.testing.assert_array_equal(found["gain_mean_db"].sel(tx="a"), alone["gain_mean_db"])
+    assert str(SECTOR) in sp.plot_coverage(found.sel(tx="a")).get_suptitle()
+    with pytest.raises(SettingsError, match=r"tx_antenna = .* one for each of a, b"):
+        sp.predict_map(_room(), tx, tx_antenna=[SECTOR], spacing_m=1.0)
+
+
+def test_an_msi_file_is_the_pattern_that_it_lists(tmp_path: Path) -> None:
+    path = tmp_path / "made.msi"
+    path.write_text(MSI.replace("GAIN 12.0 dBd", "GAIN 12.0").replace("\n90 23.01\n", "\n90 5.0\n"), encoding="ascii")
+    read, sector = sp.load_antenna(path), sp.AntennaPattern.sector(14.15)
+    assert (read.name, read.gain_dbi) == ("made", 14.15)
+    expected_db = sector.horizontal_db.copy()
+    expected_db[270] = 5.0
+    np.testing.assert_allclose(read.horizontal_db, expected_db, atol=0.006)  # clockwise in the file
+    assert (read.vertical_db[90], read.vertical_db[270].round(1)) == (5.0, 23.0)
+    antenna = sp.Antenna(read, azimuth_deg=30.0, downtilt_deg=20.0)
+    at_rad = np.radians([[110.0, 30.0], [90.0, 30.0], [110.0, -60.0]])
+    gain_dbi = 10 * np.log10(antenna.gain(at_rad, 28e9))
+    assert gain_dbi[:2] == pytest.approx([14.15, 14.15 - 12 * (20 / 65) ** 2], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("GAIN 12.0 dBd", "GAIN nan", "GAIN = 'nan'"),
+        ("GAIN 12.0 dBd", "GAIN 1 furlong", "dBd or dBi"),
+        ("GAIN 12.0 dBd", "GAIN 999 dBi", "gain_dbi = 999"),
+        ("GAIN 12.0 dBd\n", "", r"without = \['GAIN'\]"),
+        ("VERTICAL 360", "VERTICAL 999999999", "2 to 3600"),
+        ("VERTICAL 360", "VERTICAL 361", "361 lines"),
+        ("\n10 0.28", "\n10 -3", "vertical_db|horizontal_db"),
+        ("\n10 0.28", "\n10 inf", "increasing"),
+        ("\n10 0.28", "\n9 0.28", "increasing"),
+        ("HORIZONTAL", "\0\x1b[31m", "HORIZONTAL"),
+    ],
+)
+def test_hostile_files_are_refused_by_name(old: str, new: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "odd.msi").write_text(MSI.replace(old, new), encoding="ascii")
+    with pytest.raises(SettingsError, match=message):
+        sp.load_antenna(tmp_path / "odd.msi")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"pattern": "yagi"}, {"azimuth_deg": 1e9}, {"downtilt_deg": float("nan")}, {"rows": 0}, {"beam": 1}],
+    ids=str,
+)
+def test_odd_antennas_are_refused_by_name(values: dict[str, Any]) -> None:
+    with pytest.raises(SettingsError, match=next(iter(values))):
+        sp.Antenna(**values)
+    assert {*values} <= {*inspect.signature(sp.Antenna).parameters}
+    with pytest.raises(SettingsError, match="tx_antenna"):
+        sp.predict_map(_room(), TX, tx_antenna=3)
+
+
+def test_a_tilted_isotropic_antenna_is_polarised_otherwise() -> None:
+    assert sp.Antenna("iso", azimuth_deg=30.0).is_isotropic
+    assert not replace(sp.Antenna(), downtilt_deg=30.0).is_isotropic
+
+
+def test_the_commands_take_antennas(tmp_path: Path) -> None:
+    (tmp_path / "made.msi").write_text(MSI, encoding="ascii")
+    sp.save_map(_room(), tmp_path / "room.npz")
+    antenna = ["--tx-antenna", str(tmp_path / "made.msi"), "--azimuth", "-90", "--tilt", "10", "--spacing", "1"]
+    command = ["predict", str(tmp_path / "room.npz"), "--tx", "1 3 1.4", "--out", str(tmp_path / "out")]
+    result = CliRunner().invoke(app, [*command, *antenna, "--format", "nc"])
+    assert result.exit_code == 0, result.output
+    found = sp.load_coverage(tmp_path / "out/coverage.nc")
+    assert found.attrs["tx_antenna"] == "made, 14.15 dBi, azimuth -90 deg, downtilt 10 deg"
+    several = ["network", str(tmp_path / "room.npz"), "--tx=1 3 1.4", "--tx=4 1 1.4", "--out", str(tmp_path / "net")]
+    result = CliRunner().invoke(app, [*several, *antenna, "--azimuth", "90"])
+    assert result.exit_code == 0, result.output
+    texts = sp.load_coverage(tmp_path / "net/coverage.nc")["tx_antenna"].to_numpy()
+    assert ["azimuth -90 deg" in texts[0], "azimuth 90 deg" in texts[1]] == [True, True]
