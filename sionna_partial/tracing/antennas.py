@@ -222,7 +222,7 @@ class AntennaPattern(Shown):
 
 
 def load_antenna(path: str | Path) -> AntennaPattern:
-    """Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
+    r"""Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
 
     A gain without unit is in dBd, as the format has it. Horizontal angles are clockwise from the main direction,
     vertical ones from the horizon downwards. An electrical tilt is in the cuts.
@@ -236,8 +236,8 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     --------
     >>> from pathlib import Path
     >>> import sionna_partial as sp
-    >>> cut = "2\\n0 0.0\\n180 25.0\\n"
-    >>> _ = Path("panel.msi").write_text(f"NAME panel\\nGAIN 9.0 dBi\\nHORIZONTAL {cut}VERTICAL {cut}")
+    >>> cut = "2\n0 0.0\n180 25.0\n"
+    >>> _ = Path("panel.msi").write_text(f"NAME panel\nGAIN 9.0 dBi\nHORIZONTAL {cut}VERTICAL {cut}")
     >>> sp.load_antenna("panel.msi").gain_dbi
     9.0
     """
