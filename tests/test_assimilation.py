@@ -239,3 +239,14 @@ def test_measurements_can_be_selected():
     some = measured.take(np.array([3, 5]))
     assert (len(some), some.sensitivity_db, some.std_db.tolist()) == (2, -110.0, [2.0, 2.0])
     assert replace(measured, std_db=None).take(np.array([3])).std_db is None
+
+
+def test_through_walls_nothing_far_from_the_measurements_becomes_certain():
+    """No trace through walls is: its own error is added where nothing was measured nearby."""
+    measured = sp.Measurements(UNSEEN, LEFT[:3], [-80.0, -84.0, -88.0])
+    posterior = Assimilation.fit(HOUSE, UNSEEN, measured, prior(3, 0.0), through_walls=True)
+    rx_m = np.column_stack([np.linspace(0.6, 9.2, 40), np.full(40, 2.0), np.full(40, 1.5)])
+    for std_db in (0.0, 4.0):
+        after = posterior.update(rx_m, prior(40, 0.0, std_db=std_db))
+        assert after.gain_std_db.min() > 1.0
+        assert after.gain_std_db[-1] >= np.hypot(std_db, 4.9)

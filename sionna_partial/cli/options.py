@@ -123,15 +123,22 @@ def parse_material(text: str) -> Material:
     return Material(permittivity, conductivity_s_m, thickness_m)
 
 
-def read_measurements(path: Path | None, column: list[str] | None) -> Any:
-    """Read the CSV of --measurements, with headers as --column has them; None if there is none."""
+def read_measurements(path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None) -> Any:
+    """Read the CSV of --measurements, with headers as --column has them; None if there is none.
+
+    `tx` is where the transmitter is of a CSV that does not say so.
+    """
     pairs = [text.partition("=") for text in column or ()]
     wrong = next((name for name, _, header in pairs if not name or not header), None)
     if wrong is not None:
         raise typer.BadParameter(f"--column {wrong!r} is no NAME=HEADER: give gain_db=level.")
     if path is None:
         return None
-    return sp.load_measurements(path, columns={name: header for name, _, header in pairs} or None)
+    columns = {name: header for name, _, header in pairs} or None
+    measured = sp.load_measurements(path, columns=columns)
+    if tx is not None and not measured.tx_known.any():
+        return sp.load_measurements(path, columns=columns, tx=tx)
+    return measured
 
 
 def parse_antenna(text: str, azimuth_deg: float, downtilt_deg: float) -> Any:

@@ -126,11 +126,12 @@ def next_views(
 
     The folder --out gets the poses as YAML, as in a geometry_msgs/PoseArray, and a picture.
     """
+    position = opt.parse_position(tx) if tx else None
     with opt.reporting_to(out, "predicting"):
         views = sp.next_views(
             partial,
-            opt.parse_position(tx) if tx else None,
-            opt.read_measurements(measurements, column),
+            position,
+            opt.read_measurements(measurements, column, position),
             goal,
             count,
             start=start,

@@ -54,7 +54,7 @@ def predict(
             spacing_m=spacing,
             predictor=predictor or None,
             **settings,
-            measurements=opt.read_measurements(measurements, column),
+            measurements=opt.read_measurements(measurements, column, position),
             receivers=receivers,
             memory_gb=memory,
             progress=part_of(report, 0.0, 0.9),

@@ -379,11 +379,13 @@ class Assimilation(Shown):
         variance = stds_db**2 + self._kind.trace_std_db**2
         total = variance + noise_db2
         with np.errstate(divide="ignore"):
-            logs = np.log(probabilities) - 0.5 * np.log(total) - 0.5 * (gain_db - means_db) ** 2 / total
+            logs = np.log(probabilities)
+            logs -= np.where(informed, 0.5 * np.log(total) + 0.5 * (gain_db - means_db) ** 2 / total, 0.0)
         weights = np.exp(logs - logs.max(axis=0))
-        pull = np.where(np.arange(3)[:, None] == LinkState.OUTAGE, 0.0, variance / total)
+        has_path = np.arange(3)[:, None] != LinkState.OUTAGE
+        pull = np.where(informed & has_path, variance / total, 0.0)
         means_db = np.clip(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB, 0.0)
-        left = variance * (1.0 - pull)
+        left = np.where(has_path, variance * (1.0 - pull), 0.0)
         stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, left) if self._kind.exact else left, 0.0))
         updated = LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db)
         return prior.where(informed, updated) if self._kind.exact else updated

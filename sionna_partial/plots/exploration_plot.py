@@ -329,7 +329,8 @@ def _draw_view(axis: Axes, rank: int, view: NextView, sees_all: bool) -> None:
     axis.plot(*view.path_m.T, color=BLUE, linewidth=1.0, alpha=0.7, zorder=3.5)
     axis.plot(*view.frontier_m.T, color=RED, marker="s", markersize=2, linestyle="none", zorder=3.6)
     ends_deg = (0.0, 360.0) if sees_all else view.heading_deg + np.array([-0.5, 0.5]) * _VIEW_DEG
-    axis.add_patch(Wedge(tuple(view.position_m), _VIEW_M, *ends_deg, color=YELLOW, alpha=0.8, linewidth=0, zorder=4))
+    alpha = 0.3 if sees_all else 0.8
+    axis.add_patch(Wedge(tuple(view.position_m), _VIEW_M, *ends_deg, color=YELLOW, alpha=alpha, linewidth=0, zorder=4))
     label = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": "black", "linewidth": 0.8}
     x, y = view.position_m.tolist()
     axis.text(x, y, str(rank), fontsize=8, ha="center", va="center", bbox=label, zorder=6)
