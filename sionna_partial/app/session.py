@@ -218,6 +218,7 @@ class Session:
         self.settings = RadioSettings()
         self.measured: Measurements | None = None
         self.answer: Answer | None = None
+        self._is_outdated = False
         self.views: NextViews | None = None
         self.status = Status()
 
@@ -240,8 +241,7 @@ class Session:
         if self._job is not None:
             self._job.is_cancelled.set()
             self._job = None
-            self.status = Status("Cancelled.")
-            self._show()
+            self._conclude(Status("Cancelled."))
 
     def refuse(self, error: object) -> None:
         """Show why something was not done."""
@@ -414,18 +414,19 @@ class Session:
             coarse_m = COARSER * settings.spacing_m
             found = coverage("map", partial, coarse_m, part_of(report, 0.0, 0.2), measurements=measured)
             answer = Answer(found, eirp_dbm, settings, is_final=False)
-            yield functools.partial(setattr, self, "answer", answer)
+            yield functools.partial(self._take_answer, answer)
             found = coverage("map", partial, settings.spacing_m, part_of(report, 0.2, 0.7), measurements=measured)
             answer = replace(answer, coverage=found, is_final=True)
             if len(tx_m) > 1:
                 report(0.7, "SINR of the network")
                 network = network_map(found, tx_power_dbm=eirp_dbm, bandwidth_hz=settings.bandwidth_hz)
                 answer = replace(answer, network=network)
-            yield functools.partial(setattr, self, "answer", answer)
+            yield functools.partial(self._take_answer, answer)
             if home is not None:
                 truth = coverage("home", home, settings.spacing_m, part_of(report, 0.75, 1.0))
-                yield functools.partial(setattr, self, "answer", replace(answer, truth=truth))
+                yield functools.partial(self._take_answer, replace(answer, truth=truth))
 
+        self._is_outdated = True
         self.begin(work)
 
     def place(self) -> None:
@@ -457,10 +458,15 @@ class Session:
         weakest_dbm = min(each.eirp_dbm for each in self.transmitters.values())
         threshold_db = float(np.clip(settings.threshold_dbm - weakest_dbm, GAIN_FLOOR_DB, 0.0))
 
+        def take(views: NextViews) -> None:
+            self.views = views
+            if self.answer is None or self._is_outdated or not self.answer.is_final:
+                self.predict()
+
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.2, "comparing poses")
             views = next_views(self._model("map", partial, settings), tx_m, threshold_db=threshold_db)
-            yield functools.partial(setattr, self, "views", views)
+            yield functools.partial(take, views)
 
         self.begin(work)
 
@@ -537,8 +543,18 @@ class Session:
 
     def _end(self, job: _Job, status: Status) -> None:
         if job is self._job:
-            self._job, self.status = None, status
-            self._show()
+            self._job = None
+            self._conclude(status)
+
+    def _conclude(self, status: Status) -> None:
+        """Say how a job has ended; an answer to another question than that of the page goes."""
+        self.status = status
+        if self._is_outdated:
+            self.answer, self._is_outdated = None, False
+        self._show()
+
+    def _take_answer(self, answer: Answer) -> None:
+        self.answer, self._is_outdated = answer, False
 
     # Files
 
@@ -546,8 +562,10 @@ class Session:
         """Return the newest answer as a file of one of `FILES`."""
         require_choice("kind", kind, FILES)
         answer = self.answer
-        if answer is None:
-            raise SettingsError("there is no coverage yet: put a transmitter on the map.")
+        if answer is None or self._is_outdated or not answer.is_final:
+            raise SettingsError(
+                "there is no coverage yet: put a transmitter on the map, and wait for the fine picture."
+            )
         if kind == "pdf":
             return report_pdf(answer.coverage, answer.eirp_dbm, answer.settings.threshold_dbm)
         with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
