@@ -32,8 +32,8 @@ _SUBCARRIERS = {20e6: 234, 40e6: 468, 80e6: 980, 160e6: 1960, 320e6: 3920}
 _NR_QPSK = (120, 157, 193, 251, 308, 379, 449, 526, 602, 679)
 _NR_16QAM = (340, 378, 434, 490, 553, 616, 658)
 _NR_64QAM = (466, 517, 567, 616, 666, 719, 772, 822, 873, 910, 948)
-"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1, compared with published copies); MCS 17, which is no faster
-than 16, is left out."""
+"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1; compared with published copies but for 873 and 910); MCS 17,
+which is no faster than 16, is left out."""
 
 _NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
 """Overhead of the downlink (3GPP TS 38.306, clause 4.1.2)."""
