@@ -30,9 +30,9 @@ def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     record = json.loads((out / "placement.json").read_text())
     x, y, z = record["position_m"]
-    covered = f"{record['score']:.1%} of the receivers are predicted above -100 dB"
     assert result.stdout.splitlines() == [
-        f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m: {covered}",
+        f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m",
+        f"{record['score']:.1%} of the receivers are predicted above -100 dB",
         f"wrote {out / 'placement.json'}",
         f"wrote {out / 'placement.png'}",
     ]
@@ -42,7 +42,7 @@ def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
 
 def test_worst_tenth(map_path: Path, tmp_path: Path) -> None:
     result = run(map_path, "--out", tmp_path / "place", "--objective", "percentile")
-    assert "m: the worst tenth of the receivers is predicted at " in result.stdout
+    assert "\nthe worst tenth of the receivers is predicted at " in result.stdout
 
 
 def test_options(map_path: Path, tmp_path: Path) -> None:

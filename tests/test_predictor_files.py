@@ -108,7 +108,7 @@ def test_missing_file(tmp_path):
 
 
 def test_name_that_is_no_path():
-    with pytest.raises(PredictorError, match=r"name_or_path = 3 is not a path: give 'map' or 'paper', or the path"):
+    with pytest.raises(PredictorError, match=r"name_or_path = 3 is not a path: give 'map' or 'paper', the path of"):
         Predictor.load(3)
 
 

@@ -258,7 +258,7 @@ def test_same_bytes_twice(tmp_path: Path) -> None:
 @pytest.mark.parametrize("settings", [None, SceneSettings(Material(itu="wood"))])
 def test_material_of_the_map_comes_before_that_of_the_settings(settings: SceneSettings | None, tmp_path: Path) -> None:
     partial = replace(drawn(ROOM), material=Material(itu="concrete"))
-    assert build_scene(partial, settings).material == partial.material
+    assert build_scene(partial, settings).materials == (partial.material,)
     folder = export_scene(partial, tmp_path / "scene", settings)
     names = ET.parse(folder / "scene.xml").getroot().iterfind(".//string[@name='type']")
     assert [name.get("value") for name in names] == ["concrete"]

@@ -68,7 +68,7 @@ def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
         names = {name.partition("/")[2] for name in files.getnames()}
     assert {"pyproject.toml", "LICENSE", "CITATION.cff", "scenes/scan.ply"} <= names
     linked = re.findall(r"\]\(([\w/]+\.\w+)\)", (ROOT / "README.md").read_text(encoding="utf-8"))
-    assert {"docs/coverage.png", "CONTRIBUTING.md"} <= set(linked) <= names
+    assert {"docs/coverage.png", "CHANGELOG.md"} <= set(linked) <= names
     assert not [name for name in names if name.startswith(("build/", ".venv/")) or "__pycache__" in name]
 
 

@@ -18,8 +18,8 @@ _PANELS = {
     "rmse_db": "RMSE of the path gain [dB]",
     "rmse_linked_db": "RMSE without outages [dB]",
 }
-_COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377")
-"""Paul Tol's bright colours, the predictor's darkened, for all that `evaluate` compares."""
+_COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377", "#000000")
+"""Paul Tol's bright colours, the predictor's darkened, and black, for all that `evaluate` compares."""
 
 _STYLES: dict[str, dict[str, Any]] = {
     "test": {"marker": "o", "linestyle": "-"},
