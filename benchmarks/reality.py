@@ -15,6 +15,8 @@ of the floor; a Gaussian process about the path loss (Matern 3/2 over the receiv
 import argparse
 import csv
 from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,15 +42,32 @@ def main() -> None:
     parser.add_argument("--map", default="map.yaml", help="name of the map in each folder")
     parser.add_argument("--material", default="drywall")
     parser.add_argument("--opaque-walls", action="store_true")
+    parser.add_argument("--half", action="store_true", help="hide each half of the plan in turn: left, right, ...")
     arguments = parser.parse_args()
     for folder in arguments.folders:
         partial, links, frequency_hz = read_floor(folder, arguments.map)
         settings = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
-        floor = Floor(partial, links, sp.Simulation(partial, settings, sp.SceneSettings(material=arguments.material)))
+        tables = []
+        for seen in halves(partial) if arguments.half else [partial]:
+            simulation = sp.Simulation(seen, settings, sp.SceneSettings(material=arguments.material))
+            tables.append(Floor(seen, links, simulation).table())
         print(f"\n{folder.name}, {arguments.map}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters")
         print("| | " + " | ".join(f"N = {number}" for number in NUMBERS) + " |\n" + "|---" * (len(NUMBERS) + 1) + "|")
-        for method, values in floor.table().items():
+        for method in tables[0]:
+            values = np.mean([table[method] for table in tables], axis=0)
             print(f"| {method} | " + " | ".join(f"{value:.2f}" for value in values) + " |")
+
+
+def halves(partial: sp.PartialMap) -> list[sp.PartialMap]:
+    """Hide the left, right, lower and upper half of what is free or wall."""
+    rows, columns = np.nonzero(partial.state != CellState.UNKNOWN)
+    of_cell = np.indices(partial.shape)
+    hidden = [
+        sign * (each - np.median(known)) > 0.0
+        for each, known in zip(of_cell, (rows, columns), strict=True)
+        for sign in (-1, 1)
+    ]
+    return [replace(partial, state=np.where(each, np.uint8(CellState.UNKNOWN), partial.state)) for each in hidden]
 
 
 def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats], float]:
@@ -74,6 +93,7 @@ class Floor:
         self.partial, self.links, self.simulation = partial, links, simulation
         self.frequency_hz = simulation.trace_settings.frequency_hz
         self.through_walls = simulation.trace_settings.through_walls
+        model = sp.LinkModel(simulation)
         self.free_db, self.walls, self.prior = {}, {}, {}
         for tx, rows in links.items():
             tx_m, rx_m = rows[0, :3], rows[:, 3:6]
@@ -81,7 +101,7 @@ class Floor:
             self.free_db[tx] = 20.0 * np.log10(SPEED_OF_LIGHT_M_S / self.frequency_hz / (4.0 * np.pi * distance_m))
             self.walls[tx] = walls_between(partial, tx_m, rx_m)
             traced = simulation.links(tx_m, rx_m)
-            self.prior[tx] = sp.LinkPrediction.of_trace(sp.link_features(partial, traced)), traced.gain_db
+            self.prior[tx] = model.predict(tx_m, rx_m), traced.gain_db
 
     def table(self) -> dict[str, list[float]]:
         """Return the mean over transmitters of each method's figures, by how many points are given."""
@@ -94,12 +114,13 @@ class Floor:
     def errors(self, tx: str) -> dict[str, list[float]]:
         """Return the figures of one transmitter."""
         loss_db, mean_offset_db = self.loss_elsewhere(tx)
+        others = [self.fitted(each, np.arange(len(self.links[each]))) for each in self.links if each != tx]
         found: dict[str, list[float]] = defaultdict(list)
         for number in NUMBERS:
             draws = defaultdict(list)
             for draw in range(DRAWS):
                 order = np.random.default_rng(draw).permutation(len(self.links[tx]))[:POINTS]
-                for method, value in self.one_draw(tx, order, number, loss_db, mean_offset_db).items():
+                for method, value in self.one_draw(tx, order, number, loss_db, mean_offset_db, others).items():
                     draws[method].append(value)
             for method, values in draws.items():
                 found[method].append(float(np.mean(values)))
@@ -115,8 +136,27 @@ class Floor:
         offsets = [np.mean(each + loss_db * self.walls[other]) for each, other in zip(rest, others, strict=True)]
         return loss_db, float(np.mean(offsets))
 
+    def fitted(self, tx: str, known: NDArray[np.int64], others: Sequence[Assimilation] = ()) -> Assimilation:
+        """Assimilate some of the powers of a transmitter."""
+        rows, (prior, _) = self.links[tx], self.prior[tx]
+        return Assimilation.fit(
+            self.partial,
+            rows[0, :3],
+            sp.Measurements(rows[0, :3], rows[known, 3:6], rows[known, 6]),
+            prior.take(known),
+            frequency_hz=self.frequency_hz,
+            through_walls=self.through_walls,
+            others=others,
+        )
+
     def one_draw(
-        self, tx: str, order: NDArray[np.int64], number: int, loss_db: float, offset_db: float
+        self,
+        tx: str,
+        order: NDArray[np.int64],
+        number: int,
+        loss_db: float,
+        offset_db: float,
+        others: Sequence[Assimilation],
     ) -> dict[str, float]:
         """Return the error of each method, and what the prediction says of its own, with some points given."""
         known, rest = order[:number], order[number:]
@@ -129,25 +169,21 @@ class Floor:
         received = np.maximum(traced_db, traced_db[traced_db > -150.0].min() - 10.0)
         shifts = {"multi-wall": multi_wall, "trace": received}
         guesses = {name: each[rest] + offset(power[known] - each[known], offset_db) for name, each in shifts.items()}
-        measured = sp.Measurements(rows[0, :3], rx_m[known], power[known])
-        fitted = Assimilation.fit(
-            self.partial,
-            rows[0, :3],
-            measured,
-            prior.take(known),
-            frequency_hz=self.frequency_hz,
-            through_walls=self.through_walls,
-        )
-        ours = fitted.update(rx_m[rest], prior.take(rest))
-        mean, std = ours.gain_mean_db + fitted.offset_db, ours.gain_std_db
+        ours = {}
+        for name, given in {"ours": others, "ours, alone": ()}.items():
+            fitted = self.fitted(tx, known, given)
+            after = fitted.update(rx_m[rest], prior.take(rest))
+            ours[name] = after.gain_mean_db + fitted.offset_db, after.gain_std_db, after.p_outage
         guesses |= {
             "path loss": loss[rest],
             "path loss + Gaussian process": loss[rest] + process(rx_m[known], (power - loss)[known], rx_m[rest]),
-            "ours": mean,
         }
+        guesses |= {name: mean_db for name, (mean_db, _, _) in ours.items()}
         errors = {name: float(np.sqrt(np.mean((each - power[rest]) ** 2))) for name, each in guesses.items()}
-        errors["ours: 90 % interval holds"] = float(np.mean(np.abs(mean - power[rest]) <= WITHIN_90 * std))
-        return errors | {"ours: P(outage) > .5": float(np.mean(ours.p_outage > 0.5))}
+        for name, (mean_db, std_db, p_outage) in ours.items():
+            errors[f"{name}: 90 % interval holds"] = float(np.mean(np.abs(mean_db - power[rest]) <= WITHIN_90 * std_db))
+            errors[f"{name}: P(outage) > .5"] = float(np.mean(p_outage > 0.5))
+        return errors
 
 
 def walls_between(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats) -> Floats:

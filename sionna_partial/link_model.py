@@ -40,7 +40,12 @@ from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
-from sionna_partial.measurements.measurements import Measurements, measurements_of_each
+from sionna_partial.measurements.measurements import (
+    SAME_TX_M,
+    Measurements,
+    measurements_of_each,
+    measurements_of_others,
+)
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
@@ -309,13 +314,14 @@ class LinkModel:
         maps = []
         with reporting(progress) as report:
             report(0.0, "building the scene")
+            others = [] if to_be_found or measurements is None else _others(self, sources_m, measurements, at_once)
             for number, (tx_m, grid, measured) in enumerate(zip(sources_m, grids, measured_of_each, strict=True)):
                 antenna = antennas[number]
                 part = part_of(report, number / len(grids), (number + 1) / len(grids))
                 posterior = (
                     _located(self, measured, at_once, antenna, part) if to_be_found and measured is not None else None
                 )
-                source = _transmitter_of(self, posterior or tx_m[0], measured, at_once, antenna)
+                source = _transmitter_of(self, posterior or tx_m[0], measured, at_once, antenna, others)
                 if posterior is not None:
                     positions_m = source.tx_m
                     grid = grid_receivers(self.partial, positions_m, rx_height_m, spacing_m, frequency_hz)
@@ -467,8 +473,12 @@ def _transmitter_of(
     measured: Measurements | None,
     at_once: int,
     antenna: Antenna,
+    others: Sequence[Assimilation],
 ) -> _Transmitter:
-    """Assimilate the measurements for a position (3,) [m], or for several that are drawn from a posterior."""
+    """Assimilate the measurements for a position (3,) [m], or for several that are drawn from a posterior.
+
+    Of the others in the building, what their measurements have in common is known.
+    """
     if isinstance(where, TransmitterPosterior):
         (tx_m, weights, p_powers), position_m = where.draw(POSITIONS), where.position_m
         p_any = float(weights @ [each or 0.0 for each in p_powers])
@@ -482,16 +492,43 @@ def _transmitter_of(
     assimilations = []
     if measured is not None:
         for each_m, each_p in zip(tx_m, p_powers, strict=True):
-            prior, _ = _prior(model, each_m, measured.rx, at_once, antenna)
-            settings = model.simulation.trace_settings
-            of_trace: Any = {"frequency_hz": settings.frequency_hz, "through_walls": settings.through_walls}
-            assimilations.append(Assimilation.fit(model.partial, each_m, measured, prior, p_powers=each_p, **of_trace))
+            elsewhere = [each for each in others if np.linalg.norm(each.tx_m - each_m) > SAME_TX_M]
+            assimilations.append(
+                _assimilated(model, each_m, measured, at_once, antenna, p_powers=each_p, others=elsewhere)
+            )
     return _Transmitter(tx_m, weights, assimilations, position_m, antenna)
+
+
+def _assimilated(
+    model: LinkModel, tx_m: Floats, measured: Measurements, at_once: int, antenna: Antenna, **options: Any
+) -> Assimilation:
+    """Predict the measured links of a transmitter (3,) [m], and fit the process to them."""
+    prior, _ = _prior(model, tx_m, measured.rx, at_once, antenna)
+    settings = model.simulation.trace_settings
+    return Assimilation.fit(
+        model.partial,
+        tx_m,
+        measured,
+        prior,
+        frequency_hz=settings.frequency_hz,
+        through_walls=settings.through_walls,
+        **options,
+    )
+
+
+def _others(model: LinkModel, sources_m: Sequence[Floats], measurements: Any, at_once: int) -> list[Assimilation]:
+    """Assimilate what was measured of other transmitters, each alone; where walls are opaque it teaches nothing."""
+    if not model.simulation.trace_settings.through_walls:
+        return []
+    frequency_hz = model.simulation.trace_settings.frequency_hz
+    others = measurements_of_others(model.partial, sources_m, measurements, frequency_hz)
+    return [_assimilated(model, each.tx[0], each, at_once, Antenna()) for each in others]
 
 
 def _measurement_attributes(measured: Measurements, source: _Transmitter) -> dict[str, Any]:
     """Return attributes of the measurements; a large offset is logged."""
-    noise_db, offset_db = source.weights @ [(each.noise_db, each.offset_db) for each in source.assimilations]
+    of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
+    noise_db, offset_db, shadow_scale = source.weights @ of_each
     if abs(offset_db) > LARGE_OFFSET_DB:
         _log.warning(
             "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
@@ -502,6 +539,7 @@ def _measurement_attributes(measured: Measurements, source: _Transmitter) -> dic
         "measured_links": len(measured),
         "measured_noise_db": float(noise_db),
         "measured_offset_db": float(offset_db),
+        "measured_shadow_scale": float(shadow_scale),
     }
 
 

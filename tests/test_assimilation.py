@@ -158,6 +158,34 @@ def test_powers_say_how_deep_shadows_are():
     assert np.abs(posterior.update(LEFT, certain).gain_mean_db + posterior.offset_db - measured.gain_db).max() < 4.0
 
 
+def test_other_transmitters_teach_the_loss_of_walls_and_the_offset():
+    """Walls cost half of what is predicted, and radios are 50 dB too strong: known from others before five powers."""
+    depth_db, through_walls = np.linspace(0.0, 40.0, 30), {"frequency_hz": 2.4e9, "through_walls": True}
+
+    def links(tx_m: NDArray[np.float64]) -> tuple[sp.Measurements, sp.LinkPrediction]:
+        free_db = -40.0 - 20.0 * np.log10(np.linalg.norm(LEFT - tx_m, axis=1))
+        walls = prior(30, p_outage=0.0, mean_db=free_db - depth_db, std_db=0.0)
+        return sp.Measurements(tx_m, LEFT, free_db - depth_db / 2.0 + 30.0), walls
+
+    others = [
+        Assimilation.fit(HOUSE, tx_m, *links(tx_m), **through_walls)
+        for tx_m in (TX, TX + np.array([0.4, -0.8, 0.0]), TX - np.array([1.2, 0.4, 0.0]))
+    ]
+    measured, walls = links(UNSEEN)
+    shallow = np.arange(3)
+    alone, taught = (
+        Assimilation.fit(HOUSE, UNSEEN, measured.take(shallow), walls.take(shallow), others=some, **through_walls)
+        for some in ([], others)
+    )
+    assert taught.shadow_scale == pytest.approx(0.5, abs=0.25)
+    assert abs(taught.shadow_scale - 0.5) < abs(alone.shadow_scale - 0.5) / 2.0
+    error_db = [
+        np.abs(each.update(LEFT, walls).gain_mean_db + each.offset_db - measured.gain_db).mean()
+        for each in (taught, alone)
+    ]
+    assert error_db[0] < 0.6 * error_db[1]
+
+
 def test_contradictions_count_as_noise():
     twice = np.concatenate([LEFT, LEFT + np.array([0.05, 0.0, 0.0])])
     agreeing, contrary = (fitted(twice, np.repeat([-90.0, -90.0 - gap], 30)) for gap in (0.5, 18.0))
@@ -192,6 +220,18 @@ class TestPredictMap:
             coverage = sp.predict_map(model(), TX, measurements=self.table(-20.0), **OPTIONS)
         assert "dB above the predicted ones: taken for an offset" in caplog.text
         assert coverage.attrs["measured_offset_db"] > 30.0
+
+    def test_others_in_the_file_count_through_walls(self):
+        """Those in walls or outside the map are left out."""
+        wifi = sp.LinkModel(HOUSE, trace_settings=sp.TraceSettings(5e9))
+        positions = np.stack([TX, TX - [0.0, 0.8, 0.0], [0.2, 0.2, 1.5], [99.0, 0.0, 1.5]])
+        table = {"tx": np.repeat(positions, 30, axis=0), "rx": np.tile(LEFT, (4, 1)), "gain_db": np.full(120, -75.0)}
+        one = {name: values[:30] for name, values in table.items()}
+        both = {name: values[:60] for name, values in table.items()}
+        scales = [
+            wifi.coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"] for each in (one, both, table)
+        ]
+        assert scales[1] == scales[2] != scales[0]
 
     def test_receivers_in_walls_are_left_out(self, caplog):
         table = self.table(rx=np.concatenate([LEFT, [[0.2, 0.2, 1.5]]]))

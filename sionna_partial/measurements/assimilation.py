@@ -56,11 +56,13 @@ go through walls, at the frequencies of radios whose offset is seldom known."""
 class Kind(NamedTuple):
     """What measurements may be."""
 
-    offset_db: float
-    """Standard deviation of an offset that all have in common [dB]."""
+    mean: tuple[float, float]
+    """Expected offset that all have in common [dB], and factor on what is predicted below the gain in free space [1].
 
-    shadow: tuple[float, float]
-    """Mean and standard deviation of a factor on what is predicted below the gain in free space [1]."""
+    Together they are what measurements have in common."""
+
+    covariance: Floats
+    """Prior covariance (2, 2) of the two."""
 
     seen_range_m: float
     """Walk over which residuals stay correlated where both ends of a link are in cells that were seen [m]."""
@@ -75,12 +77,33 @@ class Kind(NamedTuple):
     exact: bool
     """Whether what is certain without measurements stays so, as no trace is for a real radio."""
 
+    def learnt(self, others: Sequence[Assimilation]) -> Kind:
+        """Return what is expected of a transmitter given others of the same building, whose means scatter."""
+        within = np.minimum(BETWEEN_TRANSMITTERS, self.covariance)
+        unsure = self.covariance - within
+        precision, shift = np.zeros((2, 2)), np.zeros(2)
+        for each_precision, each_shift in (other._in_common for other in others):
+            scattered = np.linalg.inv(np.eye(2) + each_precision @ within)
+            precision, shift = precision + scattered @ each_precision, shift + scattered @ each_shift
+        left = np.linalg.solve(np.eye(2) + unsure @ precision, unsure)
+        mean = self.mean + left @ (shift - precision @ self.mean)
+        return self._replace(mean=(float(mean[0]), float(mean[1])), covariance=left + within)
 
-KINDS = (Kind(2.0, (1.0, 0.0), 0.8, 1.0, 3.0, True), Kind(40.0, (0.5, 0.2), 4.0, 3.0, math.inf, True))
+
+KINDS = (
+    Kind((0.0, 1.0), np.diag([2.0, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
+    Kind((0.0, 0.5), np.diag([40.0, 0.2]) ** 2, 4.0, 3.0, math.inf, True),
+)
 """Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
 
-KINDS_THROUGH_WALLS = tuple(Kind(offset_db, (1.0, 0.4), 4.0, 5.0, math.inf, False) for offset_db in (2.0, 40.0))
-"""Gains and powers that a real radio received through walls, whose losses are known to 40 %."""
+KINDS_THROUGH_WALLS = tuple(
+    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, 5.0, math.inf, False) for offset_db in (2.0, 40.0)
+)
+"""Gains and powers that a real radio received through walls, whose loss is anything from none to twice the expected
+or more: on measured floors a wall costs 0.5 to 8 dB."""
+
+BETWEEN_TRANSMITTERS = np.diag([6.0, 0.3]) ** 2
+"""Covariance (2, 2) of offset [dB] and factor between the transmitters of a building."""
 
 MOST_POINTS = 500
 """Number of measured positions from which on neighbours are averaged."""
@@ -199,10 +222,33 @@ class _Hypothesis(NamedTuple):
     log_p: float
     kind: Kind
     noise_db: float
-    common: Floats
-    covariance: Floats
+    design: Floats
+    correlation: Floats
     residual: Floats
     noise: Floats
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance (P, P) of the residuals without noise."""
+        return self.correlation + self.design.T @ self.kind.covariance @ self.design
+
+    def log_evidence(self, received: Bools) -> float:
+        """Log-likelihood of the residuals (P,) where something was received, but for a constant."""
+        z = np.maximum(self.residual, -self.kind.deepest)[received]
+        factor = cho_factor(self.covariance[np.ix_(received, received)] + np.diag(self.noise[received] ** 2), lower=True)
+        return float(-0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
+
+    def in_common(self, received: Bools) -> tuple[Floats, Floats]:
+        """Precision (2, 2) of what the measurements have in common, and its product with the mean, without a prior.
+
+        Residuals that are correlated count once: least squares with their covariance would have a factor on shadows
+        from differences between neighbours alone, and those of a trace are wrong.
+        """
+        design, residual = self.design[:, received], self.residual[received]
+        redundancy = self.correlation[np.ix_(received, received)].sum() / max(1, received.sum())
+        weight = 1.0 / (max(1.0, redundancy) * (1.0 + self.noise[received] ** 2))
+        precision = (design * weight) @ design.T
+        return precision, (design * weight) @ residual + precision @ self.kind.mean
 
 
 def _hypotheses(
@@ -214,17 +260,16 @@ def _hypotheses(
     below_db = prior.gain_mean_db - links.free_space_db(measured.rx)
     for kind, p_kind in zip(kinds, (1.0 - p_powers, p_powers), strict=True):
         scale_db = sample.averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
-        factor, spread = kind.shadow
-        residual = sample.averaged(above_db - (factor - 1.0) * below_db) / scale_db
-        common = np.stack([np.full(len(residual), kind.offset_db), spread * sample.averaged(below_db)]) / scale_db
-        covariance = _positive(links.correlation(sample.rx_m, kind)) + common.T @ common
-        believed = np.maximum(residual, -kind.deepest)
+        offset_db, factor = kind.mean
+        residual = sample.averaged(above_db - offset_db - (factor - 1.0) * below_db) / scale_db
+        design = np.stack([np.ones(len(residual)), sample.averaged(below_db)]) / scale_db
+        correlation = _positive(links.correlation(sample.rx_m, kind))
         for each_db, noise_db in sample.noises_db().items():
             log_p = math.log(p_kind) - 0.5 * (math.log(each_db / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
-            log_p += _log_evidence(covariance, believed, noise_db / scale_db, received)
             log_p -= np.log(scale_db[received]).sum()
             mean_db = float(np.sqrt(np.mean(noise_db**2 * sample.size)))
-            yield _Hypothesis(log_p, kind, mean_db, common, covariance, residual, noise_db / scale_db)
+            each = _Hypothesis(log_p, kind, mean_db, design, correlation, residual, noise_db / scale_db)
+            yield each._replace(log_p=log_p + each.log_evidence(received))
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +312,12 @@ class Assimilation(Shown):
     _links: _Links = field(repr=False)
     _weights: Floats = field(repr=False)
     _precision: Floats = field(repr=False)
+    _in_common: tuple[Floats, Floats] = field(repr=False)
+
+    @property
+    def tx_m(self) -> Floats:
+        """The transmitter (3,) [m]."""
+        return self._links.tx_m
 
     @classmethod
     def fit(
@@ -279,6 +330,7 @@ class Assimilation(Shown):
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
         p_powers: float | None = None,
         through_walls: bool = False,
+        others: Sequence[Assimilation] = (),
     ) -> Assimilation:
         """Fit the process to measurements.
 
@@ -297,6 +349,9 @@ class Assimilation(Shown):
         through_walls : bool
             Whether the prior comes from a trace through walls. Measurements are then taken for those of a real radio:
             the loss of walls is inferred with them, and no trace is certain.
+        others : sequence of Assimilation
+            What was fitted to other transmitters of the building through walls, from which their losses and offsets are
+            known in part.
 
         Returns
         -------
@@ -323,7 +378,7 @@ class Assimilation(Shown):
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
         sample = _Sample.of(measured)
-        kinds = KINDS_THROUGH_WALLS if through_walls else KINDS
+        kinds = [kind.learnt(others) for kind in KINDS_THROUGH_WALLS] if through_walls else KINDS
         longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in kinds))
         links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
         if p_powers is None:
@@ -332,16 +387,10 @@ class Assimilation(Shown):
         hypotheses = _hypotheses(sample, links, prior, kinds, min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P))
         best = max(hypotheses, key=lambda each: each.log_p)
         weights, precision = _posterior(best.covariance, best.residual, sample.received, best.noise)
-        in_common, kind = best.common @ weights, best.kind
-        return cls(
-            best.noise_db,
-            float(kind.offset_db * in_common[0]),
-            float(kind.shadow[0] + kind.shadow[1] * in_common[1]),
-            kind,
-            links,
-            weights,
-            precision,
-        )
+        kind = best.kind
+        offset_db, factor = kind.mean + kind.covariance @ best.design @ weights
+        in_common = best.in_common(sample.received)
+        return cls(best.noise_db, float(offset_db), float(factor), kind, links, weights, precision, in_common)
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
         """Return what is predicted of the links to receivers given the measurements, from what was before.
@@ -419,13 +468,6 @@ def _positive(correlation: Floats) -> Floats:
     """Make the correlation (P, P) of positions positive definite: walks are no Euclidean distances."""
     values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
     return (vectors * np.maximum(values, _LEAST_EXPLAINED)) @ vectors.T
-
-
-def _log_evidence(covariance: Floats, residual: Floats, noise: Floats, received: Bools) -> float:
-    """Log-likelihood of the residuals (P,) where something was received, but for a constant."""
-    z = residual[received]
-    factor = cho_factor(covariance[np.ix_(received, received)] + np.diag(noise[received] ** 2), lower=True)
-    return float(-0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
 
 
 def _posterior(covariance: Floats, residual: Floats, received: Bools, noise: Floats) -> tuple[Floats, Floats]:

@@ -41,6 +41,9 @@ SAME_TX_M = 0.5
 MOST_MEASUREMENTS = 20_000
 """Number of measurements that are held against predictions."""
 
+MOST_OTHERS, MOST_OF_OTHER = 12, 100
+"""Number of other transmitters that the loss of walls is learnt from, and of the links of each."""
+
 _log = logging.getLogger(__name__)
 
 _CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
@@ -353,6 +356,25 @@ def measurements_of_each(
         _measured(partial, tx_m, measured, frequency_hz) if is_near else None
         for tx_m, is_near in zip(sources_m, near, strict=True)
     ]
+
+
+def measurements_of_others(
+    partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
+) -> list[Measurements]:
+    """Choose links of the other transmitters that are nearest to those at (1, 3) [m], where links can be predicted."""
+    measured = measurements_of(measurements)
+    usable = np.linalg.norm(measured.rx - measured.tx, axis=1) >= nearest_m(frequency_hz)
+    for ends_m in (measured.tx, measured.rx):
+        usable &= partial.radios_can_stand(ends_m)
+        usable[usable] = clear_of_walls(partial, ends_m[usable])
+    measured = measured.take(usable)
+    places_m, of_place = np.unique(measured.tx, axis=0, return_inverse=True)
+    apart_m = np.min([np.linalg.norm(places_m - tx_m, axis=1) for tx_m in sources_m], axis=0)
+    others = []
+    for place in np.argsort(apart_m, kind="stable")[:MOST_OTHERS]:
+        links = np.flatnonzero(of_place.ravel() == place)
+        others.append(measured.take(links[np.unique(np.linspace(0, len(links) - 1, MOST_OF_OTHER).astype(int))]))
+    return others
 
 
 def _measured(

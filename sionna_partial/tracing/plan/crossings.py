@@ -302,7 +302,7 @@ def _trace(plan, beam, receivers, slabs, depth_m, limits, needed, height_m):  # 
             piece, wall = scratch.piece[i], scratch.piece_wall[i]
             if state[k, 0] > 0 and state[k, 3] > 0:
                 pair, pairs = _add_points(beam[k], own >= 0, piece, receivers, k, pair, pairs)
-            if wall < 0:
+            if wall < 0 or _was_met(node, k, wall):
                 continue
             beam, node, state = grow(beam, count + 2), grow(node, count + 2), grow(state, count + 2)
             value, sequence = grow(value, count + 2), grow(sequence, count + 2)
@@ -358,6 +358,18 @@ def _trace(plan, beam, receivers, slabs, depth_m, limits, needed, height_m):  # 
                     count += 1
         k += 1
     return node[:count], sequence[:count], beam[:count, :2].copy(), value[:count, 0].copy(), pair[:pairs]
+
+
+@njit(cache=True)
+def _was_met(node, beam, wall):  # type: ignore[no-untyped-def]
+    """Whether a beam has met a wall since it was reflected: no line does twice, slivers at corners would for ever."""
+    while beam >= 0:
+        if node[beam, 1] == wall:
+            return True
+        if node[beam, 2] == 0:
+            break
+        beam = node[beam, 0]
+    return False
 
 
 @njit(cache=True)
