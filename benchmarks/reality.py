@@ -10,6 +10,7 @@ the points, which all received, it calls likelier in outage than not.
 
 Baselines: path loss with fitted exponent; multi-wall (COST 231), whose loss per wall comes from the other transmitters
 of the floor; a Gaussian process about the path loss (Matern 3/2 over the receiver's position).
+"ours, alone" does without the links of the floor's other transmitters.
 """
 
 import argparse

@@ -72,7 +72,8 @@ def predict_map(
     trace_settings : TraceSettings, optional
     measurements : Measurements, mapping, data frame or path, optional
         Gains that were measured of this transmitter (see `Measurements`), which improve the prediction of other
-        receivers (`Assimilation`). Those of transmitters farther than 0.5 m from `tx` are not used.
+        receivers (`Assimilation`). Those of transmitters farther than 0.5 m from `tx` are
+        not used where walls are opaque; through walls they teach the loss of walls and the offset of powers.
     receivers : {"indoor", "anywhere"}
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float

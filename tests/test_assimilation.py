@@ -229,7 +229,8 @@ class TestPredictMap:
         one = {name: values[:30] for name, values in table.items()}
         both = {name: values[:60] for name, values in table.items()}
         scales = [
-            wifi.coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"] for each in (one, both, table)
+            wifi.coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
+            for each in (one, both, table)
         ]
         assert scales[1] == scales[2] != scales[0]
 

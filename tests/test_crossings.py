@@ -1,5 +1,7 @@
 """Paths through walls: their loss is that of the walls between, counted once, and none that matters is missing."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +20,7 @@ BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
 STRAIGHT = sp.TraceSettings(frequency_hz=5e9, max_depth=0, power_tolerance_db=0.0)
 REFRACTION, DIFFRACTION = 4, 8
+BLEFLAT = Path(__file__).resolve().parents[1] / ".." / "shared" / "measured" / "bleflat" / "map.yaml"
 
 
 def walled(cells: int, *, resolution_m: float = 0.1, unseen: bool = False) -> sp.PartialMap:
@@ -221,3 +224,19 @@ def test_slopes_of_materials() -> None:
         np.testing.assert_allclose(
             slope[strong], expected[strong], rtol=0.05, atol=0.02 * np.abs(expected[strong]).max()
         )
+
+
+@pytest.mark.skipif(not BLEFLAT.is_file(), reason="the measured flat is not here")
+def test_beams_at_the_corner_of_three_walls_end():
+    """Two walls that touch there each let a sliver of a beam back to the other, for ever, where rounding has it so."""
+    program = f"""
+import numpy as np, sionna_partial as sp
+from sionna_partial.tracing.simulation import clear_of_walls
+flat = sp.load_map({str(BLEFLAT)!r})
+cells = np.argwhere(flat.state == 0)[:, ::-1]
+rx = np.column_stack([np.add(flat.origin_m, (cells + 0.5) * flat.resolution_m), np.full(len(cells), 1.3)])
+rx = rx[clear_of_walls(flat, rx)][5::100]
+simulation = sp.Simulation(flat, sp.TraceSettings(2.44e9), sp.SceneSettings(material="drywall"))
+simulation.links((0.6250000000000001, 0.32500000000000007, 1.3), rx)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=240)

@@ -235,7 +235,9 @@ class _Hypothesis(NamedTuple):
     def log_evidence(self, received: Bools) -> float:
         """Log-likelihood of the residuals (P,) where something was received, but for a constant."""
         z = np.maximum(self.residual, -self.kind.deepest)[received]
-        factor = cho_factor(self.covariance[np.ix_(received, received)] + np.diag(self.noise[received] ** 2), lower=True)
+        factor = cho_factor(
+            self.covariance[np.ix_(received, received)] + np.diag(self.noise[received] ** 2), lower=True
+        )
         return float(-0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
 
     def in_common(self, received: Bools) -> tuple[Floats, Floats]:
