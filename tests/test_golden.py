@@ -18,6 +18,10 @@ NAMES = (
 
 SCENES = ("house", "office", "apartment")
 
+MOST, LARGEST = 1e-3, 0.1
+"""Differences that 95 % of the values, and all of them, may have [dB, m, 1]. Single precision differs between
+processors: by up to 0.04 dB in a traced gain, and by 0.01 dB in a predicted one."""
+
 
 def predicted(scene: str) -> xr.Dataset:
     return sp.predict_map(scenes_folder() / scene / "step100", demo_homes()[scene]["transmitter"], spacing_m=0.3)
@@ -28,7 +32,9 @@ def test_prediction_is_the_pinned_one(scene: str) -> None:
     coverage = predicted(scene)
     with np.load(FOLDER / f"{scene}.npz") as pinned:
         for name in NAMES:
-            np.testing.assert_allclose(coverage[name].to_numpy(), pinned[name], rtol=0.0, atol=1e-4, err_msg=name)
+            found = coverage[name].to_numpy()
+            np.testing.assert_allclose(found, pinned[name], rtol=0.0, atol=LARGEST, err_msg=name)
+            assert np.nanquantile(np.abs(found - pinned[name]), 0.95) <= MOST, name
 
 
 if __name__ == "__main__":
