@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.finder import listed_before
-from sionna_partial.tracing.paths import DIFFRACTION
+from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
 
 Paths = dict[str, NDArray[Any]]

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.links import TracedLinks
-from sionna_partial.tracing.paths import DIFFRACTION
 
 STATES = {sp.LinkState.OUTAGE: "outage", sp.LinkState.LOS: "LOS", sp.LinkState.NLOS: "NLOS"}
 RX_HEIGHT_M = 1.5

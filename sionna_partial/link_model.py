@@ -309,7 +309,9 @@ class LinkModel:
         sources_m = [positions_m] if to_be_found else [each[None] for each in positions_m]
         grids = [grid_receivers(self.partial, tx_m, rx_height_m, spacing_m, frequency_hz) for tx_m in sources_m]
         at_once = _receivers_at_once(self.partial, grids[0], memory_gb)
-        measured_of_each = measurements_of_each(self.partial, sources_m, measurements, frequency_hz)
+        measured_of_each: list[Measurements | None] = [None] * len(sources_m)
+        if measurements is not None:
+            measured_of_each = measurements_of_each(self.partial, sources_m, measurements, frequency_hz)
         attributes = {"rx_height_m": float(rx_height_m), "spacing_m": float(spacing_m), "receivers": receivers}
         maps = []
         with reporting(progress) as report:

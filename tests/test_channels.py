@@ -20,7 +20,7 @@ from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.tracing.engine import load_sionna
-from sionna_partial.tracing.paths import DIFFRACTION
+from sionna_partial.tracing.interactions import DIFFRACTION
 
 TX = np.array([1.03, 2.93, 1.4])
 RX = np.array([[2.21, 1.12, 1.2], [5.02, 2.03, 1.5], [1.9, 3.1, 1.9]])

@@ -26,13 +26,23 @@ ROOMS = {
         *("process", "files", "planar", "llvm"),
     ),
     "maps": (
-        *("mesh.cut", "mesh.mesh", "partial_map", "mesh.cells", "mesh.points", "mesh.files", "ros_map"),
+        *(
+            "mesh.cut",
+            "mesh.mesh",
+            "environment",
+            "wall_cells",
+            "partial_map",
+            "mesh.cells",
+            "mesh.points",
+            "mesh.files",
+            "ros_map",
+        ),
         *("drawings", "bags", "map_files"),
     ),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot"),
-    "scene": (*("lines", "wall_cells", "outlines", "floor_plan", "scene"),),
+    "scene": ("lines", "outlines", "floor_plan", "scene"),
     "tracing": (
-        *("paths", "candidates", "links", "engine", "slab", "bounds"),
+        *("slab", "bounds", "interactions", "paths", "candidates", "links", "engine"),
         *("plan.beams", "plan.specular", "plan.crossings", "plan.diffraction", "plan.crossed_edges"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder"),
         *("path_set", "simulation", "gradients"),
@@ -103,7 +113,6 @@ PLOTS_ARE_FOR = ("plots.", "app.", "cli.", "export", "demo", "reports")
 
 LATER = {
     "export:save_coverage": "`coverage.radio.save`",
-    "scene.wall_cells:wall_cells": "`PartialMap.wall_noise`",
     **dict.fromkeys([f"channels.responses:{name}" for name in ("cir", "cfr", "taps", "spreads")], "`TracedLinks`"),
     "channels.beams:beam_gains": "`TracedLinks.beam_gains`",
     "link_budget:LinkBudget": "`coverage.radio.snr`",

@@ -446,7 +446,7 @@ class TestMemory:
         self, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
         caplog.set_level("INFO", "sionna_partial")
-        monkeypatch.setattr(simulation, "RECEIVERS_OF_PLAN", 1_000)
+        monkeypatch.setattr(simulation, "LARGE_JOB", 1_000)
         rx = _grid(_room(), 0.04)[::6]
         assert len(rx) > 1_600
         with pytest.raises(MemoryLimitError, match=r"memory_gb = 0.001 is too little for about .* give a folder"):

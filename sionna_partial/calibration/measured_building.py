@@ -102,12 +102,8 @@ class MeasuredBuilding:
 
     def with_materials(self, materials: Sequence[Material]) -> PartialMap:
         """Return the map with other materials."""
-        mesh, new = self.partial.mesh, dict(zip(self.start, materials, strict=True))
-        if mesh is None:
-            of_walls = tuple(new.get(f"material{k}", old) for k, old in enumerate(self.partial.wall_materials, 1))
-            return replace(self.partial, material=materials[0], wall_materials=of_walls)
-        named = tuple(new.get(f"material{index}", old) for index, old in enumerate(mesh.materials))
-        return replace(self.partial, mesh=replace(mesh, materials=named))
+        new = dict(zip(self.start, materials, strict=True))
+        return replace(self.partial, **self.partial.environment.with_materials(new))
 
     def paths(
         self, measured: Measurements, trace_settings: TraceSettings, scene_settings: SceneSettings, report: Progress
@@ -164,13 +160,8 @@ def start_materials(
     partial: PartialMap, start: Material | None, scene_settings: SceneSettings, frequency_hz: float
 ) -> dict[str, Material]:
     """Return the materials of a scene by their names there, with constants in place of formulas."""
-    if partial.mesh is None:
-        cells, of_walls = partial.wall_material, (scene_settings.material, *partial.wall_materials)
-        used = [0] if cells is None else np.unique(np.append(cells, 0)).tolist()
-        materials = {f"material{index or ''}": start or of_walls[index] for index in used}
-    else:
-        used, own = np.unique(partial.mesh.material).tolist(), partial.mesh.materials
-        materials = {f"material{index}": start or own[index] or scene_settings.material for index in used}
+    materials = partial.environment.scene_materials(scene_settings.material)
+    materials = {name: start or each for name, each in materials.items()}
     for material in materials.values():
         material.require_frequency(frequency_hz)
     return {name: custom_material(each, frequency_hz) for name, each in materials.items()}

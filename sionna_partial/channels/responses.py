@@ -18,7 +18,7 @@ from sionna_partial.checks import real_array, require, require_bool, require_num
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.tracing.antennas import Antennas
-from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION
+from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, REFLECTION
 
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import TracedLinks

@@ -114,7 +114,7 @@ def explore(
             tx=position,
             progress=part_of(report, 0.1, 0.5),
         )
-        asked, suffix = exploration.at(steps), ".yaml" if complete.mesh is None else ".npz"
+        asked, suffix = exploration.at(steps), complete.environment.suffixes[0]
         maps = {f"steps_{count:03d}{suffix}": partial for count, partial in zip(asked.steps, asked.maps, strict=True)}
         maps[f"complete{suffix}"] = complete
         with atomic_files(out) as folder:

@@ -34,7 +34,7 @@ from sionna_partial.files import (
     output_path,
     read_bytes,
 )
-from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, material_records
+from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
 from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
 from sionna_partial.settings import Material
@@ -139,15 +139,12 @@ def load_map(
             raise MapError(f"{name} is for {kinds} alone, but path = '{source}' is {reader.what}: leave it out.")
     given["strict"] = strict or None
     partial = reader.read(file, **{name: given[name] for name in reader.options if given[name] is not None})
-    if partial.mesh is None:
+    if partial.environment.is_extruded:
         warn_of_odd_states(f"path = '{source}'", partial)
     if wall_height_m is None:
         return partial
     partial = replace(partial, wall_height_m=wall_height_m)
-    if partial.mesh is None:
-        return partial
-    low, _ = partial.height_range_m
-    return replace(partial, mesh=replace(partial.mesh, height_range_m=(low, low + partial.wall_height_m)))
+    return replace(partial, **partial.environment.with_height(partial.wall_height_m))
 
 
 def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mapping[str, object] | None = None) -> None:
@@ -183,7 +180,7 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     target = output_path(path)
     suffix = target.suffix.lower()
     if suffix in (".yaml", ".yml"):
-        if partial.mesh is not None:
+        if suffix not in partial.environment.suffixes:
             raise OutputError(f"path = '{target}' cannot hold the map's mesh: choose .npz, or use export_scene.")
         write_ros_map(partial, target, extra)
     elif suffix == ".npz":
@@ -199,19 +196,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             content["interior_cells"] = partial.interior_cells
         if partial.material is not None:
             content["material"] = json.dumps(asdict(partial.material))
-        if partial.wall_material is not None:
-            content["wall_material"] = partial.wall_material
-            content["wall_materials"] = json.dumps(material_records(partial.wall_materials))
-        if partial.mesh is not None:
-            mesh = partial.mesh
-            content["mesh_vertices_m"], content["mesh_triangles"] = mesh.vertices_m, mesh.triangles
-            content["mesh_material"], content["mesh_materials"] = (
-                mesh.material,
-                json.dumps(material_records(mesh.materials)),
-            )
-            content["mesh_height_range_m"] = mesh.height_range_m
         with atomic_write(target) as stream:
-            np.savez_compressed(stream, **content)
+            np.savez_compressed(stream, **content, **partial.environment.arrays())
     else:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose .yaml, .yml or .npz.")
 

@@ -15,9 +15,11 @@ from scipy import ndimage
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import is_whole, number_of, real_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
-from sionna_partial.display import Pictured, later
+from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
+from sionna_partial.maps.environment import FloorPlan, Mesh
 from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
+from sionna_partial.maps.wall_cells import wall_cells
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -220,11 +222,16 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return x, y, x + nx * self.resolution_m, y + ny * self.resolution_m
 
     @property
+    def environment(self) -> FloorPlan | Mesh:
+        """What stands in it: walls extruded from its cells, or its mesh."""
+        if self.mesh is None:
+            return FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
+        return Mesh(self.mesh)
+
+    @property
     def height_range_m(self) -> tuple[float, float]:
         """World z of floor and ceiling [m]; of a mesh, its ends. Radios are between them."""
-        if self.mesh is None or self.mesh.height_range_m is None:
-            return 0.0, self.wall_height_m
-        return self.mesh.height_range_m
+        return self.environment.height_range_m
 
     @cached_property
     def is_complete(self) -> bool:
@@ -242,12 +249,14 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
         gets into it from free cells without touching a wall. Meshes are never nearly complete.
         """
-        return self.is_complete or (self.mesh is None and not _has_unknown_room(self.state, self.resolution_m))
+        if self.is_complete or not self.environment.is_extruded:
+            return self.is_complete
+        return not _has_unknown_room(self.state, self.resolution_m)
 
     @cached_property
     def wall_noise(self) -> float:
         """How much range noise thickened and roughened the walls, 0 (exact) to 1."""
-        return float(later("scene.wall_cells:wall_cells")(self).noise)
+        return wall_cells(self.state, self.resolution_m).noise
 
     @cached_property
     def alike_cells(self) -> NDArray[np.int32]:
@@ -313,7 +322,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     def _turned_hint(self, points_m: Floats) -> str:
         """Say how positions (N, 3), three at least, would all be free if the array of states were turned."""
         turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
-        can_tell = len(points_m) >= 3 and self.mesh is None and bool((np.abs(points_m) < 1e8).all())
+        can_tell = len(points_m) >= 3 and self.environment.is_extruded and bool((np.abs(points_m) < 1e8).all())
         for name, state in turns.items() if can_tell else ():
             if (replace(self, state=state, wall_material=None).state_at(points_m) == CellState.FREE).all():
                 return f" All {len(points_m)} are free on the map {name}."
@@ -361,13 +370,6 @@ def require_height(partial: PartialMap, name: str, height_m: object) -> None:
 def cell_centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> Floats:
     """Return x and y of the centres of cells (..., 2), rows and columns [m]."""
     return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
-
-
-def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
-    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
-    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    row, start = np.nonzero(step == 1)
-    return row, start, np.nonzero(step == -1)[1]
 
 
 def unknown_pockets(state: States, resolution_m: float) -> Bools:

@@ -21,7 +21,7 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, open_regular, read_bytes
-from sionna_partial.maps.mesh.mesh import SceneMesh, material_records
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import MAX_CELLS, MAX_INTERIOR_CELLS, MapWarning, PartialMap, frontier_cells
 from sionna_partial.settings import Material
 
@@ -169,16 +169,9 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         sheet["interior_cells"] = int(partial.interior_cells)
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
-    if partial.mesh is not None:
-        sheet["mesh"] = {
-            "height_range": [*partial.height_range_m],
-            "materials": material_records(partial.mesh.materials),
-        }
-    images = {}
-    if partial.wall_material is not None:
-        image = f"{path.stem}_wall_material.pgm"
-        sheet["wall_material"] = {"image": image, "materials": material_records(partial.wall_materials)}
-        images[path.with_name(image)] = partial.wall_material
+    image = f"{path.stem}_wall_material.pgm"
+    sheet |= partial.environment.sheet(image)
+    images = {} if partial.wall_material is None else {path.with_name(image): partial.wall_material}
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet

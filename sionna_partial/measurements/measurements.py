@@ -343,8 +343,6 @@ def measurements_of_each(
     partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
 ) -> list[Measurements | None]:
     """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
-    if measurements is None:
-        return [None] * len(sources_m)
     measured = measurements_of(measurements)
     if len(sources_m) > 1:
         apart_m = [np.linalg.norm(measured.tx - tx_m, axis=1) for tx_m in sources_m]

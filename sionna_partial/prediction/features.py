@@ -259,7 +259,7 @@ def _possible_states(
     """
     los, states = link_state == LinkState.LOS, np.arange(len(LinkState))
     possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
-    if partial.mesh is None:
+    if partial.environment.is_extruded:
         walled = walled_m > 0.0
         doubtful = (walled & ~(seen & los)) | ~los
         blocked[doubtful] = _crosses_wall(partial, *(end_m[doubtful] for end_m in ends_m))

@@ -14,9 +14,9 @@ from scipy import ndimage
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.wall_cells import wall_cells
 from sionna_partial.planar import cross
 from sionna_partial.scene.lines import fit_runs
-from sionna_partial.scene.wall_cells import wall_cells
 
 _KEY = 1 << 32
 _LOOK_EDGES = 6
@@ -106,7 +106,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     padded = np.pad(partial.state, margin, constant_values=CellState.UNKNOWN)
     state, transpose, flips = _canonical(padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1])
 
-    walls = wall_cells(PartialMap(state, partial.resolution_m), bridge_gap_m)
+    walls = wall_cells(state, partial.resolution_m, bridge_gap_m)
     graph = _wall_graph(walls.cells, cut_spurs=True)
     shift = _layer_shift(graph.points, walls.peeled)
     chains = [_fitted(graph, shift, points, (1.0 + walls.noise) * tolerance_cells) for points in _chains(graph)]

@@ -20,9 +20,11 @@ from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
+from sionna_partial.maps.environment import Mesh
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.partial_map import PartialMap, require_map, row_runs
+from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
+from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.scene.floor_plan import Plan, prepare_plan
 from sionna_partial.scene.outlines import Outlines, cut_by_material, lattice_outlines, wall_outlines
 from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
@@ -31,9 +33,6 @@ _log = logging.getLogger(__name__)
 
 FLAT_SHAPES = ("floor", "ceiling")
 """Shapes of an exported floor plan beside its walls."""
-
-FAR_M = 1000.0
-"""Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
 
 
 SIONNA_LOAD_GHZ = 3.5
@@ -108,7 +107,7 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
     """Return the settings of a map's scene, with the map's own material, if it has one."""
     settings = settings_or_default("scene_settings", settings, SceneSettings)
     default = partial.material or settings.material
-    used = used_materials(partial, default)
+    used = partial.environment.known_materials(default)
     if used and settings.material not in (DRYWALL, *used):
         _log.warning(
             "material = %s of the scene settings is not used: the map or mesh has its own; leave it out, or set that "
@@ -116,11 +115,6 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
             settings.material,
         )
     return replace(settings, material=default)
-
-
-def used_materials(partial: PartialMap, default: Material) -> set[Material]:
-    """Return the materials of a map, `default` where it names none; those of floor and ceiling count as used."""
-    return {default, *partial.wall_materials} if partial.mesh is None else partial.mesh.used_materials(default)
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
@@ -197,32 +191,31 @@ def export_scene(
     (['map.pgm', 'map.yaml', 'meshes', 'scene.xml'], True)
     """
     require_map("partial", partial)
-    settings = scene_settings_of(partial, scene_settings)
-    material = settings.material
-    if partial.mesh is None:
-        far = max(abs(value) for value in partial.bounds_m) > FAR_M
-        offset_m = [*(partial.origin_m if far else (0.0, 0.0))]
-    else:
-        x0, y0, x1, y1 = partial.bounds_m
-        offset_m = [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), partial.height_range_m)]
-    for each in used_materials(partial, material):
+    settings, environment = scene_settings_of(partial, scene_settings), partial.environment
+    offset_m = environment.scene_offset_m(partial.bounds_m)
+    for each in environment.known_materials(settings.material):
         each.require_frequency(frequency_hz)
     with atomic_folder(folder) as target:
-        if partial.mesh is None:
-            write_scene(build_scene(partial, settings), target, offset_m=offset_m, frequency_hz=frequency_hz)
-        else:
-            write_mesh_scene(
-                partial.mesh, target, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz
-            )
+        write_map(partial, target, settings, offset_m=offset_m, frequency_hz=frequency_hz)
         write_ros_map(partial, target / "map.yaml", {"scene_offset": offset_m})
     return Path(folder)
 
 
-def _whole_offset_m(low_m: float, high_m: float) -> float:
-    """Whole number of metres that takes a far axis to the origin, and takes no digit from any number beyond it."""
-    if max(abs(low_m), abs(high_m)) <= FAR_M:
-        return 0.0
-    return float(np.floor(max(low_m, 0.0)) + np.ceil(min(high_m, 0.0)))
+def write_map(
+    partial: PartialMap, folder: Path, settings: SceneSettings, *, offset_m: Sequence[float], frequency_hz: float
+) -> tuple[Path, SceneGeometry | SceneMesh]:
+    """Write the scene of a map into an existing folder; its `scene.xml`, and what the scene consists of.
+
+    Settings come from `scene_settings_of`; `offset_m` as of `write_scene`.
+    """
+    environment = partial.environment
+    if isinstance(environment, Mesh):
+        mesh, default = environment.mesh, settings.material
+        return write_mesh_scene(
+            mesh, folder, offset_m=offset_m, default_material=default, frequency_hz=frequency_hz
+        ), mesh
+    geometry = build_scene(partial, settings)
+    return write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz), geometry
 
 
 def write_scene(

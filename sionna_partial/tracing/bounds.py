@@ -126,6 +126,13 @@ def reflected_power(largest, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def transmitted_power(transmission, cosine):  # type: ignore[no-untyped-def]
+    """Largest fraction of the power that a wall leaves, however polarised, by its coefficients (K + 1, 2)."""
+    te, tm = transmission[min(int(cosine * (len(transmission) - 1) + 0.5), len(transmission) - 1)]
+    return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
+
+
+@njit(cache=True)
 def most_at_wall(largest, material, cosine):  # type: ignore[no-untyped-def]
     """Upper bound of what a reflection leaves of any field, if the cosine of the angle of incidence is no smaller."""
     return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]

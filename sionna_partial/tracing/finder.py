@@ -15,16 +15,18 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CellState
 from sionna_partial.errors import BackendError
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.progress import part_of
-from sionna_partial.scene.scene import SceneGeometry, build_scene, floor_cells, write_mesh_scene, write_scene
+from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
 from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, set_antennas
+from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.sequences import shoot_rays
-from sionna_partial.tracing.paths import DIFFRACTION, DIFFUSE, REFLECTION, SolvedPaths
+from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
@@ -161,13 +163,10 @@ def write_scene_of(
     Settings come from `checked_settings`.
     """
     offset_m, frequency_hz = partial.origin_m, settings.frequency_hz
-    if partial.mesh is not None:
-        mesh, material = partial.mesh, scene_settings.material
-        xml = write_mesh_scene(mesh, folder, offset_m=offset_m, default_material=material, frequency_hz=frequency_hz)
-        shapes = tuple(f"part{index}" for index in range(len(mesh.materials)))
-        return MeshScene(xml, shapes, settings, mesh.vertices_m - [*offset_m, 0.0], mesh.triangles)
-    geometry = build_scene(partial, scene_settings)
-    xml = write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz)
+    xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz)
+    if isinstance(geometry, SceneMesh):
+        shapes = tuple(f"part{index}" for index in range(len(geometry.materials)))
+        return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles)
     floor = floor_cells(partial, scene_settings.floor_extent)
     interior = Interior(partial.state == CellState.FREE, floor, partial.resolution_m, settings.wall_depth_m)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)
@@ -275,19 +274,15 @@ def _point(position_m: Floats) -> Any:
 
 def _options(settings: TraceSettings) -> dict[str, Any]:
     """Arguments of Sionna RT's path solver."""
-    diffraction, rays = settings.diffraction is True, settings.samples_per_tx
+    rays = settings.samples_per_tx
     every_ray = 1 + rays * settings.max_depth if settings.diffuse_reflection else 0
     return {
         "max_depth": settings.max_depth,
         "max_num_paths_per_src": max(TABLE_SIZE, every_ray),
         "samples_per_src": rays,
         "los": True,
-        "specular_reflection": True,
-        "diffuse_reflection": settings.diffuse_reflection,
-        "refraction": settings.through_walls,
-        "diffraction": diffraction,
-        "edge_diffraction": diffraction,
         "seed": settings.seed,
+        **{argument: kind.is_on(settings) for kind in INTERACTIONS for argument in kind.arguments},
     }
 
 

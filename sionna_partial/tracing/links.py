@@ -14,7 +14,8 @@ from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.paths import REFRACTION, SolvedPaths
+from sionna_partial.tracing.interactions import REFRACTION
+from sionna_partial.tracing.paths import SolvedPaths
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats
 
-REFLECTION, DIFFUSE, REFRACTION, DIFFRACTION = 1, 2, 4, 8
-"""Sionna RT's `InteractionType` of specular and diffuse reflections, refractions and diffractions."""
-
 
 @dataclass(frozen=True)
 class SolvedPaths:

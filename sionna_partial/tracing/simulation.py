@@ -23,10 +23,11 @@ from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
 from sionna_partial.progress import part_of, reporting
-from sionna_partial.scene.scene import scene_settings_of, used_materials
+from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
 from sionna_partial.tracing.finder import ExactFinder, Found, RayFinder, write_scene_of
+from sionna_partial.tracing.interactions import Interaction, only_by_rays, with_defaults
 from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.path_set import PathParameters, PathSet
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
@@ -39,9 +40,8 @@ _log = logging.getLogger(__name__)
 SHORTEST_M = 0.011
 """Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
 
-RECEIVERS_OF_PLAN, RECEIVERS_OF_MESH = 8_000, 50_000
-"""Number of receivers whose paths are found together, which bounds the memory. A mesh has fewer paths, and costs rays
-each time."""
+LARGE_JOB = 8_000
+"""Number of links from which the memory that their paths take is estimated first."""
 
 SAMPLE = 100
 """Number of receivers from which the number of all paths is estimated."""
@@ -224,9 +224,9 @@ class Simulation:
 
     def require_exact(self) -> None:
         """Raise a SettingsError for paths that only rays find, and a BackendError where they must find all."""
-        for name in self._only_by_rays:
+        for kind in self._only_by_rays:
             remedy = "paths that are found by shooting rays have no gradients: give False"
-            require(False, name, True, f"{remedy}, and trace_links for the gain alone.")
+            require(False, kind.setting, True, f"{remedy}, and trace_links for the gain alone.")
         if engine_fault():
             raise BackendError(f"Gradients need the fast engine, and {engine_fault()}: {REMEDY}")
 
@@ -239,16 +239,14 @@ class Simulation:
         return points_m + self._origin_m
 
     @property
-    def _only_by_rays(self) -> list[str]:
-        """Settings that ask for paths which only rays find."""
-        names = "diffuse_reflection", *(() if self.partial.mesh is None else ("diffraction", "refraction"))
-        return [name for name in names if getattr(self.trace_settings, name)]
+    def _only_by_rays(self) -> list[Interaction]:
+        return only_by_rays(self.trace_settings, self.partial.environment.kind)
 
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
         """What finds the paths, with the scene in memory; a warning is logged where only rays do."""
         if self._only_by_rays:
-            names = [name if name == "diffuse_reflection" else f"{name} on a mesh" for name in self._only_by_rays]
+            names = [f"{kind.setting} on a mesh" if kind.exact_on else kind.setting for kind in self._only_by_rays]
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
             _log.warning(message, " and ".join(names).replace("_", " "), self.trace_settings.samples_per_tx)
         with temporary_folder() as folder:
@@ -261,7 +259,7 @@ class Simulation:
         self, tx_m: Floats, rx_m: Floats, rx_of_tx: Iterable[Indices], report: Progress, polarisations: int = 1
     ) -> Iterator[Iterator[Found]]:
         """Find the paths from transmitters (T, 3) to some receivers each, for so many receivers at once as fit."""
-        at_once = RECEIVERS_OF_PLAN if self.partial.mesh is None else RECEIVERS_OF_MESH
+        at_once = self.partial.environment.receivers_at_once
         groups = [
             (tx, chosen[start : start + at_once].astype(np.int32))
             for tx, chosen in enumerate(rx_of_tx)
@@ -308,7 +306,7 @@ class Simulation:
 
         Raises a MemoryLimitError if that is more than `memory_gb`.
         """
-        if valid.sum() <= RECEIVERS_OF_PLAN:
+        if valid.sum() <= LARGE_JOB:
             return
         source = int(valid.sum(axis=1).argmax())
         all_m = rx_m[valid[source]]
@@ -438,14 +436,9 @@ def checked_settings(
     """
     settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
     scene_settings = scene_settings_of(partial, scene_settings)
-    default = scene_settings.material
-    for material in used_materials(partial, default):
+    for material in partial.environment.known_materials(scene_settings.material):
         material.require_frequency(settings.frequency_hz)
-    if settings.diffraction is None:
-        settings = replace(settings, diffraction=partial.mesh is None)
-    if settings.refraction is None:
-        settings = replace(settings, refraction=settings.through_walls and partial.mesh is None)
-    return settings, scene_settings
+    return with_defaults(settings, partial.environment.kind), scene_settings
 
 
 def nearest_m(frequency_hz: float) -> float:

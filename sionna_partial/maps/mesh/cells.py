@@ -13,9 +13,11 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.environment import Mesh
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, row_runs
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
 
@@ -81,7 +83,8 @@ def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
     """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left."""
-    if partial.mesh is None:
+    environment = partial.environment
+    if not isinstance(environment, Mesh):
         return partial
     row, start, end = row_runs(partial.state != CellState.UNKNOWN)
     cells = shapely.union_all(shapely.box(start, row, end, row + 1))
@@ -91,7 +94,7 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
         area = shapely.transform(cells, lambda corners: (corners + first) * partial.resolution_m)
     else:
         area = shapely.transform(cells, lambda corners: corners * partial.resolution_m + partial.origin_m)
-    return replace(partial, mesh=partial.mesh.within(area))
+    return replace(partial, mesh=environment.mesh.within(area))
 
 
 def narrow_areas(free: Bools, resolution_m: float) -> Bools:

@@ -109,10 +109,6 @@ class SceneMesh(Shown):
         """Corners (F, 3, 3) of every triangle [m]."""
         return self.vertices_m[self.triangles]
 
-    def used_materials(self, default: Material) -> set[Material]:
-        """Return the materials of its triangles, with `default` in place of None."""
-        return {self.materials[index] or default for index in np.unique(self.material)}
-
     def within(self, area: Any) -> "SceneMesh":
         """Cut the mesh at the border of an area (shapely, world x and y [m]) seen from above.
 

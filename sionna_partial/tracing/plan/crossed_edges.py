@@ -15,26 +15,25 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.bounds import Strengths, at_edge, at_flats, utd_terms, wedge_angle
+from sionna_partial.tracing.bounds import Strengths, at_edge, at_flats, transmitted_power, utd_terms, wedge_angle
 from sionna_partial.tracing.candidates import Candidates, Wedges
-from sionna_partial.tracing.paths import DIFFRACTION
+from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.plan.crossings import (
-    EDGE,
     Interior,
     Limits,
     Slabs,
     can_bounce_as,
+    columns_of,
     cross_leg,
-    faces_and_kinds,
+    empty_paths,
     has_long_legs,
     least_power,
     trail_of,
-    transmitted_power,
     weakest_needed,
     write_kinds,
 )
 from sionna_partial.tracing.plan.diffraction import angle_rad, edges_of, outside
-from sionna_partial.tracing.plan.specular import Room, merge_heights, unfolded_height
+from sionna_partial.tracing.plan.specular import WALLS, Room, merge_heights, unfolded_height
 
 _EDGES_AT_ONCE = 16
 
@@ -97,19 +96,20 @@ class CrossedEdgeCandidates:
         if not kept.any():
             return
         edge, rx, variant = edge[kept], rx[kept], variant[kept]
-        surface, kind, vertices_m = _written(edge, rx, variant, self._edges, *fixed, trail_of(plan))
-        kind, face, vertices_m, same_wall = faces_and_kinds(surface, kind, vertices_m, self._geometry)
+        written = _written(edge, rx, variant, self._edges, *fixed, trail_of(plan))
         wedge = np.where(arrivals.lit[edge], edge, edge + len(self._wedges.edge_m)).astype(np.int32)
-        face = np.where(kind == DIFFRACTION, self._wedges.face[wedge, :1], face)
-        yield Candidates(rx.astype(np.int32), kind, face, vertices_m, wedge, self._wedges, same_wall), 1.0
+        columns = columns_of(self._geometry, *written)
+        columns["face"] = np.where(columns["kind"] == DIFFRACTION, self._wedges.face[wedge, :1], columns["face"])
+        yield Candidates(rx.astype(np.int32), **columns, wedge=wedge, wedges=self._wedges), 1.0
 
 
 @njit(cache=True)
 def _leg_power(trail, start, count, slabs):  # type: ignore[no-untyped-def]
-    """Fraction of the power that the walls leave among some entries of a trail."""
+    """Fraction of the power that the walls leave of a horizontal path among some entries of a trail."""
     power = 1.0
     for k in range(start, count):
-        power *= transmitted_power(trail, k, slabs)
+        if not trail.same_wall[k]:
+            power *= transmitted_power(slabs.transmission[slabs.material[trail.surface[k]]], trail.cosine[k])
     return power
 
 
@@ -221,22 +221,21 @@ def _listed(group, edges, arrivals, strengths, needed, plan, interior, room, sla
 
 @njit(cache=True)
 def _written(edge, rx, variants, edges, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
-    """Write paths: surfaces (C, D), kinds of `Trail`, -1 where there is nothing, and vertices (C, D, 3) [m]."""
-    columns = len(trail.surface) + 2
-    surface, kind = np.full((len(rx), columns), -1, np.int32), np.full((len(rx), columns), -1, np.int32)
-    vertices, item = np.zeros((len(rx), columns, 3)), np.arange(len(trail.surface))
+    """Write paths as `write_paths` does."""
+    surface, kind, vertices, same_wall = empty_paths(len(rx), trail)
+    item = WALLS + np.arange(len(trail.surface))
     for c in range(len(rx)):
         origin, target = edges.position_m[edge[c]], room.rx_m[rx[c]]
         before = np.hypot(room.tx_m[0] - origin[0], room.tx_m[1] - origin[1])
         onward = np.hypot(target[0] - origin[0], target[1] - origin[1])
         total = before + onward
         count, _ = _to_edge(plan, interior, room.tx_m, origin, before, total, trail)
-        trail.surface[count], trail.kind[count] = 0, EDGE
+        trail.kind[count], trail.same_wall[count] = DIFFRACTION, False
         trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = origin[0], origin[1], before / total
         count, _ = _from_edge(plan, interior, origin, target, onward, total, count + 1, trail)
         if count < 0 or not has_long_legs(trail, count, total):
             continue
         bounces, first, _ = can_bounce_as(variants[c], room)
         merge_heights(item[:count], trail.points[:count], room, target, bounces, first, surface[c], vertices[c])
-        write_kinds(trail, plan, count + bounces, surface[c], kind[c])
-    return surface, kind, vertices
+        write_kinds(trail, plan, count + bounces, surface[c], kind[c], same_wall[c])
+    return surface, kind, vertices, same_wall

@@ -21,9 +21,19 @@ from sionna_partial.scene.scene import SceneGeometry, constants_of
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.bounds import dropped_power
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.paths import DIFFRACTION, REFLECTION, REFRACTION
+from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
 from sionna_partial.tracing.plan.beams import TOLERANCE_M, _add_points, _reflect, _root_beams, _Scratch, _visible_pieces
-from sionna_partial.tracing.plan.specular import CEILING, FLOOR, Room, can_bounce, merge_heights, unfolded_height
+from sionna_partial.tracing.plan.specular import (
+    CEILING,
+    EDGE,
+    FLOOR,
+    WALLS,
+    Room,
+    can_bounce,
+    faces_of,
+    merge_heights,
+    unfolded_height,
+)
 from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
 
 _COSINES = 2048
@@ -48,10 +58,6 @@ _AT_ONCE = 100_000
 
 _PAIRS_AT_ONCE = 5_000
 """Number of pairs whose power is computed by one thread at a time."""
-
-WALL, SAME_WALL, FLAT, EDGE = 1, 2, 3, 4
-"""What a path does, if it is not reflected at a wall (0): it crosses a wall, a further face of that wall, which costs
-nothing, is reflected at floor or ceiling, or diffracted at an edge."""
 
 _FACES = 40
 """Most faces of walls that a leg may cross."""
@@ -204,11 +210,10 @@ class CrossingCandidates:
     def _written(self, tree: Tree, chosen: Indices, variant: Indices) -> Candidates:
         """Write the paths of some pairs."""
         geometry = self._geometry
-        surface, kind, vertices_m = write_paths(
+        written = write_paths(
             tree, chosen, variant, geometry.plan, self._interior, self._room, self._limits, trail_of(geometry.plan)
         )
-        kind, face, vertices_m, same_wall = faces_and_kinds(surface, kind, vertices_m, geometry)
-        return Candidates(tree.pair[chosen, 1].astype(np.int32), kind, face, vertices_m, same_wall=same_wall)
+        return Candidates(tree.pair[chosen, 1].astype(np.int32), **columns_of(geometry, *written))
 
 
 def weakest_needed(power: Floats, tolerance_db: float) -> Floats:
@@ -231,16 +236,18 @@ def least_power(rx: Indices, power: Floats, found: Floats, tolerance_db: float) 
     return least
 
 
-def faces_and_kinds(
-    surface: NDArray[np.int32], kind: NDArray[np.int32], vertices_m: Floats, geometry: SceneGeometry
-) -> tuple[NDArray[np.uint8], NDArray[np.int32], Floats, Bools]:
-    """Turn walls and kinds of `Trail` (C, D) into those of `Candidates`: kind, face, vertices and `same_wall`."""
-    used = max(1, int((kind >= 0).sum(axis=1).max(initial=0)))
-    surface, kind, vertices_m = surface[:, :used], kind[:, :used], vertices_m[:, :used]
-    flat = np.where(vertices_m[:, :, 2] > 0.5 * geometry.height_m, geometry.ceiling_face, geometry.floor_face)
-    face = np.where(kind == FLAT, flat, np.where(kind < 0, -1, 2 * surface)).astype(np.int32)
-    of_kind = np.array([REFLECTION, REFRACTION, REFRACTION, REFLECTION, DIFFRACTION, 0], np.uint8)
-    return of_kind[kind], face, vertices_m, kind == SAME_WALL
+def columns_of(
+    geometry: SceneGeometry, surface: NDArray[np.int32], kind: NDArray[np.uint8], vertices_m: Floats, same_wall: Bools
+) -> dict[str, Any]:
+    """Return columns of `Candidates` (C, D), of which the first have all that is used."""
+    used = max(1, int((kind > 0).sum(axis=1).max(initial=0)))
+    columns = (
+        ("kind", kind),
+        ("face", faces_of(surface, geometry)),
+        ("vertices_m", vertices_m),
+        ("same_wall", same_wall),
+    )
+    return {name: column[:, :used] for name, column in columns}
 
 
 def slabs_of(geometry: SceneGeometry, frequency_hz: float) -> Slabs:
@@ -450,14 +457,16 @@ def _reaches(beam, near, loss, needed):  # type: ignore[no-untyped-def]
 class Trail(NamedTuple):
     """Scratch of one path in the plan: its reflections, and all it meets, in order from the transmitter.
 
-    `surface` are pieces of walls, `kind` 0 where it is reflected, WALL where it crosses a wall, SAME_WALL at further
-    faces of the same wall, `cosine` that of the incidence there; `points` are (x, y, fraction of the length).
+    `surface` are pieces of walls, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a further
+    face of a wall that has been crossed, which costs nothing, and `cosine` that of the incidence there; `points` are
+    (x, y, fraction of the length).
     """
 
     walls: NDArray[np.int64]
     bounce: Floats
     surface: NDArray[np.int64]
     kind: NDArray[np.int64]
+    same_wall: Bools
     cosine: Floats
     points: Floats
     found: Floats
@@ -473,6 +482,7 @@ def trail_of(plan: Plan) -> Trail:
         np.empty((16, 3)),
         np.empty(room, np.int64),
         np.empty(room, np.int64),
+        np.empty(room, np.bool_),
         np.empty(room),
         np.empty((room, 3)),
         np.empty(room),
@@ -531,7 +541,7 @@ def _follow(tree, node, plan, interior, tx_m, target, limits, trail):  # type: i
         if level < k:
             if count >= len(trail.surface) - 1:
                 return -1, crossed, total
-            trail.surface[count], trail.kind[count] = other, 0
+            trail.surface[count], trail.kind[count], trail.same_wall[count] = other, REFLECTION, False
             trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = bx, by, stop
             count += 1
         ax, ay, done, own = bx, by, stop, other
@@ -613,7 +623,8 @@ def _group(plan, interior, ax, ay, dx, dy, length, n, done, stop, count, trail):
             _choose(trail, count, n, begin, j, backwards)
             walls, begin, start, steep = walls + 1, j, t, 1.0
         entry = count + (n - 1 - j if backwards else j)
-        trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, SAME_WALL, cosine
+        trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, cosine
+        trail.same_wall[entry] = True
         trail.points[entry, 0], trail.points[entry, 1] = ax + t * dx, ay + t * dy
         trail.points[entry, 2] = done + t * (stop - done)
         previous, steep = t, min(steep, cosine)
@@ -630,7 +641,7 @@ def _choose(trail, count, n, begin, end, backwards):  # type: ignore[no-untyped-
             other = count + (n - 1 - k if backwards else k)
             rank += trail.cosine[other] < trail.cosine[own] or (trail.cosine[other] == trail.cosine[own] and k < j)
         if rank == (end - begin) // 2:
-            trail.kind[own] = WALL
+            trail.same_wall[own] = False
 
 
 @njit(cache=True)
@@ -685,7 +696,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
             nx, ny, nz = wy / norm, -wx / norm, 0.0
             ax, ay, done = trail.points[item, 0], trail.points[item, 1], trail.points[item, 2]
             item += 1
-            if kind == SAME_WALL:
+            if trail.same_wall[item - 1]:
                 continue
         else:
             stop = trail.points[item, 2] if item < count else 1.0
@@ -696,7 +707,7 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
             inside = 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1]
             if not (inside and interior.floor[row, column]):
                 return 0.0
-            nx, ny, nz, kind, material = 0.0, 0.0, 1.0, 0, 0
+            nx, ny, nz, kind, material = 0.0, 0.0, 1.0, REFLECTION, 0
             turn += 1
         along = kx * nx + ky * ny + kz * nz
         at = abs(along) * _COSINES
@@ -710,10 +721,10 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
         te = ex * sx + ey * sy + ez * sz
         px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
         tm = ex * px + ey * py + ez * pz
-        table = slabs.transmission if kind == WALL else slabs.reflection
+        table = slabs.transmission if kind == REFRACTION else slabs.reflection
         te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
         tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
-        if kind == 0:
+        if kind == REFLECTION:
             kx, ky, kz = kx - 2.0 * along * nx, ky - 2.0 * along * ny, kz - 2.0 * along * nz
             px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
         ex, ey, ez = te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz
@@ -736,7 +747,7 @@ def pair_powers(tree, needed, plan, interior, room, slabs, limits, wavelength, t
         count, crossed, length = _follow(tree, node, plan, interior, room.tx_m, target, limits, trail)
         if count < 0 or crossed == 0 or not has_long_legs(trail, count, length):
             continue
-        reflections = count - np.sum(trail.kind[:count] > 0)
+        reflections = np.sum(trail.kind[:count] == REFLECTION)
         for variant in range(_VARIANTS):
             bounces, first, good = can_bounce_as(variant, room)
             if good and bounces > 0 and node >= 0:
@@ -765,39 +776,34 @@ def has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def write_paths(tree, chosen, variants, plan, interior, room, limits, trail):  # type: ignore[no-untyped-def]
-    """Write chosen pairs: surfaces (C, D), kinds of `Trail` or FLAT, -1 where there is nothing, vertices (C, D, 3)."""
-    columns = len(trail.surface) + 2
-    surface, kind = np.full((len(chosen), columns), -1, np.int32), np.full((len(chosen), columns), -1, np.int32)
-    vertices = np.zeros((len(chosen), columns, 3))
-    item = np.empty(len(trail.surface), np.int64)
+    """Write chosen pairs: surfaces, kinds (C, D) and vertices (C, D, 3) of interactions, and `same_wall` (C, D)."""
+    surface, kind, vertices, same_wall = empty_paths(len(chosen), trail)
+    item = WALLS + np.arange(len(trail.surface))
     for c in range(len(chosen)):
         node, rx = tree.pair[chosen[c], 0], tree.pair[chosen[c], 1]
         target = room.rx_m[rx]
         count, _, _ = _follow(tree, node, plan, interior, room.tx_m, target, limits, trail)
         bounces, first, _ = can_bounce_as(variants[c], room)
-        for k in range(count):
-            item[k] = k
         merge_heights(item[:count], trail.points[:count], room, target, bounces, first, surface[c], vertices[c])
-        write_kinds(trail, plan, count + bounces, surface[c], kind[c])
-    return surface, kind, vertices
+        write_kinds(trail, plan, count + bounces, surface[c], kind[c], same_wall[c])
+    return surface, kind, vertices, same_wall
 
 
 @njit(cache=True)
-def write_kinds(trail, plan, count, surface, kind):  # type: ignore[no-untyped-def]
-    """Put walls and kinds in place of the entries of a trail, and of the flats (negative) among them."""
+def empty_paths(count, trail):  # type: ignore[no-untyped-def]
+    """Surfaces, kinds, vertices and `same_wall` of paths, without any interaction."""
+    shape = count, len(trail.surface) + 2
+    vertices, same_wall = np.zeros((*shape, 3)), np.zeros(shape, np.bool_)
+    return np.zeros(shape, np.int32), np.zeros(shape, np.uint8), vertices, same_wall
+
+
+@njit(cache=True)
+def write_kinds(trail, plan, count, surface, kind, same_wall):  # type: ignore[no-untyped-def]
+    """Put surfaces in place of the entries of a trail, which are numbered as walls, and write the kinds of all."""
     for d in range(count):
-        if surface[d] >= 0:
-            kind[d] = trail.kind[surface[d]]
-            surface[d] = plan.owner[trail.surface[surface[d]]]
-        else:
-            kind[d] = FLAT
-
-
-@njit(cache=True)
-def transmitted_power(trail, entry, slabs):  # type: ignore[no-untyped-def]
-    """Fraction of the power, however polarised, that an entry of a trail leaves of a horizontal path."""
-    if trail.kind[entry] != WALL:
-        return 1.0
-    at = min(int(trail.cosine[entry] * _COSINES + 0.5), _COSINES)
-    te, tm = slabs.transmission[slabs.material[trail.surface[entry]], at]
-    return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
+        entry = surface[d] - WALLS
+        if entry < 0:
+            kind[d] = REFLECTION
+            continue
+        kind[d], same_wall[d] = trail.kind[entry], trail.same_wall[entry]
+        surface[d] = EDGE if kind[d] == DIFFRACTION else WALLS + plan.owner[trail.surface[entry]]

@@ -30,17 +30,19 @@ from sionna_partial.tracing.bounds import (
     wedge_constants,
 )
 from sionna_partial.tracing.candidates import Candidates, Wedges
-from sionna_partial.tracing.paths import DIFFRACTION
+from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
 from sionna_partial.tracing.plan.specular import (
     CEILING,
-    DIFFRACTED,
+    EDGE,
     FLOOR,
+    NOTHING,
+    WALLS,
     Room,
     can_bounce,
     clear,
+    faces_of,
     incidence,
-    interactions_of,
     merge_heights,
     unfold,
     unfolded_height,
@@ -97,6 +99,18 @@ class _Edges(NamedTuple):
     exterior_rad: Floats
     normals: Floats
     utd: Floats
+    material: NDArray[np.int64]
+
+
+class _Leg(NamedTuple):
+    """Scratch of a leg after an edge: walls and points as `unfold` writes them, cosines of the angles of incidence.
+
+    `material` is that of each wall, and at its end that of floor and ceiling.
+    """
+
+    walls: NDArray[np.int64]
+    points: Floats
+    cosine: Floats
     material: NDArray[np.int64]
 
 
@@ -158,8 +172,9 @@ class DiffractionCandidates:
             rx, wedge, surface, vertices_m = _combine(
                 *self._beams[number], groups[number], self._edges, self._arrivals, self._room, self._reflections, own
             )
-            kind, face = interactions_of(surface, geometry)
-            face = np.where(kind == DIFFRACTION, self._wedges.face[wedge, :1], face)
+            edge, met = surface == EDGE, surface != NOTHING
+            kind = np.where(edge, DIFFRACTION, np.where(met, REFLECTION, 0)).astype(np.uint8)
+            face = np.where(edge, self._wedges.face[wedge, :1], faces_of(surface, geometry))
             return Candidates(rx, kind, face, vertices_m, wedge, self._wedges), own.power
 
         for number, (candidates, power) in enumerate(in_order(listed, range(len(groups)))):
@@ -258,46 +273,23 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
     size, first, last = reflections + 1, strengths.first, strengths.last
     rx, wedge = np.empty(1024, np.int32), np.empty(1024, np.int32)
     surface, vertices, used = np.empty((1024, size), np.int32), np.empty((1024, size, 3)), np.int64(0)
-    walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
-    all_walls, all_points, terms = np.empty(size, np.int64), np.empty((size, 3)), np.empty((4, 3))
-    start, pair_rx, pair_node, parent = arrivals.start, beams.pair_rx, beams.pair_node, beams.parent
-    segment, source, walls_m, rx_m, edge_m = beams.segment, beams.source, room.walls_m, room.rx_m, edges.position_m
-    normals, face_rad, exterior_rad, utd = edges.normals, edges.face_rad, edges.exterior_rad, edges.utd
-    heights = _heights(room, size)
-    highest = heights.max()
-    most = _most_of_arrivals(strengths.largest, arrivals, edges.material, highest)
-    wall_material, material = room.wall_material, np.full(size + 1, room.flat_material)
+    leg = _Leg(np.empty(size, np.int64), np.empty((size, 3)), np.empty(size), np.full(size + 1, room.flat_material))
+    met, points, terms = np.empty(size, np.int64), np.empty((size, 3)), np.empty((4, 3))
+    start, pair_rx, pair_node, heights = arrivals.start, beams.pair_rx, beams.pair_node, _heights(room, size)
+    most = _most_of_arrivals(strengths.largest, arrivals, edges.material, heights.max())
     level = np.empty((np.diff(start).max(), size, 2), np.int64)
     for i in range(len(pair_node)):
         here = pair_rx[i]
         if best[i] >= last[here]:
             continue
-        best[i] = LEVELS
-        edge = group[_root(parent, pair_node[i]) // 4]
-        target, origin = rx_m[here], edge_m[edge]
-        after, onward, good = unfold(parent, segment, source, pair_node[i], walls_m, target, walls, points)
-        ox, oy = (points[0, 0], points[0, 1]) if after > 0 else (target[0], target[1])
-        ox, oy = ox - origin[0], oy - origin[1]
-        if not good or np.hypot(ox, oy) < _NEAR_M or not outside(normals[edge], ox, oy)[1]:
+        best[i], edge, target = LEVELS, group[_root(beams.parent, pair_node[i]) // 4], room.rx_m[here]
+        after, onward, departure = _depart(beams, pair_node[i], edges, edge, room, target, leg)
+        if after < 0:
             continue
-        incidence(walls_m, origin, target, walls[:after], points, cosine)
-        for k in range(after):
-            material[k] = wall_material[walls[k]]
-        departure = wedge_angle(angle_rad(face_rad[edge], exterior_rad[edge], ox, oy), exterior_rad[edge])
         pair = here, start[edge], start[edge + 1], reflections - after, onward
-        best[i] = _bound(
-            strengths,
-            arrivals,
-            most,
-            pair,
-            utd[edge],
-            (material, edges.material[edge]),
-            departure,
-            cosine[:after],
-            heights[here],
-            level,
-            terms,
-        )
+        materials = leg.material, edges.material[edge]
+        own = departure, leg.cosine[:after], heights[here]
+        best[i] = _bound(strengths, arrivals, most, pair, edges.utd[edge], materials, *own, level, terms)
         if not first[here] < last[here] or best[i] >= last[here]:
             continue
         for j in range(start[edge], start[edge + 1]):
@@ -309,11 +301,31 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
                     surface, vertices = grow(surface, used + 1), grow(vertices, used + 1)
                     rx[used], wedge[used] = here, edge if arrivals.lit[j] else edge + len(edges.position_m)
                     clear(surface[used], vertices[used])
-                    count = _join(arrivals, j, origin, walls[:after], points, onward, all_walls, all_points)
-                    whole = all_walls[:count], all_points[:count]
-                    merge_heights(*whole, room, target, bounces, CEILING + down, surface[used], vertices[used])
+                    count = _join(
+                        arrivals, j, edges.position_m[edge], leg.walls[:after], leg.points, onward, met, points
+                    )
+                    whole = met[:count], points[:count]
+                    merge_heights(*whole, room, target, bounces, CEILING - down, surface[used], vertices[used])
                     used += 1
     return rx[:used].copy(), wedge[:used].copy(), surface[:used].copy(), vertices[:used].copy()
+
+
+@njit(cache=True)
+def _depart(beams, node, edges, edge, room, target, leg):  # type: ignore[no-untyped-def]
+    """Write a leg from an edge to a receiver: its number of walls (-1 if there is none), length [m] and direction."""
+    origin, exterior = edges.position_m[edge], edges.exterior_rad[edge]
+    count, length, good = unfold(
+        beams.parent, beams.segment, beams.source, node, room.walls_m, target, leg.walls, leg.points
+    )
+    x, y = (leg.points[0, 0], leg.points[0, 1]) if count > 0 else (target[0], target[1])
+    x, y = x - origin[0], y - origin[1]
+    direction = wedge_angle(angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
+    if not good or np.hypot(x, y) < _NEAR_M or not outside(edges.normals[edge], x, y)[1]:
+        return -1, length, direction
+    incidence(room.walls_m, origin, target, leg.walls[:count], leg.points, leg.cosine)
+    for k in range(count):
+        leg.material[k] = room.wall_material[leg.walls[k]]
+    return count, length, direction
 
 
 @njit(cache=True)
@@ -325,7 +337,7 @@ def _heights(room, size):  # type: ignore[no-untyped-def]
             for first in (CEILING, FLOOR):
                 possible = can_bounce(bounces, first, room)
                 height = unfolded_height(room, room.rx_m[rx], bounces, first) if possible else -1.0
-                heights[rx, bounces, first - CEILING] = height
+                heights[rx, bounces, CEILING - first] = height
     return heights
 
 
@@ -421,18 +433,18 @@ def _most_at_walls(largest, material, cosine, count, length, highest):  # type: 
 
 
 @njit(cache=True)
-def _join(arrivals, j, origin, walls, points, onward, all_walls, all_points):  # type: ignore[no-untyped-def]
-    """Write the walls and the edge that a whole path meets, and where, as `unfold` does; return their number."""
+def _join(arrivals, j, origin, walls, points, onward, met, met_points):  # type: ignore[no-untyped-def]
+    """Write the surfaces that a whole path meets in the plan, and where, as `unfold` does; return their number."""
     before, length = arrivals.reflections[j], arrivals.length_m[j]
     total = length + onward
     for n in range(before):
-        all_walls[n] = arrivals.walls[j, n]
-        all_points[n, 0], all_points[n, 1] = arrivals.points[j, n, 0], arrivals.points[j, n, 1]
-        all_points[n, 2] = arrivals.points[j, n, 2] * length / total
-    all_walls[before] = DIFFRACTED
-    all_points[before, 0], all_points[before, 1], all_points[before, 2] = origin[0], origin[1], length / total
+        met[n] = WALLS + arrivals.walls[j, n]
+        met_points[n, 0], met_points[n, 1] = arrivals.points[j, n, 0], arrivals.points[j, n, 1]
+        met_points[n, 2] = arrivals.points[j, n, 2] * length / total
+    met[before] = EDGE
+    met_points[before, 0], met_points[before, 1], met_points[before, 2] = origin[0], origin[1], length / total
     for n in range(len(walls)):
-        all_walls[before + 1 + n] = walls[n]
-        all_points[before + 1 + n, 0], all_points[before + 1 + n, 1] = points[n, 0], points[n, 1]
-        all_points[before + 1 + n, 2] = (length + onward * points[n, 2]) / total
+        met[before + 1 + n] = WALLS + walls[n]
+        met_points[before + 1 + n, 0], met_points[before + 1 + n, 1] = points[n, 0], points[n, 1]
+        met_points[before + 1 + n, 2] = (length + onward * points[n, 2]) / total
     return before + 1 + len(walls)

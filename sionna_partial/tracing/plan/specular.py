@@ -16,11 +16,11 @@ from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.bounds import LEVELS, Strengths, at_flats, at_wall, level_of
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.paths import DIFFRACTION, REFLECTION
+from sionna_partial.tracing.interactions import REFLECTION
 from sionna_partial.tracing.plan.beams import trace_beams
 
-FLOOR, CEILING, DIFFRACTED = -2, -3, -4
-"""Stand for a wall segment where a path meets the floor, the ceiling or a vertical edge."""
+NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
+"""Surfaces by number: no surface, the floor, the ceiling, a vertical edge, and from `WALLS` on the wall segments."""
 
 _PAIRS_AT_ONCE = 200_000
 """Number of (sequence of walls, receiver) pairs in a block of candidates, which bounds the memory."""
@@ -72,18 +72,15 @@ class SpecularCandidates:
             rx, surface, vertices_m = _expand_heights(
                 self._beams, start, stop, self._room, self._max_depth, strengths, self._best
             )
-            yield Candidates(rx, *interactions_of(surface, self._geometry), vertices_m), stop / count
+            kind = np.where(surface == NOTHING, 0, REFLECTION).astype(np.uint8)
+            yield Candidates(rx, kind, faces_of(surface, self._geometry), vertices_m), stop / count
 
 
-def interactions_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """Turn wall segments, FLOOR, CEILING and DIFFRACTED (C, D) into kinds of interactions and faces of the scene.
-
-    Edges have no face yet: -1, as where there is no interaction.
-    """
-    walls = np.arange(len(geometry.segments))
-    face = np.append(2 * walls, [-1, geometry.ceiling_face, geometry.floor_face, -1]).astype(np.int32)
-    kind = np.append(0 * walls + REFLECTION, [DIFFRACTION, REFLECTION, REFLECTION, 0]).astype(np.uint8)
-    return kind[surface], face[surface]
+def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.int32]:
+    """Return the faces of the scene (C, D) of surfaces; edges have none yet: -1, as where there is no surface."""
+    walls = 2 * np.arange(len(geometry.segments))
+    face = np.concatenate([[-1, geometry.floor_face, geometry.ceiling_face, -1], walls]).astype(np.int32)
+    return face[surface]
 
 
 @njit(cache=True, nogil=True)
@@ -106,7 +103,7 @@ def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # ty
     wall_material, flat_material = room.wall_material, room.flat_material
     size = max(1, max_depth)
     walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
-    material = np.full(size + 1, flat_material)
+    met, material = np.empty(size, np.int64), np.full(size + 1, flat_material)
     out_rx, surface, vertices = np.empty(1024, np.int32), np.empty((1024, size), np.int32), np.empty((1024, size, 3))
     count = np.int64(0)
     for i in range(start, stop):
@@ -119,7 +116,7 @@ def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # ty
             continue
         incidence(walls_m, tx_m, target, walls[:k], points, cosine)
         for level in range(k):
-            material[level] = wall_material[walls[level]]
+            met[level], material[level] = WALLS + walls[level], wall_material[walls[level]]
         for bounces in range(max_depth - k + 1):
             for first in (FLOOR, CEILING):
                 if not can_bounce(bounces, first, room):
@@ -136,7 +133,7 @@ def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # ty
                 out_rx, surface, vertices = grow(out_rx, count + 1), grow(surface, count + 1), grow(vertices, count + 1)
                 out_rx[count] = rx
                 clear(surface[count], vertices[count])
-                merge_heights(walls[:k], points[:k], room, target, bounces, first, surface[count], vertices[count])
+                merge_heights(met[:k], points[:k], room, target, bounces, first, surface[count], vertices[count])
                 count += 1
     return out_rx[:count].copy(), surface[:count].copy(), vertices[:count].copy()
 
@@ -145,7 +142,7 @@ def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # ty
 def clear(surface, vertices):  # type: ignore[no-untyped-def]
     """Empty one candidate."""
     for depth in range(len(surface)):
-        surface[depth] = -1
+        surface[depth] = NOTHING
         vertices[depth, 0] = vertices[depth, 1] = vertices[depth, 2] = 0.0
 
 
@@ -228,25 +225,25 @@ def unfold(parent, segment, source, node, all_walls, target, walls, points):  # 
 
 
 @njit(cache=True)
-def merge_heights(walls, points, room, target, bounces, first, surface, vertices):  # type: ignore[no-untyped-def]
-    """Write one candidate: wall reflections and `bounces` alternating floor and ceiling reflections in path order."""
+def merge_heights(met, points, room, target, bounces, first, surface, vertices):  # type: ignore[no-untyped-def]
+    """Write one candidate: what it meets in the plan, and `bounces` reflections at floor and ceiling, in path order."""
     tx, height = room.tx_m, room.height_m
     to_first = tx[2] if first == FLOOR else height - tx[2]
     unfolded = unfolded_height(room, target, bounces, first) if bounces else 1.0
-    at_walls, at_flats = 0, 0
+    at_met, at_flats = 0, 0
     px, py, done = tx[0], tx[1], 0.0
-    for depth in range(len(walls) + bounces):
+    for depth in range(len(met) + bounces):
         fraction = (to_first + at_flats * height) / unfolded if at_flats < bounces else 2.0
-        if at_walls < len(walls) and points[at_walls, 2] <= fraction:
-            px, py, done = points[at_walls, 0], points[at_walls, 1], points[at_walls, 2]
-            surface[depth] = walls[at_walls]
+        if at_met < len(met) and points[at_met, 2] <= fraction:
+            px, py, done = points[at_met, 0], points[at_met, 1], points[at_met, 2]
+            surface[depth] = met[at_met]
             vertices[depth, 0], vertices[depth, 1] = px, py
             vertices[depth, 2] = _height_at(done, room, target, bounces, first, to_first, unfolded)
-            at_walls += 1
+            at_met += 1
             continue
         nx, ny, stop = target[0], target[1], 1.0
-        if at_walls < len(walls):
-            nx, ny, stop = points[at_walls, 0], points[at_walls, 1], points[at_walls, 2]
+        if at_met < len(met):
+            nx, ny, stop = points[at_met, 0], points[at_met, 1], points[at_met, 2]
         part = (fraction - done) / (stop - done) if stop > done else 0.0
         is_floor = (at_flats % 2 == 0) == (first == FLOOR)
         surface[depth] = FLOOR if is_floor else CEILING

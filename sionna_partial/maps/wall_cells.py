@@ -1,14 +1,12 @@
-"""PartialMap -> the wall cells that outlines run through: holes filled, ragged faces smoothed, short gaps closed."""
+"""Cells of a map -> the wall cells that outlines run through: holes filled, faces smoothed, short gaps closed."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools
+from sionna_partial.arrays import Bools, Indices, States
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap, row_runs
 
 MAX_GAP_CELLS = 2
 """Longest gap of FREE cells in a wall that is closed, and longest bump or notch that is levelled [cells]."""
@@ -24,6 +22,9 @@ DEEP_CELLS = 4
 
 PINHOLE_CELLS = 6
 """Largest hole in a wall that is filled [cells]."""
+
+_TURNS = (0, 2, -1, 1)
+"""Quarter turns of a mask, so that each side is at row 0 once, and each corner at row and column 0."""
 
 _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
@@ -46,8 +47,8 @@ class CleanWalls(NamedTuple):
     noise: float
 
 
-def wall_cells(partial: PartialMap, bridge_gap_m: float = 0.5) -> CleanWalls:
-    """Clean the wall cells of a map.
+def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
+    """Clean the wall cells among the states (ny, nx) of a map.
 
     Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
     UNKNOWN cells in seen walls are closed (up to `bridge_gap_m`), and short ones of FREE cells in straight walls
@@ -55,15 +56,16 @@ def wall_cells(partial: PartialMap, bridge_gap_m: float = 0.5) -> CleanWalls:
     was not seen. Of deep walls these are the cells that rays meet, and those of inner corners. Walls two cells thick
     are thinned. Thin walls, posts and specks stay.
     """
-    wall = _fill_pinholes(partial.state == CellState.WALL)
-    free = ~_fill_pinholes((partial.state != CellState.FREE) | wall)
+    wall = _fill_pinholes(state == CellState.WALL)
+    free = ~_fill_pinholes((state != CellState.FREE) | wall)
     wall |= _hidden_corners(wall, free)[0]
-    longest = int(bridge_gap_m / partial.resolution_m + 1e-6)
-    filled = _close_unknown_gaps(wall, free, longest)
-    noise = _level(wall, free)
-    filled |= _close_unknown_gaps(wall, free, longest)
-    for cells, is_free in ((wall, free), (wall.T, free.T)):
-        _close_gaps(cells, is_free, partial.resolution_m, bridge_gap_m)
+    longest = int(bridge_gap_m / resolution_m + 1e-6)
+    filled = _unknown_gaps(wall, free, longest)
+    wall, free, noise = _levelled(wall | filled, free)
+    more = _unknown_gaps(wall, free, longest)
+    wall, filled = wall | more, filled | more
+    wall |= _short_gaps(wall, free, resolution_m, bridge_gap_m)
+    wall |= _short_gaps(wall.T, free.T, resolution_m, bridge_gap_m).T
     seen = wall & ndimage.binary_dilation(free, structure=_SQUARE) & ~_hidden_corners(wall, free)[1]
     label, count = ndimage.label(wall, structure=_SQUARE)
     unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
@@ -80,38 +82,39 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
-    for *masks, is_inner, is_behind in _orientations(wall, free, inner, behind):
-        is_wall, is_free = (np.pad(mask, DEEP_CELLS) for mask in masks)
+    for turns in _TURNS:
+        is_wall, is_free = (np.pad(np.rot90(mask, turns), DEEP_CELLS) for mask in (wall, free))
         row, column = np.nonzero(is_free[:-1, :-1] & is_wall[:-1, 1:] & is_wall[1:, :-1])
         row, column = row + 1, column + 1
         deep = ~is_free[row[:, None, None] + ahead[:, None], column[:, None, None] + ahead].any(axis=(1, 2))
         row, column = row[deep], column[deep]
         ends = ~(is_free[row - 2, column] | is_free[row, column - 2])
-        for found, which in ((is_inner, ends), (is_behind, ~ends)):
-            found[row[which] - DEEP_CELLS, column[which] - DEEP_CELLS] = True
+        for found, which in ((inner, ends), (behind, ~ends)):
+            corners = np.zeros_like(is_wall)
+            corners[row[which], column[which]] = True
+            found |= np.rot90(corners[DEEP_CELLS:-DEEP_CELLS, DEEP_CELLS:-DEEP_CELLS], -turns)
     return inner, behind & ~inner
 
 
-def _level(wall: Bools, free: Bools) -> float:
-    """Level faces in place, and return the noise of `CleanWalls`.
+def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
+    """Return the walls and the FREE cells with level faces, and the noise of `CleanWalls`.
 
     Rays that end at a wall without noise mark one layer of cells with smooth faces; with noise they mark several, with
     rough ones. Walls of plans are thick too, but smooth.
     """
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     faces, hidden = max(1, int(facing.sum())), int((wall & ~facing).sum())
-    was_free = free.copy()
-    for _ in range(2):
-        for wall_view, free_view in _orientations(wall, free):
-            _shave_bumps(wall_view, free_view)
-        for wall_view, free_view in _orientations(wall, free):
-            _fill_notches(wall_view, free_view)
+    was_free = free
+    for level in (_without_bumps, _without_notches) * 2:
+        for turns in _TURNS:
+            turned = level(np.rot90(wall, turns), np.rot90(free, turns))
+            wall, free = (np.rot90(mask, -turns) for mask in turned)
     levelled = int((free != was_free).sum())
-    return min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
+    return wall, free, min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
 
 
-def _close_unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
-    """Fill, in place, gaps of UNKNOWN cells between two pieces of wall, and return the cells filled.
+def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
+    """Return the UNKNOWN cells that close gaps between two pieces of wall.
 
     A gap is a row of UNKNOWN cells beside FREE ones, at most `longest`, that ends at two pieces. The shortest line
     between these closes it, or, where rays passed that line, the row itself.
@@ -132,15 +135,14 @@ def _close_unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
                 line = np.zeros(ends.shape, dtype=bool)
                 line[tuple(np.rint(np.linspace(*from_to, int(apart.min()) + 1)).astype(int).T)] = True
                 filled[around] |= row if (free[around] & line).any() else line
-    filled &= ~wall
-    wall |= filled
-    return filled
+    return filled & ~wall
 
 
-def _orientations(*masks: Bools) -> Iterator[tuple[Bools, ...]]:
-    """Yield views of masks in their four rotations: each side is at row 0 once, and each corner at row and column 0."""
-    for turned in (lambda m: m, lambda m: m[::-1, ::-1], lambda m: m.T[:, ::-1], lambda m: m.T[::-1]):
-        yield tuple(turned(mask) for mask in masks)
+def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
+    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
+    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(step == 1)
+    return row, start, np.nonzero(step == -1)[1]
 
 
 def _fill_pinholes(wall: Bools) -> Bools:
@@ -150,29 +152,31 @@ def _fill_pinholes(wall: Bools) -> Bools:
     return wall | (size <= PINHOLE_CELLS)[label[1:-1, 1:-1]]
 
 
-def _fill_notches(wall: Bools, free: Bools) -> None:
-    """Fill, in place, notches of one or two FREE cells in faces that look towards larger rows."""
-    before = wall.copy()
+def _without_notches(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
+    """Fill notches of one or two FREE cells in faces that look towards larger rows: walls and FREE cells."""
+    wall, free = was_wall.copy(), was_free.copy()
     row, start, end = row_runs(free)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        if before[i, a - 1] and before[i, b] and not free[i - 1, a - 1 : b + 1].any():
+        if was_wall[i, a - 1] and was_wall[i, b] and not free[i - 1, a - 1 : b + 1].any():
             wall[i, a:b], free[i, a:b] = True, False
+    return wall, free
 
 
-def _shave_bumps(wall: Bools, free: Bools) -> None:
-    """Move, in place, bumps of one or two cells back into faces that look towards larger rows."""
-    before, was_free = wall.copy(), free.copy()
+def _without_bumps(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
+    """Move bumps of one or two cells back into faces that look towards larger rows: walls and FREE cells."""
+    wall, free = was_wall.copy(), was_free.copy()
     row, start, end = row_runs(wall)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        sides = was_free[i, a - 1] and was_free[i, b] and before[i - 1, a - 1] and before[i - 1, b]
+        sides = was_free[i, a - 1] and was_free[i, b] and was_wall[i - 1, a - 1] and was_wall[i - 1, b]
         if sides and not was_free[i - 1, a:b].any() and was_free[i + 1 : i + 2, a - 1 : b + 1].all():
             wall[i, a:b], free[i, a:b], wall[i - 1, a:b] = False, True, True
+    return wall, free
 
 
-def _close_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: float) -> None:
-    """Close, in place, short horizontal gaps between walls that are longer than they are thick."""
+def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: float) -> Bools:
+    """Return the cells of short horizontal gaps between walls that are longer than they are thick."""
     row, start, end = row_runs(wall)
     gap = np.where(row[1:] == row[:-1], start[1:] - end[:-1], 0)
     longest = min(MAX_GAP_CELLS, int(bridge_gap_m / resolution_m + 1e-6))
@@ -187,8 +191,8 @@ def _close_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: flo
     label, _ = ndimage.label(filled)
     thickness = [0] + [rows.stop - rows.start for rows, _ in ndimage.find_objects(label)]
     for k in index:
-        if beside[k] >= thickness[label[row[k], end[k]]]:
-            wall[row[k], end[k] : start[k + 1]] = True
+        filled[row[k], end[k] : start[k + 1]] = beside[k] >= thickness[label[row[k], end[k]]]
+    return filled
 
 
 def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
@@ -206,20 +210,22 @@ def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     for removable in (~kept & ~facing, ~kept):
         for (dy, dx), across in (((1, 0), height), ((-1, 0), height), ((0, 1), width), ((0, -1), width)):
             side = ~np.roll(thinned, (-dy, -dx), (0, 1))
-            _peel(thinned, side & np.pad(removable & (across <= np.minimum(width, height)), 1))
+            thinned &= ~_peeled(thinned, side & np.pad(removable & (across <= np.minimum(width, height)), 1))
     return thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing
 
 
-def _peel(wall: Bools, candidates: Bools) -> None:
-    """Remove, in place, the candidates whose removal neither parts the wall nor opens it nor shortens it."""
+def _peeled(wall: Bools, candidates: Bools) -> Bools:
+    """Return the candidates whose removal, one after the other, neither parts the wall nor opens it nor shortens it."""
+    left = wall.copy()
     rows, columns = np.nonzero(candidates)
     for parity in range(4):
         mine = (rows % 2 * 2 + columns % 2) == parity
         row, column = rows[mine], columns[mine]
         ring = ((0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1))
-        around = np.stack([wall[row + dy, column + dx] for dy, dx in ring])
+        around = np.stack([left[row + dy, column + dx] for dy, dx in ring])
         empty = ~around
         corners = [empty[k] & ~(empty[k] & empty[k + 1] & empty[(k + 2) % 8]) for k in (0, 2, 4, 6)]
         simple = np.sum(corners, axis=0) == 1
         gone = simple & (around.sum(axis=0) >= 2)
-        wall[row[gone], column[gone]] = False
+        left[row[gone], column[gone]] = False
+    return wall & ~left

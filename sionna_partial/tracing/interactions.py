@@ -1,0 +1,77 @@
+"""The kinds of interactions of paths: who finds them, whether they can be differentiated, what they leave of a field.
+
+What depends on the kind of an interaction is decided by this table. One more kind is one more row. Sionna RT's rays
+then find its paths. To find every one, on a plan or a mesh, it takes candidates as well: a class with `blocks` in
+`tracing/plan` or `tracing/mesh`, which writes the number of the kind into `Candidates.kind`, leaves out what is weak by
+the bound of its power, and is listed by the scene in `finder.py`. Sionna RT verifies candidates of any kind.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sionna_partial.maps.environment import EnvironmentKind
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.bounds import at_edge, reflected_power, transmitted_power
+from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
+
+
+@dataclass(frozen=True)
+class Interaction:
+    """A kind of interaction.
+
+    Parameters
+    ----------
+    number : int
+        Sionna RT's `InteractionType`.
+    setting : str
+        Field of `TraceSettings` that switches it on; "" where it always is.
+    arguments : tuple of str
+        Arguments of Sionna RT's path solver that switch it on where rays find its paths.
+    exact_on : tuple
+        Kinds of maps on which candidates find every path. These paths can be differentiated; those of rays cannot.
+    coefficients, bound : callable or None
+        Its coefficients TE and TM (`slab.py`), and the bound of what it leaves of a field or its power (`bounds.py`).
+        The coefficients of an edge follow from those of its faces.
+    default : callable
+        Whether paths have it where the setting is None and candidates find it.
+    """
+
+    number: int
+    setting: str
+    arguments: tuple[str, ...]
+    exact_on: tuple[EnvironmentKind, ...]
+    coefficients: Callable[..., Any] | None = None
+    bound: Callable[..., Any] | None = None
+    default: Callable[[TraceSettings], bool] = lambda _: True
+
+    def is_on(self, settings: TraceSettings) -> bool:
+        """Whether settings without None ask for it."""
+        return not self.setting or bool(getattr(settings, self.setting))
+
+
+INTERACTIONS = (
+    Interaction(1, "", ("specular_reflection",), ("plan", "mesh"), reflection_coefficients, reflected_power),
+    Interaction(2, "diffuse_reflection", ("diffuse_reflection",), ()),
+    Interaction(
+        *(4, "refraction", ("refraction",), ("plan",), transmission_coefficients, transmitted_power),
+        default=lambda settings: settings.through_walls,
+    ),
+    Interaction(8, "diffraction", ("diffraction", "edge_diffraction"), ("plan",), reflection_coefficients, at_edge),
+)
+"""All kinds of interactions."""
+
+REFLECTION, DIFFUSE, REFRACTION, DIFFRACTION = (kind.number for kind in INTERACTIONS)
+
+
+def with_defaults(settings: TraceSettings, environment: EnvironmentKind) -> TraceSettings:
+    """Return settings with True or False in place of None: by default, candidates alone find the paths."""
+    unset = [kind for kind in INTERACTIONS if kind.setting and getattr(settings, kind.setting) is None]
+    return replace(
+        settings, **{kind.setting: environment in kind.exact_on and kind.default(settings) for kind in unset}
+    )
+
+
+def only_by_rays(settings: TraceSettings, environment: EnvironmentKind) -> list[Interaction]:
+    """Return the kinds that settings without None ask for and that only rays find on a kind of map."""
+    return [kind for kind in INTERACTIONS if kind.is_on(settings) and environment not in kind.exact_on]
