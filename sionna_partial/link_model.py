@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats
@@ -51,6 +51,7 @@ from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.prediction.wall_losses import WALL_LOSSES, predict_through_walls, wall_loss_db
+from sionna_partial.prediction.windows import map_windows
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
@@ -68,7 +69,7 @@ _FEWEST_RECEIVERS, _MOST_RECEIVERS = 500, 8_000
 """Number of receivers that are predicted together."""
 
 KEPT_BLOCKS = 8
-"""Number of blocks of links that a link model keeps: 20 MB in all."""
+"""Number of blocks of links, and of transmitters' windows, that a link model keeps: 20 MB in all."""
 
 LARGE_OFFSET_DB = 15.0
 """Offset of measurements from which on they are no path gains, but powers [dB]."""
@@ -152,6 +153,7 @@ class LinkModel:
             self._settings = scene.trace_settings, scene.scene_settings
         self.asked = predictor
         self._latest: dict[tuple[bytes, bytes, Antenna], PredictedLinks] = {}
+        self._windows: dict[bytes, NDArray[np.uint8]] = {}
         if predictor is not None:
             warm_predictor(predictor)
 
@@ -189,6 +191,7 @@ class LinkModel:
             self.simulation = Simulation(partial, *self._settings)
             self.__dict__.pop("_every_path", None)
             self._latest.clear()
+            self._windows.clear()
 
     @cached_property
     def _every_path(self) -> Simulation:
@@ -244,9 +247,18 @@ class LinkModel:
         settings, found = None if complete.all() else self.predictor.settings, []
         context = not complete.all() and (settings is None or settings.networks != "paper")
         for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
-            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, frequency_hz, context=context))
+            windows = self._windows_around(tx_m) if context else None
+            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, frequency_hz, windows))
         phi = LinkFeatures.concatenate(found)
         return phi, self.predict_features(phi, complete), complete
+
+    def _windows_around(self, tx_m: Floats) -> NDArray[np.uint8]:
+        """Draw the map around a transmitter (3,) [m]; the latest windows are kept."""
+        key = tx_m.tobytes()
+        if key not in self._windows:
+            self._windows[key] = map_windows(self.partial, tx_m[None, :2])
+            _drop_oldest(self._windows)
+        return self._windows[key]
 
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
         """Predict links from their features; the trace is the prediction of those that are complete."""
@@ -266,8 +278,7 @@ class LinkModel:
         key = tx_m.tobytes(), rx_m.tobytes(), antenna
         if key not in self._latest:
             self._latest[key] = self._new_links(tx_m, rx_m, report, antenna)
-            for oldest in [*self._latest][:-KEPT_BLOCKS]:
-                del self._latest[oldest]
+            _drop_oldest(self._latest)
         return self._latest[key]
 
     def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna) -> PredictedLinks:
@@ -345,6 +356,11 @@ class LinkModel:
     def _complete(self, tx_m: Floats, rx_m: Floats) -> Bools:
         """Whether the trace is the truth of each link from (3,) to (N, 3) [m]: nothing unknown is met."""
         return is_enclosed(self.partial, np.broadcast_to(tx_m, rx_m.shape), rx_m)
+
+
+def _drop_oldest(kept: dict[Any, Any]) -> None:
+    for oldest in [*kept][:-KEPT_BLOCKS]:
+        del kept[oldest]
 
 
 def transmitter_positions(

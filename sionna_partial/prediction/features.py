@@ -495,7 +495,8 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx)
     paths.add(links)
     frequency_hz = links.trace_settings.frequency_hz
-    phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz, windows=windows)
+    phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz)
+    phi = phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
     return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
 
@@ -505,38 +506,32 @@ def features_of_paths(
     rx_m: Floats,
     blocks: Iterable[SolvedPaths],
     frequency_hz: float,
-    *,
-    context: bool = True,
+    windows: NDArray[np.uint8] | None,
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
-    `blocks` are all paths between them, from `Simulation.blocks`. The paper's predictor needs no context.
+    `blocks` are all paths between them, from `Simulation.blocks`, and `windows` those of `map_windows` around the
+    transmitter. Without windows there is no context, which the paper's predictor does not need.
     """
     sums = LinkSums(1, len(rx_m))
     indirect = IndirectPaths(partial, tx_m[None], rx_m)
     for paths in blocks:
         sums.add(paths)
-        if context:
+        if windows is not None:
             indirect.add(paths)
     link_state, gain_db = sums.states_and_gains()
-    return _features(indirect, link_state[0], gain_db[0], frequency_hz, context=context)
+    phi = _features(indirect, link_state[0], gain_db[0], frequency_hz, context=windows is not None)
+    return phi if phi.context is None else replace(phi, context=replace(phi.context, windows=windows))
 
 
 def _features(
-    paths: IndirectPaths,
-    link_state: States,
-    gain_db: Floats,
-    frequency_hz: float,
-    *,
-    context: bool = True,
-    windows: bool = True,
+    paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float, *, context: bool = True
 ) -> LinkFeatures:
-    """Return the features of all links of `paths`, whose states and gains (N,) are given."""
+    """Return the features of all links of `paths`, whose states and gains (N,) are given, without windows."""
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
     distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
     found = paths.context(link_state, unobserved_m) if context else None
-    phi = LinkFeatures(link_state, unobserved_m, distance_m, gain_db, found, frequency_hz)
-    return phi.with_windows((paths.partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
+    return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, found, frequency_hz)
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:

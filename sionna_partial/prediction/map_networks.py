@@ -8,6 +8,7 @@ the numbers of all windows at its receiver. It returns P(link state), and mean a
 sight and without.
 """
 
+import functools
 import itertools
 import logging
 import math
@@ -24,7 +25,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkContext, LinkFeatures, excess_noise
 from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
-from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS
+from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
 from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
@@ -172,6 +173,28 @@ def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> li
     return [each[:-1] - each[-1:] for each in maps]
 
 
+class MapReader:
+    """Reads the windows of transmitters by map networks, and keeps what it has read of the latest ones."""
+
+    def __init__(self, networks: Networks) -> None:
+        self._kept: dict[bytes, list[Any]] = {}
+        self._read: Callable[[Any], list[Any]] = functools.partial(read_maps, networks)
+        signature = [tf.TensorSpec((None, *WINDOWS), tf.float32)]
+        self._compiled = tf.function(self._read, input_signature=signature, autograph=False)
+
+    def __call__(self, windows: NDArray[np.uint8]) -> list[list[Any]]:
+        """Return what `read_maps` does of each window (W, *WINDOWS)."""
+        keys = [window.tobytes() for window in windows]
+        new = [number for number, key in enumerate(keys) if key not in self._kept]
+        known = dict(self._kept)
+        if new:
+            maps = self._read(windows[new].astype(np.float32))
+            self._read = self._compiled  # from the second time on: compiling takes longer than reading once
+            known |= {keys[number]: [each[at : at + 1] for each in maps] for at, number in enumerate(new)}
+        self._kept = dict([*known.items()][-_MAPS_AT_ONCE:])
+        return [known[key] for key in keys]
+
+
 def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
     """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters.
 
@@ -227,12 +250,15 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
 
 
 def evaluate_context_networks(
-    networks: Networks, phi: LinkFeatures, frequency_hz: float
+    networks: Networks, phi: LinkFeatures, frequency_hz: float, read: MapReader | None = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`."""
+    """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`.
+
+    `read` is the reader of these networks, where one is kept.
+    """
     inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
-    for maps, links in _by_window(networks, context_of(phi)):
+    for maps, links in _by_window(networks, context_of(phi), read):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
@@ -241,18 +267,17 @@ def evaluate_context_networks(
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
-def _by_window(networks: Networks, context: LinkContext) -> Iterator[tuple[list[Any], Indices]]:
+def _by_window(networks: Networks, context: LinkContext, read: MapReader | None) -> Iterator[tuple[list[Any], Indices]]:
     """Yield what the map networks read around each transmitter, and its links; without them nothing, and all links."""
     if not reads_maps(networks):
         yield [], np.arange(len(context))
         return
     assert context.windows is not None
+    read = read or MapReader(networks)
     used, links = _links_by_window(context)
     for start in range(0, len(used), _MAPS_AT_ONCE):
-        numbers = used[start : start + _MAPS_AT_ONCE]
-        maps = read_maps(networks, context.windows[numbers].astype(np.float32))
-        for here, number in enumerate(range(start, start + len(numbers))):
-            yield [each[here : here + 1] for each in maps], links[number]
+        here = slice(start, start + _MAPS_AT_ONCE)
+        yield from zip(read(context.windows[used[here]]), links[here], strict=True)
 
 
 def _links_by_window(context: LinkContext) -> tuple[Indices, list[Indices]]:

@@ -23,6 +23,7 @@ from sionna_partial.prediction.features import LinkFeatures, excess_noise, link_
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
+    MapReader,
     context_of,
     evaluate_context_networks,
     fit_context_networks,
@@ -461,7 +462,8 @@ class Predictor(Shown):
         if self.reads_maps:
             _require_windows(features)
         frequency_hz, context = self.settings.frequency_hz, context_of(features)
-        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, frequency_hz))
+        read = _map_reader(self.model) if self.reads_maps else None
+        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, frequency_hz, read))
         if context.nearly_complete.any():
             traced = LinkPrediction.of_nearly_complete(features, frequency_hz)
             trust = 1.0 - (1.0 - NOISY_TRUST) * excess_noise(context.wall_noise)
@@ -624,6 +626,11 @@ def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
 @lru_cache(maxsize=4)
 def _read_once(name: str | None, *identity: object) -> Predictor:
     return Predictor.load(name)
+
+
+@lru_cache(maxsize=4)
+def _map_reader(model: keras.Model) -> MapReader:
+    return MapReader(parts(model))
 
 
 def predictor_path(name_or_path: str | PathLike[str] | None) -> Path:
