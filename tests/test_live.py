@@ -136,17 +136,21 @@ class TestMaps:
         heard.live.on_map_update(update)
         assert heard.step() == [(2, False), (2, True)]
         assert heard[-1].coverage.attrs["map_complete"] == 1
-        for faulty in (Fields(**{**vars(update), "x": 5}), Fields(**{**vars(update), "data": [100]}), Fields()):
-            heard.live.on_map_update(faulty)
+        for faulty in ({"x": 5}, {"data": [100]}, {"data": [65636, 65636]}, {"data": [0.5, 0.5]}):
+            heard.live.on_map_update(Fields(**{**vars(update), **faulty}))
+        heard.live.on_map_update(Fields())
         assert heard.step() == []
         assert "no map has come before it" in caplog.text
         assert "1 x 2 cells at (5, 1) are not on the map of 5 x 4 cells" in caplog.text
+        assert "data holds 65636" in caplog.text
+        assert "data has dtype float64" in caplog.text
 
     @pytest.mark.parametrize(
         ("faulty", "line"),
         [
             (message(frame="odom"), "frame_id = 'odom': the transmitters are given in 'map'"),
             (message(sec=99), "it is 1.00 s older than the last one"),
+            (message(grown(), sec=10**300), "is no time"),
             (message([[100, 7, 120]]), "data holds 120"),
             (message(yaw=math.nan), "is not level"),
             (message(at=(math.nan, 0.0)), "origin_m"),
@@ -162,6 +166,17 @@ class TestMaps:
         heard.live.on_map(faulty)
         assert heard.step() == []
         assert line in caplog.text
+
+    def test_a_failure_does_not_end_it(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        published = heard.live._publish
+        heard.live._publish = lambda answer: published(answer.lost)  # type: ignore[union-attr]
+        heard.live.on_map(message())
+        assert heard.step() == []
+        assert "map for tx not answered: this failed (AttributeError" in caplog.text
+        heard.live._publish = published
+        heard.live.on_map(message(grown()))
+        assert heard.step() == [(2, False), (2, True)]
 
     def test_clock_that_starts_again_is_a_restart(self) -> None:
         heard = Heard()
@@ -222,6 +237,7 @@ class TestListener:
         for each in cycle:
             listener.take("/tf", Fields(transforms=[each]))
         listener.take("/tf", Fields())
+        listener.take("/tf", Fields(transforms=[self.transform("base_link", "wheel", 0.1)]), 9.0)  # not in the chain
         assert heard.live._pose[2] == 7.0  # type: ignore[index]
         assert "is not finite" in caplog.text
 
@@ -289,4 +305,5 @@ def test_lines_are_not_repeated(caplog: pytest.LogCaptureFixture) -> None:
     heard = Heard()
     for _ in range(5):
         heard.live.on_pose(math.nan, 0.0, 0.0)
-    assert len(caplog.records) == 1
+        heard.live.on_map(None)
+    assert len(caplog.records) == 2

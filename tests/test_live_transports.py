@@ -193,9 +193,10 @@ class TestRosbridge:
         robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
         assert "it is tried again" in caplog.text
 
-    def test_refused_address(self) -> None:
+    @pytest.mark.parametrize("url", ["robot:9090", "ws://robot:99999", "ws://[::1", "ws://robot/\0"])
+    def test_refused_address(self, url: str) -> None:
         with pytest.raises(sp.SionnaPartialError, match="give for example ws://robot:9090"):
-            rosbridge.Rosbridge("robot:9090", Topics(), {})
+            rosbridge.Rosbridge(url, Topics(), {})
 
 
 @pytest.mark.usefixtures("command_line")

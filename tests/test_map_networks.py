@@ -18,6 +18,7 @@ from sionna_partial.prediction.map_networks import (
     LINK_OUTPUTS,
     MAP_FEATURES,
     MAP_NETWORKS,
+    MapReader,
     context_networks,
     decode,
     evaluate_context_networks,
@@ -321,6 +322,18 @@ class TestEvaluateContextNetworks:
         many = evaluate_context_networks(networks, phi.take(np.arange(17_000) % 50), FREQUENCY_HZ)
         for one, other in zip(at_once, many, strict=True):
             np.testing.assert_allclose(one, other[:, -50:], rtol=1e-5, atol=1e-5)
+
+    def test_windows_are_read_once_and_the_same_when_compiled(self, networks):
+        rng = np.random.default_rng(11)
+        windows = rng.integers(0, 256, (3, *WINDOWS)).astype(np.uint8)
+        expected = [np.asarray(each) for each in read_maps(networks, windows.astype(np.float32))]
+        read = MapReader(networks)
+        first = read(windows[:1])
+        later = read(windows)  # the first is kept, the others are read by compiled networks
+        assert later[0] is first[0]
+        for number, maps in enumerate(later):
+            for one, every in zip(maps, expected, strict=True):
+                np.testing.assert_array_equal(one[0], every[number])
 
     def test_gains_stay_above_the_floor(self, home):
         def low(links):

@@ -38,7 +38,13 @@ _TOOLTIPS = (
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 
 _UPLOAD = "document.getElementById(id).click()"
-_COPY = "navigator.clipboard ? navigator.clipboard.writeText(area.value) : 0"
+_COPY = """
+const copied = navigator.clipboard ? navigator.clipboard.writeText(area.value) : Promise.reject()
+copied.then(() => { message.text = "Copied." }, () => { message.text = "Select the lines, and copy them with Ctrl-C." })
+"""
+_LOST = (
+    "message.text = 'The connection has ended: start sionna-partial app again, and open the address that it prints.'"
+)
 
 TEMPLATE = """\
 {% block title %}Radio coverage{% endblock %}
@@ -83,8 +89,10 @@ TEMPLATE = """\
       for (const file of input.files) { form.append("file", file); size += file.size }
       input.value = ""
       if (size > {{ most_bytes }}) return alert("Too large: start sionna-partial app with the map's path.")
-      const answer = await fetch("{{ files_url }}/" + kind, { method: "POST", body: form })
-      if (!answer.ok) alert(await answer.text())
+      try {
+        const answer = await fetch("{{ files_url }}/" + kind, { method: "POST", body: form })
+        if (!answer.ok) alert(await answer.text())
+      } catch { alert("The file was not sent: start sionna-partial app again, and open the address that it prints.") }
     }
   }
 </script>
@@ -103,6 +111,8 @@ class Page:
     """
 
     def __init__(self, document: Any, files_url: str) -> None:
+        from bokeh.models import CustomJS
+
         self._files_url = files_url
         self.session = Session(document.add_next_tick_callback, self.show)
         self._is_showing = False
@@ -113,6 +123,7 @@ class Page:
         for name, model in self._roots().items():
             model.name = name
             document.add_root(model)
+        document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=_LOST))
 
     # What is made once
 
@@ -123,7 +134,7 @@ class Page:
         self._ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
         self._values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *_LAYERS, *_HOVERED)})
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
-        self._ways = ColumnDataSource({"xs": [], "ys": []})
+        self._routes = ColumnDataSource({"xs": [], "ys": []})
         self._poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
         plot: Any = figure(
             x_range=DataRange1d(range_padding=0.02),
@@ -149,7 +160,7 @@ class Page:
             name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
         }
         plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
-        plot.multi_line("xs", "ys", source=self._ways, line_color="black", line_dash="dashed", line_width=2)
+        plot.multi_line("xs", "ys", source=self._routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
         points = plot.scatter(
@@ -175,7 +186,7 @@ class Page:
         self.layer = self._on(
             Select(title="Layer", name="layer", value="p_above", options=self._options(1)), lambda _: self.show()
         )
-        self.which = self._on(Select(title="Of", value=""), lambda _: self.show())
+        self.which = self._on(Select(title="Shown for", value=""), lambda _: self.show())
         self.truth = self._on(
             Select(
                 title="Computed for",
@@ -257,7 +268,7 @@ class Page:
         )
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
-        copy.js_on_click(CustomJS(args={"area": self.python}, code=_COPY))
+        copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=_COPY))
         self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
         x, y, z, eirp = self.fields.values()
         frequency, bandwidth, height, spacing = self.radio.values()
@@ -285,7 +296,11 @@ class Page:
         """Give what is chosen to a function; what is refused is shown."""
 
         def changed(_name: str, _old: Any, new: Any) -> None:
-            if not self._is_showing and new is not None:
+            if self._is_showing:
+                return
+            if new is None:  # a field was emptied: what it had comes back
+                self.show()
+            else:
                 self._guarded(take, new)
 
         model.on_change(attribute, changed)
@@ -376,7 +391,7 @@ class Page:
         size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m, cells of {partial.resolution_m:g} m"
         robot = f"; robot after {session.steps} steps" if session.home is not None else ""
         self.map_text.text = f"<b>{html.escape(session.title)}</b>: {size}, {seen}{robot}"
-        self.more.disabled = session.home is None
+        self.more.visible = session.home is not None
         self.example.value = session.title if session.home is not None else ""
         self.truth.visible = session.home is not None
 
@@ -462,7 +477,7 @@ class Page:
 
     def _show_views(self) -> None:
         views = self.session.views or ()
-        self._ways.data = {"xs": [view.path_m[:, 0] for view in views], "ys": [view.path_m[:, 1] for view in views]}
+        self._routes.data = {"xs": [view.path_m[:, 0] for view in views], "ys": [view.path_m[:, 1] for view in views]}
         self._poses.data = {
             "x": [view.position_m[0] for view in views],
             "y": [view.position_m[1] for view in views],
@@ -501,13 +516,13 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
 
 
 def _summary(answer: Answer, threshold_dbm: float) -> str:
-    """Say how much of the floor is covered, and in a home that is known, how good the prediction is."""
+    """State how much of the floor is covered, and in a home that is known, how good the prediction is."""
     area = answer.coverage.radio.area(threshold_dbm, probability=_PROBABILITY, eirp_dbm=answer.eirp_dbm)["fraction"]
-    shares = (
+    fractions = (
         f"<b>{html.escape(str(name))}</b> {float(seen):.0%} of the observed floor, {float(every):.0%} of all"
         for name, seen, every in zip(answer.coverage["tx"].to_numpy(), *area.to_numpy(), strict=True)
     )
-    text = f"Above {threshold_dbm:g} dBm with probability {_PROBABILITY:g}: {'; '.join(shares)}."
+    text = f"Above {threshold_dbm:g} dBm with probability {_PROBABILITY:g}: {'; '.join(fractions)}."
     found = answer.agreement()
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."

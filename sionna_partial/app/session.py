@@ -171,7 +171,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class Status:
-    """What the page says: a message, the fraction of the work that is done or None, and whether it is an error."""
+    """What the page shows: a message, the fraction of the work that is done or None, and whether it is an error."""
 
     message: str = ""
     fraction: float | None = None
@@ -319,18 +319,18 @@ class Session:
 
     # Transmitters and settings
 
-    def put(self, places: Sequence[tuple[str, float, float]]) -> None:
+    def put(self, positions: Sequence[tuple[str, float, float]]) -> None:
         """Take the transmitters (name, x, y) [m] of the picture; a new one has no name yet."""
+        if len(positions) > MOST_TRANSMITTERS:
+            raise SettingsError(f"there are {MOST_TRANSMITTERS} transmitters already: remove one first.")
         found: dict[str, Transmitter] = {}
-        for name, x_m, y_m in places[:MOST_TRANSMITTERS]:
+        for name, x_m, y_m in positions:
             old = self.transmitters.get(name)
             name = name if old else self._new_name([*self.transmitters, *found])
             x_m, y_m = round(float(x_m), 2), round(float(y_m), 2)
             if old is None or (x_m, y_m) != (old.x_m, old.y_m):
                 self.chosen = name
             found[name] = replace(old, x_m=x_m, y_m=y_m) if old else Transmitter(x_m, y_m)
-        if len(places) > MOST_TRANSMITTERS:
-            self.refuse(f"there are {MOST_TRANSMITTERS} transmitters already: remove one first.")
         self._take_transmitters(found)
 
     def add(self) -> None:
@@ -378,8 +378,8 @@ class Session:
         self.predict()
 
     def _is_of_ours(self, measured: Measurements) -> bool:
-        places_m = np.array([each.position_m for each in self.transmitters.values()]).reshape(-1, 3)
-        return bool((np.linalg.norm(measured.tx[:, None] - places_m, axis=2) <= SAME_TX_M).any())
+        positions_m = np.array([each.position_m for each in self.transmitters.values()]).reshape(-1, 3)
+        return bool((np.linalg.norm(measured.tx[:, None] - positions_m, axis=2) <= SAME_TX_M).any())
 
     def _new_name(self, taken: Sequence[str]) -> str:
         return next(name for name in map("tx{}".format, itertools.count(1)) if name not in taken)
@@ -401,7 +401,7 @@ class Session:
         partial, settings, measured, home = self._map(), self.settings, self.measured, self.home
         if not self.transmitters:
             self.cancel()
-            self.answer, self.status = None, Status("Click on the map to put a transmitter.")
+            self.answer, self.status = None, Status('Click on the map to put a transmitter, or press "Add".')
             self._show()
             return
         tx_m, eirp_dbm = self._tx_m(), np.array([each.eirp_dbm for each in self.transmitters.values()])
@@ -476,8 +476,8 @@ class Session:
 
         def take(measured: Measurements) -> None:
             if not self._is_of_ours(measured):
-                place = ", ".join(f"{each:g}" for each in measured.tx[0])
-                remedy = f"move one to ({place}), where that of the first one is."
+                position = ", ".join(f"{each:g}" for each in measured.tx[0])
+                remedy = f"move one to ({position}), where that of the first one is."
                 self.cancel()
                 self.refuse(f"no transmitter is within {SAME_TX_M:g} m of those of the measurements: {remedy}")
                 return
@@ -505,7 +505,7 @@ class Session:
         return model
 
     def begin(self, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Start a job in place of the one before: it yields what is to be done in the session's thread."""
+        """Start a job and cancel the one before: it yields what is to be done in the session's thread."""
         if self._job is not None:
             self._job.is_cancelled.set()
         job = self._job = _Job(self._tell)
@@ -520,7 +520,7 @@ class Session:
             change = next(found, None)
         except _CancelledError:
             return
-        except Exception as error:  # whatever it is, the page says so and stays alive
+        except Exception as error:  # whatever it is, the page shows it and stays alive
             known = isinstance(error, SionnaPartialError | OSError | MemoryError)
             if not known:
                 _log.exception("a job of the app failed")
@@ -547,7 +547,7 @@ class Session:
             self._conclude(status)
 
     def _conclude(self, status: Status) -> None:
-        """Say how a job has ended; an answer to another question than that of the page goes."""
+        """Show how a job has ended; an answer to another question than that of the page goes."""
         self.status = status
         if self._is_outdated:
             self.answer, self._is_outdated = None, False

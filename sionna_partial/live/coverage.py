@@ -16,14 +16,24 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import Checked, Within, number_of, real_array, require, settings_or_default, shown
+from sionna_partial.checks import (
+    Checked,
+    Progress,
+    Within,
+    no_progress,
+    number_of,
+    real_array,
+    require,
+    settings_or_default,
+    shown,
+)
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.coverage_map import probability_above
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.bags import OCCUPIED_PERCENT, map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, grid_array
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.settings import SceneSettings, TraceSettings
 
@@ -42,6 +52,9 @@ POWER_CELL_M = 0.25
 
 MOST_POWERS = 500
 """Number of powers of a transmitter that are kept, the newest ones."""
+
+REPEATED_S, MOST_LINES = 60.0, 50
+"""Time for which a line is not logged again [s], and the number of lines for which that is remembered."""
 
 _log = logging.getLogger(__name__)
 
@@ -142,7 +155,7 @@ class _Grid:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """What tells maps apart."""
+        """By what maps differ."""
         return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
 
     @property
@@ -175,6 +188,10 @@ class _Grid:
             at.append(np.clip(index, 0, coverage.sizes[name] - 1))
         wall = (self.percent >= OCCUPIED_PERCENT) & (self.percent <= 100)
         return np.where(wall, -1, np.nan_to_num(known, nan=-1.0)[tuple(at)]).astype(np.int8)
+
+
+class _NewerMap(Exception):
+    """A newer map waits, and comes first."""
 
 
 def _refusing(method: Callable[..., None]) -> Callable[..., None]:
@@ -251,11 +268,11 @@ class LiveCoverage:
         self._pose: tuple[float, float, float] | None = None
         self._powers: dict[str, dict[tuple[int, int], tuple[float, float, float]]] = {name: {} for name in self.tx_m}
         self._new_powers, self._views_wanted, self._views_s = False, False, -math.inf
-        self._last_line = ""
+        self._lines_s: dict[str, float] = {}
 
     @_refusing
     def on_map(self, message: Any) -> None:
-        """Take a `nav_msgs/OccupancyGrid`, in place of one that waits."""
+        """Take a `nav_msgs/OccupancyGrid`, which replaces one that waits."""
         values, resolution_m, origin = occupancy_parts(message)
         self._take(message, values, resolution_m, origin)
 
@@ -269,8 +286,9 @@ class LiveCoverage:
         ny, nx = last.percent.shape
         if min(x, y) < 0 or min(width, height) < 1 or x + width > nx or y + height > ny:
             raise MapError(f"{width} x {height} cells at ({x}, {y}) are not on the map of {nx} x {ny} cells.")
-        values = last.percent.copy()
-        values[y : y + height, x : x + width] = np.asarray(message.data).reshape(height, width)
+        part = grid_array("data", np.asarray(message.data).reshape(height, width), "iu").astype(np.int64)
+        values = last.percent.astype(np.int64)
+        values[y : y + height, x : x + width] = part
         self._take(message, values, last.resolution_m, last.origin)
 
     @_refusing
@@ -343,15 +361,17 @@ class LiveCoverage:
         return grid is not None or views
 
     def report(self, line: str) -> None:
-        """Log what was refused, and nothing where that is repeated."""
-        if line != self._last_line:
-            self._last_line = line
+        """Log what was refused, the same line once a minute."""
+        now_s = time.monotonic()
+        if now_s - self._lines_s.get(line, -math.inf) >= REPEATED_S:
+            self._lines_s.pop(line, None)
+            self._lines_s = dict([*self._lines_s.items()][-MOST_LINES:]) | {line: now_s}
             _log.warning("%s", line)
 
     def _take(
         self, message: Any, values: NDArray[Any], resolution_m: float, origin: tuple[float, float, float]
     ) -> None:
-        """Check a map, and let it wait in place of an older one, unless it is the same as the newest."""
+        """Check a map, and let it wait and replace an older one, unless it is the same as the newest."""
         frame, stamp = _frame_and_stamp(message)
         if self.frame and frame != self.frame:
             raise MapError(f"frame_id = {shown(frame)}: the transmitters are given in {shown(self.frame)}.")
@@ -368,33 +388,49 @@ class LiveCoverage:
                 self._changed.notify_all()
 
     def _guarded(self, what: str, compute: Callable[..., None], *given: Any) -> None:
+        """Compute, and log why something is not answered; a coarse answer, "", is followed by the final one's line."""
         try:
             compute(*given)
-        except (SionnaPartialError, OSError, MemoryError) as error:
-            self.report(f"{what} not answered: {error}")
+        except _NewerMap:
+            raise
+        except Exception as error:  # whatever it is, the next map may be answered
+            known = isinstance(error, SionnaPartialError | OSError | MemoryError)
+            reason = str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
+            if what:
+                self.report(f"{what} not answered: {reason}")
 
     def _compute(self, grid: _Grid) -> None:
         if self._model is None:
             self._model = LinkModel(grid.partial, **self._model_settings)
         self._model.update(grid.partial)
-        spacing_m = self.settings.spacing_m
         if grid.number != self._answered:
-            self._each(grid, COARSER * spacing_m)
-        self._answered = grid.number
-        self._gave_way = self._waiting is not None and not self._gave_way
-        if not self._gave_way:  # else a newer map comes first; once, so that there is a fine answer now and then
-            self._each(grid, spacing_m)
+            self._each(grid, is_final=False)
+        self._answered, may_give_way, self._gave_way = grid.number, not self._gave_way, False
+        try:  # once a newer map comes first, and then not, so that there is a fine answer now and then
+            self._each(grid, is_final=True, report=self._give_way if may_give_way else no_progress)
+        except _NewerMap:
+            self._gave_way = True
 
-    def _each(self, grid: _Grid, spacing_m: float) -> None:
+    def _give_way(self, fraction: float, message: str) -> None:
+        """End a final answer as soon as a newer map waits."""
+        if self._waiting is not None:
+            raise _NewerMap
+
+    def _each(self, grid: _Grid, *, is_final: bool, report: Progress = no_progress) -> None:
         for name, tx_m in self.tx_m.items():
-            self._guarded(f"map for {name}", self._answer, grid, name, tx_m, spacing_m)
+            self._guarded(f"map for {name}" if is_final else "", self._answer, grid, name, tx_m, is_final, report)
 
-    def _answer(self, grid: _Grid, name: str, tx_m: Floats, spacing_m: float) -> None:
+    def _answer(self, grid: _Grid, name: str, tx_m: Floats, is_final: bool, report: Progress) -> None:
         assert self._model is not None
-        height_m = self.settings.rx_height_m
-        measured = self._measured(name)
-        coverage = self._model.coverage(tx_m, spacing_m=spacing_m, rx_height_m=height_m, measurements=measured)
-        cost, is_final = grid.cost(coverage, self.settings.threshold_db), spacing_m == self.settings.spacing_m
+        spacing_m = self.settings.spacing_m * (1 if is_final else COARSER)
+        coverage = self._model.coverage(
+            tx_m,
+            spacing_m=spacing_m,
+            rx_height_m=self.settings.rx_height_m,
+            measurements=self._measured(name),
+            progress=report,
+        )
+        cost = grid.cost(coverage, self.settings.threshold_db)
         age_s = time.monotonic() - grid.came_s
         self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, grid.header, grid.info, age_s))
 
@@ -445,6 +481,10 @@ def _frame_and_stamp(message: Any) -> tuple[str, tuple[int, int]]:
         next((int(getattr(stamp, name)) for name in names if hasattr(stamp, name)), 0)
         for names in (("sec", "secs"), ("nanosec", "nsecs"))
     )
+    if not (-(2**31) <= seconds < 2**32 and 0 <= nanoseconds < 2**32):
+        raise MapError(
+            f"header.stamp = ({shown(seconds)}, {shown(nanoseconds)}) is no time: give seconds, nanoseconds."
+        )
     return str(getattr(header, "frame_id", "")).lstrip("/"), (seconds, nanoseconds)
 
 

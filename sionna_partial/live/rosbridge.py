@@ -41,12 +41,16 @@ class Rosbridge:
     """
 
     def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
-        if not re.fullmatch(r"wss?://[^/\s]+(/\S*)?", url):
-            raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
         try:
-            import websockets.sync.client  # noqa: F401
+            from websockets.uri import parse_uri
         except ImportError as error:
             raise SettingsError("rosbridge needs websockets: pip install 'sionna-partial[live]'.") from error
+        try:
+            good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
+        except ValueError:  # a port that is none
+            good = False
+        if not good:
+            raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
         self.url, self.topics, self._names = url, topics, names
         self._socket: Any = None
         self._last: dict[str, str] = {}

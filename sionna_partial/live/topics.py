@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 
 MOST_FRAMES = 1000
-"""Number of frames of a robot that are kept, and of steps from one to the map."""
+"""Number of frames of a robot that are kept."""
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
 """Types of what is published."""
@@ -106,12 +106,10 @@ class Listener:
                 raise ValueError(f"the transform from {parent!r} to {child!r} is not finite")
             if child in self._frames or len(self._frames) < MOST_FRAMES:
                 self._frames[child] = _Transform(parent, Rotation.from_quat(quaternion).as_matrix(), position_m)
-        position_m, frame = np.zeros(3), self.topics.robot_frame
-        for _ in range(MOST_FRAMES):
-            if frame == self.live.frame:
-                self.live.on_pose(float(position_m[0]), float(position_m[1]), now_s)
-                break
-            if frame not in self._frames:
-                break
+        position_m, frame, passed = np.zeros(3), self.topics.robot_frame, set[str]()
+        while frame != self.live.frame and frame in self._frames and frame not in passed:
+            passed.add(frame)
             frame, turn, origin_m = self._frames[frame]
             position_m = turn @ position_m + origin_m
+        if frame == self.live.frame and passed & {each.child_frame_id.lstrip("/") for each in message.transforms}:
+            self.live.on_pose(float(position_m[0]), float(position_m[1]), now_s)
