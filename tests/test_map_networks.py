@@ -324,16 +324,13 @@ class TestEvaluateContextNetworks:
             np.testing.assert_allclose(one, other[:, -50:], rtol=1e-5, atol=1e-5)
 
     def test_windows_are_read_once_and_the_same_when_compiled(self, networks):
-        rng = np.random.default_rng(11)
-        windows = rng.integers(0, 256, (3, *WINDOWS)).astype(np.uint8)
-        expected = [np.asarray(each) for each in read_maps(networks, windows.astype(np.float32))]
+        windows = np.random.default_rng(11).integers(0, 256, (3, *WINDOWS)).astype(np.uint8)
         read = MapReader(networks)
-        first = read(windows[:1])
-        later = read(windows)  # the first is kept, the others are read by compiled networks
-        assert later[0] is first[0]
-        for number, maps in enumerate(later):
-            for one, every in zip(maps, expected, strict=True):
-                np.testing.assert_array_equal(one[0], every[number])
+        for some in (windows[:1], windows[1:], windows):  # all but the first are read by compiled networks
+            maps = read(some)
+            assert read(some) is maps
+            for number, expected in enumerate(read_maps(networks, some.astype(np.float32))):
+                np.testing.assert_array_equal(np.concatenate([each[number] for each in maps]), expected)
 
     def test_gains_stay_above_the_floor(self, home):
         def low(links):

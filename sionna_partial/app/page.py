@@ -81,6 +81,17 @@ TEMPLATE = """\
 <input type="file" id="map-file" multiple hidden accept="{{ map_suffixes }}" aria-label="Map files">
 <input type="file" id="csv-file" hidden accept=".csv" aria-label="Measurements">
 <script>
+  const labels = {
+    "noUi-handle": "Threshold [dBm]", "bk-spin-btn-up": "more", "bk-spin-btn-down": "less",
+    "bk-events": "Map; the fields x and y move its transmitters",
+  }
+  document.addEventListener("focusin", event => {
+    const node = event.composedPath()[0]
+    const name = Object.keys(labels).find(each => node.classList?.contains(each))
+    if (name || node.title) node.setAttribute("aria-label", labels[name] ?? node.title)
+    if (name == "bk-events") node.setAttribute("role", "img")
+    else if (node.tagName == "DIV" && node.title) node.setAttribute("role", "button")
+  })
   for (const [id, kind] of [["map-file", "map"], ["csv-file", "measurements"]]) {
     const input = document.getElementById(id)
     input.onchange = async () => {

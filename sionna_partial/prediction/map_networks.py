@@ -70,7 +70,7 @@ _FADE_CELLS = 8.0
 """Width of the rim of a window in which its numbers fade to 0 [cells]."""
 
 _IMPOSSIBLE = -1e30
-_LINKS_AT_ONCE, _MAPS_AT_ONCE = 16_384, 8
+_LINKS_AT_ONCE, _MAPS_AT_ONCE, _MAPS_KEPT = 16_384, 8, 8
 _REPORT_STEPS = 50
 
 _log = logging.getLogger(__name__)
@@ -174,25 +174,23 @@ def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> li
 
 
 class MapReader:
-    """Reads the windows of transmitters by map networks, and keeps what it has read of the latest ones."""
+    """Reads the windows of transmitters by map networks, and keeps what it has read last."""
 
     def __init__(self, networks: Networks) -> None:
-        self._kept: dict[bytes, list[Any]] = {}
+        self._kept: dict[bytes, list[list[Any]]] = {}
         self._read: Callable[[Any], list[Any]] = functools.partial(read_maps, networks)
         signature = [tf.TensorSpec((None, *WINDOWS), tf.float32)]
         self._compiled = tf.function(self._read, input_signature=signature, autograph=False)
 
     def __call__(self, windows: NDArray[np.uint8]) -> list[list[Any]]:
-        """Return what `read_maps` does of each window (W, *WINDOWS)."""
-        keys = [window.tobytes() for window in windows]
-        new = [number for number, key in enumerate(keys) if key not in self._kept]
-        known = dict(self._kept)
-        if new:
-            maps = self._read(windows[new].astype(np.float32))
+        """Return what `read_maps` does of each window (W, *WINDOWS); the bytes depend on how many are read together."""
+        key, kept = windows.tobytes(), self._kept
+        if key not in kept:
+            maps = self._read(windows.astype(np.float32))
             self._read = self._compiled  # from the second time on: compiling takes longer than reading once
-            known |= {keys[number]: [each[at : at + 1] for each in maps] for at, number in enumerate(new)}
-        self._kept = dict([*known.items()][-_MAPS_AT_ONCE:])
-        return [known[key] for key in keys]
+            each_window = [[each[at : at + 1] for each in maps] for at in range(len(windows))]
+            self._kept = kept = dict([*kept.items()][1 - _MAPS_KEPT :]) | {key: each_window}
+        return kept[key]
 
 
 def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
