@@ -385,7 +385,8 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         before = tab.run(f"{_MODEL}('python').value")
         for _ in range(5):  # where the machine is slow, a drag is taken for a long press
             with suppress(TimeoutError):
-                tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 3.0, 2.0))
+                at = tab.run(f"['x', 'y'].map(axis => {_MODEL}('points').data[axis][0])")
+                tab.drag(*pixel(tab, *at), *pixel(tab, 3.0, 2.0))
                 tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3) < 0.1", 5.0)
                 break
         assert abs(tab.run(f"{_MODEL}('points').data.x[0]") - 3.0) < 0.1
