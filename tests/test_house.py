@@ -44,7 +44,8 @@ ROOMS = {
     "tracing": (
         *("slab", "bounds", "interactions", "paths", "candidates", "links", "engine"),
         *("plan.beams", "plan.specular", "plan.crossings", "plan.diffraction", "plan.crossed_edges"),
-        *("mesh.planes", "mesh.sequences", "mesh.candidates", "mesh.faces", "mesh.walls", "mesh.crossings", "finder"),
+        *("mesh.planes", "mesh.sequences", "mesh.candidates"),
+        *("mesh.faces", "mesh.walls", "mesh.split_rays", "mesh.crossings", "finder"),
         *("path_set", "simulation", "gradients"),
         "antennas",
     ),

@@ -138,4 +138,7 @@ def test_faces_between_points_are_those_of_brute_force() -> None:
         points = a + met.at[:count, None] * (b - a)
         assert np.allclose(np.linalg.norm(points, axis=1), 1.0, atol=0.03)
         assert (np.diff(met.at[:count]) > 0.0).all()
-        assert count == {0: count // 2 * 2, 1: 1, 2: 0}[int(inside)] or np.abs(np.linalg.norm([a, b], axis=1) - 0.985).min() < 0.016
+        assert (
+            count == {0: count // 2 * 2, 1: 1, 2: 0}[int(inside)]
+            or np.abs(np.linalg.norm([a, b], axis=1) - 0.985).min() < 0.016
+        )

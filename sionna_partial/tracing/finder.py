@@ -31,7 +31,7 @@ from sionna_partial.tracing.mesh.crossings import MeshCrossings
 from sionna_partial.tracing.mesh.faces import FaceTree, face_tree
 from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
 from sionna_partial.tracing.mesh.sequences import shoot_rays
-from sionna_partial.tracing.mesh.walls import Bodies, SolidMesh, closed_bodies
+from sionna_partial.tracing.mesh.walls import Bodies, Cells, SolidMesh, closed_bodies
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior, slabs_of
@@ -111,7 +111,7 @@ class MeshScene:
     settings: TraceSettings
     vertices_m: Floats
     triangles: NDArray[np.int64]
-    interior: Interior
+    cells: Cells
 
     def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths likewise, by the sequences of planes that rays meet."""
@@ -127,7 +127,7 @@ class MeshScene:
             return
         slabs = slabs_of(solver.materials.values(), solver.material_of_face, frequency_hz)
         largest = strengths_of(solver.materials.values(), frequency_hz, 0).largest
-        solid = SolidMesh(self.tree, self.planes, self.bodies, self.interior, slabs)
+        solid = SolidMesh(self.tree, self.planes, self.bodies, self.cells, slabs)
         crossing = MeshCrossings(solid, tx_m, rx_m, largest, self.settings)
         ends = tx_m, rx_m, np.zeros(len(rx_m))
         yield from _with_walls(solver, listed, crossing, ends, self.settings, report)
@@ -190,8 +190,8 @@ def write_scene_of(
         shapes = tuple(f"part{index}" for index in range(len(geometry.materials)))
         free = partial.state == CellState.FREE
         free &= ~narrow_areas(free, partial.resolution_m, settings.wall_depth_m)
-        interior = Interior(free, free, partial.resolution_m, settings.wall_depth_m)
-        return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles, interior)
+        cells = Cells(free, partial.resolution_m, settings.wall_depth_m)
+        return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles, cells)
     floor = floor_cells(partial, scene_settings.floor_extent)
     interior = Interior(partial.state == CellState.FREE, floor, partial.resolution_m, settings.wall_depth_m)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)

@@ -248,7 +248,9 @@ def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best
     rx, face, points = out
     mesh, depth = (sequences, views, planes, material), views.depth[node]
     for target in found:
-        power = fold_line(node, rx_m[target], mesh, strengths.largest, strengths.wavelength_m, face[count], points[count])
+        power = fold_line(
+            node, rx_m[target], mesh, strengths.largest, strengths.wavelength_m, face[count], points[count]
+        )
         if power >= 0.0:
             level = level_of(power)
             best[node] = min(best[node], level)

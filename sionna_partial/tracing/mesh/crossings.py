@@ -17,6 +17,7 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.mesh.candidates import (
     REACH,
     REACH_M,
@@ -28,25 +29,15 @@ from sionna_partial.tracing.mesh.candidates import (
     receivers_in_view,
 )
 from sionna_partial.tracing.mesh.faces import MOST_FACES, faces_between, scratch
-from sionna_partial.tracing.mesh.sequences import (
-    Sequences,
-    Views,
-    collect_sequences,
-    find_sequence,
-    lattice,
-    rehash,
-    view_sequences,
-)
-from sionna_partial.tracing.mesh.walls import SolidMesh, cosine_at, is_one_wall, mark_walls, trail
-from sionna_partial.tracing.paths import REFLECTION, REFRACTION
+from sionna_partial.tracing.mesh.sequences import Sequences, Views, collect_sequences, lattice, view_sequences
+from sionna_partial.tracing.mesh.split_rays import Fixed, least_needed, split_rays
+from sionna_partial.tracing.mesh.walls import SolidMesh, is_inside, mark_walls, trail
 from sionna_partial.tracing.plan.crossings import (
     _COSINES,
     _MOST_REFLECTIONS,
     _RARER,
     _SHORTEST_LEG_M,
     _USUAL_REFLECTIONS,
-    SAME_WALL,
-    WALL,
     Limits,
     least_power,
     weakest_needed,
@@ -61,7 +52,7 @@ _MARGIN = 4.0
 _PART = 0.5
 """Part of the weakest power that matters down to which sequences are followed, as rays are only samples of them."""
 
-_AT_ONCE = 100_000
+_AT_ONCE = 20_000
 """Number of candidates that are written together, which bounds the memory."""
 
 _SEQUENCES_AT_ONCE = 500
@@ -69,18 +60,6 @@ _SEQUENCES_AT_ONCE = 500
 
 _ENTRIES = 160
 """Most faces that a path may meet."""
-
-
-class Least(NamedTuple):
-    """What a ray must bring to matter, from receivers (N,) sorted by their distance from the transmitter.
-
-    `relative` is the smallest power that matters, relative to free space, to any receiver at least that far away,
-    `power` the smallest to any at most that far away, times (4 pi / wavelength)^2.
-    """
-
-    distance_m: Floats
-    relative: Floats
-    power: Floats
 
 
 class Traced(NamedTuple):
@@ -99,26 +78,13 @@ class Pairs(NamedTuple):
     power: Floats
 
 
-class Fixed(NamedTuple):
-    """What all paths of a call have in common; `largest` is that of `Strengths`."""
-
-    mesh: SolidMesh
-    tx_m: Floats
-    rx_m: Floats
-    limits: Limits
-    largest: Floats
-    wavelength_m: float
-
-
 class MeshCrossings:
     """Paths between a transmitter (3,) and receivers (N, 3) that go through walls of a mesh, without diffraction.
 
     `largest` is that of `Strengths`, of the materials of the mesh.
     """
 
-    def __init__(
-        self, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, largest: Floats, settings: TraceSettings
-    ) -> None:
+    def __init__(self, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, largest: Floats, settings: TraceSettings) -> None:
         self._tolerance_db, self._rays = settings.power_tolerance_db, min(_RAYS, settings.samples_per_tx)
         exact = self._tolerance_db == 0.0
         most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
@@ -128,7 +94,6 @@ class MeshCrossings:
 
     def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
         """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
-        receivers = len(self._fixed.rx_m)
         nothing = self._traced(None)
         straight = _straight(nothing, self._fixed)
         needed = weakest_needed(found + straight.power, self._tolerance_db)
@@ -147,8 +112,11 @@ class MeshCrossings:
         chosen = np.flatnonzero(pairs.power >= least[pairs.rx])
         for start in range(0, len(chosen), _AT_ONCE):
             rows = chosen[start : start + _AT_ONCE]
-            columns = _written(pairs.node[rows], pairs.rx[rows], traced, self._fixed)
-            yield _candidates(pairs.rx[rows], *columns), min(1.0, (start + _AT_ONCE) / len(chosen))
+            face, kind, vertices_m, same_wall = _written(pairs.node[rows], pairs.rx[rows], traced, self._fixed)
+            used = max(1, int((kind > 0).sum(axis=1).max()))
+            columns = kind[:, :used], face[:, :used], vertices_m[:, :used]
+            candidates = Candidates(pairs.rx[rows].astype(np.int32), *columns, same_wall=same_wall[:, :used])
+            yield candidates, min(1.0, (start + _AT_ONCE) / len(chosen))
 
     def _traced(self, needed: Floats | None) -> Traced:
         """Split rays at all faces; without `needed`, there are none."""
@@ -156,8 +124,8 @@ class MeshCrossings:
         sequences, loss = collect_sequences([], fixed.mesh.planes), np.empty(1024)
         if needed is not None and len(needed) and len(fixed.mesh.tree.order):
             direction = lattice(np.arange(self._rays), self._rays).astype(np.float64)
-            least = _least(fixed, needed)
-            sequences, loss = _split_rays(sequences, loss, direction, least, fixed, _spread_m(fixed))
+            least = least_needed(fixed.tx_m, fixed.rx_m, _PART * needed, fixed.wavelength_m)
+            sequences, loss = split_rays(sequences, loss, direction, least, fixed, _spread_m(fixed))
         return Traced(sequences, view_sequences(sequences, fixed.mesh.planes, fixed.tx_m, _MARGIN), loss)
 
 
@@ -166,108 +134,6 @@ def _spread_m(fixed: Fixed) -> float:
     tree = fixed.mesh.tree
     low, high = np.minimum(tree.low_m[0], fixed.tx_m), np.maximum(tree.high_m[0], fixed.tx_m)
     return float(np.linalg.norm(high - low)) + 1.0
-
-
-def _least(fixed: Fixed, needed: Floats) -> Least:
-    """Sort what matters to receivers by their distance."""
-    distance_m = np.linalg.norm(fixed.rx_m - fixed.tx_m, axis=1)
-    order = np.argsort(distance_m, kind="stable")
-    distance_m, needed = distance_m[order], _PART * needed[order] * (4.0 * np.pi / fixed.wavelength_m) ** 2
-    relative = np.minimum.accumulate((needed * np.maximum(distance_m, 1e-3) ** 2)[::-1])[::-1].copy()
-    return Least(distance_m, relative, np.minimum.accumulate(needed))
-
-
-def _candidates(
-    rx: NDArray[np.int64], face: NDArray[np.int32], kind: NDArray[np.int64], vertices_m: Floats
-) -> Candidates:
-    """Turn kinds of `Trail` into those of candidates."""
-    used = max(1, int((kind >= 0).sum(axis=1).max(initial=0)))
-    face, kind, vertices_m = face[:, :used], kind[:, :used], vertices_m[:, :used]
-    of_kind = np.array([REFLECTION, REFRACTION, REFRACTION, 0], np.uint8)
-    return Candidates(rx.astype(np.int32), of_kind[kind], face, vertices_m, same_wall=kind == SAME_WALL)
-
-
-@njit(cache=True)
-def _matters(loss, near, least):  # type: ignore[no-untyped-def]
-    """Whether a ray with this loss, which has come this far at least, may matter to any receiver."""
-    at = np.searchsorted(least.distance_m, near)
-    if at < len(least.distance_m) and loss >= least.relative[at]:
-        return True
-    return at > 0 and loss >= least.power[at - 1] * near * near
-
-
-@njit(cache=True)
-def _at(table, material, cosine):  # type: ignore[no-untyped-def]
-    """Entry of a table of the largest power that a material leaves."""
-    return table[material, int(cosine * _COSINES)]
-
-
-@njit(cache=True)
-def _split_rays(sequences, loss, directions, least, fixed, far):  # type: ignore[no-untyped-def]
-    """Add the sequences of rays that split at every face, one that is reflected and one that goes on."""
-    mesh, limits = fixed.mesh, fixed.limits
-    parent, plane, low, high, reach, table, count, rays = sequences
-    normal, faces_plane = mesh.planes.normal, mesh.planes.plane
-    met, end, top = scratch(), np.empty(3), 0
-    state = np.empty((MOST_FACES * (limits.reflections + 1), 8))  # origin, direction, length, loss
-    numbers = np.empty((len(state), 4), np.int64)  # sequence, its planes, walls crossed
-    for i in range(len(directions)):
-        state[0, :3], state[0, 3:6], state[0, 6], state[0, 7] = fixed.tx_m, directions[i], 0.0, 1.0
-        numbers[0], top = -1, 1
-        numbers[0, 1], numbers[0, 2] = 0, 0
-        while top > 0:
-            top -= 1
-            a, d, length, left = state[top, :3].copy(), state[top, 3:6].copy(), state[top, 6], state[top, 7]
-            node, depth, crossed = numbers[top, 0], numbers[top, 1], numbers[top, 2]
-            own = plane[node] if node >= 0 else -1
-            for axis in range(3):
-                end[axis] = a[axis] + far * d[axis]
-            number, stop, start, steep = faces_between(mesh.tree, a, end, own, -1, met), far, 0.0, 1.0
-            rare = limits.rarer ** max(0, depth - _USUAL_REFLECTIONS)
-            rarer = limits.rarer ** max(0, depth + 1 - _USUAL_REFLECTIONS)
-            for j in range(number):
-                face, t = met.face[j], met.at[j]
-                cosine, near = cosine_at(mesh.planes, face, d[0], d[1], d[2]), length + t * far
-                same = j > 0 and (t - start) * far * min(cosine, steep) <= mesh.interior.depth_m
-                same = same and is_one_wall(mesh, met.face[j - 1], face, a, end, met.at[j - 1], t)
-                steep = min(steep, cosine)
-                if same:
-                    continue
-                material = mesh.slabs.material[face]
-                p = faces_plane[face]
-                after = left * _at(mesh.slabs.most_reflected, material, cosine)
-                if depth < limits.reflections and _matters(after * rarer, near, least):
-                    room = count + 1
-                    if room > len(parent):
-                        parent, plane, reach = grow(parent, room), grow(plane, room), grow(reach, room)
-                        low, high, loss = grow(low, room), grow(high, room), grow(loss, room)
-                    if 2 * room > len(table):
-                        table = rehash(parent, plane, count, 2 * len(table))
-                    slot = find_sequence(table, parent, plane, node, p)
-                    child = table[slot]
-                    if child < 0:
-                        child = count
-                        parent[count], plane[count], reach[count], loss[count] = node, p, 0.0, 0.0
-                        low[count], high[count], table[slot] = 1.0, -1.0, count
-                        count += 1
-                    loss[child] = max(loss[child], after)
-                    along = d[0] * normal[p, 0] + d[1] * normal[p, 1] + d[2] * normal[p, 2]
-                    for axis in range(3):
-                        state[top, axis] = a[axis] + t * far * d[axis]
-                        state[top, 3 + axis] = d[axis] - 2.0 * along * normal[p, axis]
-                        low[child, axis] = min(low[child, axis], state[top, 3 + axis])
-                        high[child, axis] = max(high[child, axis], state[top, 3 + axis])
-                    state[top, 6], state[top, 7] = near, after
-                    numbers[top, 0], numbers[top, 1], numbers[top, 2] = child, depth + 1, crossed
-                    top += 1
-                left *= _at(mesh.slabs.most_transmitted, material, cosine)
-                crossed, start, steep = crossed + 1, t, cosine
-                if crossed > limits.walls or not _matters(left * rare, near, least):
-                    stop = t * far
-                    break
-            if node >= 0:
-                reach[node] = max(reach[node], length + stop)
-    return Sequences(parent, plane, low, high, reach, table, count, rays + len(directions)), loss
 
 
 @njit(cache=True)
@@ -284,11 +150,15 @@ def _follow(node, target, traced, fixed, met, entries, faces, points):  # type: 
         if number == MOST_FACES or count + number + 1 > len(entries.face):
             return -1
         crossed += mark_walls(mesh, a, b, number, met, entries, count)
-        if crossed > limits.walls:
+        inside = number > 0 and (
+            (k > 0 and is_inside(mesh, faces[k - 1], met.face[0], a, b, 0.0, met.at[0]))
+            or (k < reflections and is_inside(mesh, met.face[number - 1], faces[k], a, b, met.at[number - 1], 1.0))
+        )
+        if inside or crossed > limits.walls:
             return -1
         count += number
         if k < reflections:
-            entries.face[count], entries.kind[count] = faces[k], 0
+            entries.face[count], entries.kind[count], entries.same_wall[count] = faces[k], REFLECTION, False
             entries.point_m[count] = b
             count += 1
         a, own = b, other
@@ -322,7 +192,7 @@ def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
     for j in range(count):
         here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
         total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)
-        if entries.kind[j] == SAME_WALL:
+        if entries.same_wall[j]:
             continue
         face = entries.face[j]
         p, material = planes.plane[face], slabs.material[face]
@@ -339,10 +209,10 @@ def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
         te = ex * sx + ey * sy + ez * sz
         px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
         tm = ex * px + ey * py + ez * pz
-        table = slabs.transmission if entries.kind[j] == WALL else slabs.reflection
+        table = slabs.transmission if entries.kind[j] == REFRACTION else slabs.reflection
         te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
         tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
-        if entries.kind[j] == 0:
+        if entries.kind[j] == REFLECTION:
             kx, ky, kz = kx - 2.0 * along * nx, ky - 2.0 * along * ny, kz - 2.0 * along * nz
             px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
         ex, ey, ez = te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz
@@ -374,6 +244,7 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
     seen, stack, bounds = np.empty(len(fixed.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     for node in nodes:
+        rarer = fixed.limits.rarer ** max(0, views.depth[node] - _USUAL_REFLECTIONS)
         reach = REACH * sequences.reach_m[node] + REACH_M
         source = views.source_m[node]
         view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)
@@ -381,7 +252,7 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
         for k in range(receivers_in_view(view, boxes, fixed.rx_m, bounds, stack, seen)):
             target = fixed.rx_m[seen[k]]
             square = (target[0] - source[0]) ** 2 + (target[1] - source[1]) ** 2 + (target[2] - source[2]) ** 2
-            least = needed[seen[k]]
+            least = needed[seen[k]] / rarer
             if traced.loss[node] * (fixed.wavelength_m / (4.0 * np.pi)) ** 2 < _PART * least * square:
                 continue
             if fold_line(node, target, folded, fixed.largest, fixed.wavelength_m, faces, points) < least:
@@ -400,10 +271,10 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _written(nodes, rx, traced, fixed):  # type: ignore[no-untyped-def]
-    """Faces (C, D), kinds of `Trail`, -1 where there is nothing, and vertices (C, D, 3) of chosen paths."""
+    """Faces and kinds (C, D) of chosen paths, vertices (C, D, 3), and whether each is of a wall that is crossed."""
     folded = traced.sequences, traced.views, fixed.mesh.planes, fixed.mesh.slabs.material
-    met, entries = scratch(), trail(_ENTRIES)
-    face, kind = np.full((len(nodes), _ENTRIES), -1, np.int32), np.full((len(nodes), _ENTRIES), -1, np.int64)
+    met, entries, shape = scratch(), trail(_ENTRIES), (len(nodes), _ENTRIES)
+    face, kind, same_wall = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     vertices = np.zeros((len(nodes), _ENTRIES, 3))
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
     for c in range(len(nodes)):
@@ -412,5 +283,5 @@ def _written(nodes, rx, traced, fixed):  # type: ignore[no-untyped-def]
             fold_line(nodes[c], target, folded, fixed.largest, fixed.wavelength_m, faces, points)
         number = _follow(nodes[c], target, traced, fixed, met, entries, faces, points)
         face[c, :number], kind[c, :number] = entries.face[:number], entries.kind[:number]
-        vertices[c, :number] = entries.point_m[:number]
-    return face, kind, vertices
+        vertices[c, :number], same_wall[c, :number] = entries.point_m[:number], entries.same_wall[:number]
+    return face, kind, vertices, same_wall

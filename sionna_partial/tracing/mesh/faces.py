@@ -145,7 +145,7 @@ def _meets(corner, a, dx, dy, dz):  # type: ignore[no-untyped-def]
 def _insert(face, t, plane, own, other, met, count):  # type: ignore[no-untyped-def]
     """Add a face, sorted, unless one of its plane is there or it is in an excluded plane; the new number of faces."""
     p = plane[face]
-    if p == own or p == other or count == MOST_FACES:
+    if p in (own, other) or count == MOST_FACES:
         return count
     for k in range(count):
         if plane[met.face[k]] == p:

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.process import njit
+from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree
 from sionna_partial.tracing.mesh.planes import MeshPlanes
-from sionna_partial.tracing.plan.crossings import SAME_WALL, WALL, Interior, Slabs, _is_free_between
+from sionna_partial.tracing.plan.crossings import Slabs
 
 
 class Bodies(NamedTuple):
@@ -25,24 +26,34 @@ class Bodies(NamedTuple):
     outward: Floats
 
 
+class Cells(NamedTuple):
+    """Which cells (ny, nx) of a map are free, their edge [m], and how deep one wall may be [m]."""
+
+    free: Bools
+    cell_m: float
+    depth_m: float
+
+
 class SolidMesh(NamedTuple):
     """A mesh that lines go through: its faces, their planes, bodies and materials, and the cells of its map."""
 
     tree: FaceTree
     planes: MeshPlanes
     bodies: Bodies
-    interior: Interior
+    cells: Cells
     slabs: Slabs
 
 
 def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
     """Find the connected pieces of a mesh that close around a volume, every edge once in each direction."""
+    if not len(triangles):
+        return Bodies(np.zeros(0, np.int64), np.zeros((0, 3)))
     count = len(vertices_m)
     start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, axis=1).ravel().astype(np.int64)
     edge, which, number = np.unique(start * count + end, return_inverse=True, return_counts=True)
     back = np.searchsorted(edge, end * count + start)
     back[back == len(edge)] = 0
-    paired = (edge[back] == end * count + start) & (number[back] == number[which]) if len(edge) else np.zeros(0, bool)
+    paired = (edge[back] == end * count + start) & (number[back] == number[which])
     graph = coo_array((np.ones(len(start), bool), (start, end)), (count, count))
     pieces, piece = connected_components(graph, directed=False)
     body = piece[triangles[:, 0]].astype(np.int64)
@@ -58,12 +69,13 @@ def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
 class Trail(NamedTuple):
     """Scratch of one path: what it meets, in order from the transmitter.
 
-    `face` are faces, `kind` 0 where it is reflected, WALL where it crosses a wall, SAME_WALL at further faces of that
-    wall; `cosine` is that of the incidence there, `point_m` the points.
+    `face` are faces, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a further face of a
+    wall that has been crossed, which costs nothing; `cosine` is that of the incidence there, `point_m` the points.
     """
 
     face: NDArray[np.int64]
-    kind: NDArray[np.int64]
+    kind: NDArray[np.uint8]
+    same_wall: Bools
     cosine: Floats
     point_m: Floats
 
@@ -71,7 +83,13 @@ class Trail(NamedTuple):
 @njit(cache=True)
 def trail(size):  # type: ignore[no-untyped-def]
     """Make room for a path that meets so many faces."""
-    return Trail(np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size), np.empty((size, 3)))
+    return Trail(
+        np.empty(size, np.int64),
+        np.empty(size, np.uint8),
+        np.empty(size, np.bool_),
+        np.empty(size),
+        np.empty((size, 3)),
+    )
 
 
 @njit(cache=True)
@@ -92,10 +110,33 @@ def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyp
         left = outward[second, 0] * dx + outward[second, 1] * dy + outward[second, 2] * dz > 0.0
         if entered and left:
             return True
+    free, cell = mesh.cells.free, mesh.cells.cell_m
     length = np.hypot(dx, dy)
-    if length == 0.0:
-        return True
-    return not _is_free_between(mesh.interior, a[0], a[1], dx, dy, length, begin, end)
+    along, last = begin * length + cell, end * length - cell  # cells that the faces themselves cut do not count
+    while along <= last:
+        column, row = int((a[0] + along / length * dx) / cell), int((a[1] + along / length * dy) / cell)
+        if 0 <= row < free.shape[0] and 0 <= column < free.shape[1] and free[row, column]:
+            return False
+        along += 0.5 * cell
+    return True
+
+
+@njit(cache=True)
+def is_inside(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
+    """Whether what lies between two faces on a line from a to b, at two fractions of it, is the inside of one wall.
+
+    Faces that are across each other are a wall and the floor that it stands on, or two walls at a corner.
+    """
+    normal, p, q = mesh.planes.normal, mesh.planes.plane[first], mesh.planes.plane[second]
+    if abs(normal[p, 0] * normal[q, 0] + normal[p, 1] * normal[q, 1] + normal[p, 2] * normal[q, 2]) < 0.5:
+        return False
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    kx, ky, kz = dx / length, dy / length, dz / length
+    steep = min(cosine_at(mesh.planes, first, kx, ky, kz), cosine_at(mesh.planes, second, kx, ky, kz))
+    if (end - begin) * length * steep > mesh.cells.depth_m:
+        return False
+    return is_one_wall(mesh, first, second, a, b, begin, end)
 
 
 @njit(cache=True)
@@ -113,7 +154,7 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
         k = count - 1 - j if turned else j
         face, t = met.face[k], 1.0 - met.at[k] if turned else met.at[k]
         cosine = cosine_at(mesh.planes, face, dx / length, dy / length, dz / length)
-        same = j > 0 and (t - start) * length * min(cosine, steep) <= mesh.interior.depth_m
+        same = j > 0 and (t - start) * length * min(cosine, steep) <= mesh.cells.depth_m
         if same:
             before = met.face[k + 1 if turned else k - 1]
             same = is_one_wall(mesh, before, face, near, far, previous, t)
@@ -121,7 +162,8 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
             _choose(entries, begin, count, opened, j, turned)
             walls, opened, start, steep = walls + 1, j, t, 1.0
         entry = begin + k
-        entries.face[entry], entries.kind[entry], entries.cosine[entry] = face, SAME_WALL, cosine
+        entries.face[entry], entries.kind[entry] = face, REFRACTION
+        entries.same_wall[entry], entries.cosine[entry] = True, cosine
         for axis in range(3):
             entries.point_m[entry, axis] = a[axis] + met.at[k] * (b[axis] - a[axis])
         previous, steep = t, min(steep, cosine)
@@ -140,5 +182,4 @@ def _choose(entries, begin, count, first, last, turned):  # type: ignore[no-unty
                 entries.cosine[other] == entries.cosine[own] and k < j
             )
         if rank == (last - first) // 2:
-            entries.kind[own] = WALL
-
+            entries.same_wall[own] = False
