@@ -255,9 +255,9 @@ def columns_of(
 def slabs_of(constants: Iterable[Iterable[float]], material: NDArray[np.int64], frequency_hz: float) -> Slabs:
     """Tabulate the coefficients of materials, each permittivity, conductivity and thickness (3,)."""
     cosine = np.linspace(0.0, 1.0, _COSINES + 1)
-    constants = [(*each, frequency_hz, cosine) for each in constants]
+    given = [(*each, frequency_hz, cosine) for each in constants]
     reflection, transmission = (
-        np.stack([np.stack(coefficients(*each), axis=1) for each in constants])
+        np.stack([np.stack(coefficients(*each), axis=1) for each in given])
         for coefficients in (reflection_coefficients, transmission_coefficients)
     )
     reflection[:, 0], transmission[:, 0] = -1.0, 0.0
