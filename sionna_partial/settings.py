@@ -224,13 +224,14 @@ class TraceSettings(Checked):
         but for rounding.
     refraction : bool or None
         Whether paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
-        below. On meshes such paths are found by shooting rays.
+        below.
     max_walls : int
-        Largest number of walls of a floor plan that a path goes through, 1 to 16. `max_depth` does not count them.
+        Largest number of walls that a path goes through, 1 to 16. `max_depth` does not count them.
     wall_depth_m : float
-        How deep one wall of a floor plan may be [m], 0 to 10. Of the faces that a path goes through one after the
-        other, with no free cell between them, those within this depth are one wall, and have the loss of one slab of
-        the material. At 0 every face is a slab, as in the exported scene.
+        How deep one wall may be [m], 0 to 10. Of the faces that a path goes through one after the other, with no free
+        cell between them, those within this depth are one wall, and have the loss of one slab of the material; so have
+        the faces where it enters a closed body of a mesh and leaves it again. At 0 every face is a slab, as in the
+        exported scene.
     diffuse_reflection : bool
         Diffuse reflections. With them, every path is found by shooting rays (Sionna RT's own candidate generator),
         which is slower than exact beams.

@@ -38,4 +38,4 @@ def test_by_default_candidates_alone_find_the_paths() -> None:
             assert only_by_rays(with_defaults(settings, environment), environment) == []
     asked = replace(settings, diffuse_reflection=True, refraction=True, diffraction=True)
     assert [kind.setting for kind in only_by_rays(asked, "plan")] == ["diffuse_reflection"]
-    assert [kind.setting for kind in only_by_rays(asked, "mesh")] == ["diffuse_reflection", "refraction", "diffraction"]
+    assert [kind.setting for kind in only_by_rays(asked, "mesh")] == ["diffuse_reflection", "diffraction"]

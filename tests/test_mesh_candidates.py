@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
+from sionna_partial.tracing.mesh.planes import group_planes
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 
 SIZE = np.array([8.0, 6.0, 3.0])
@@ -31,7 +32,7 @@ def candidates_of(
     **options: int,
 ) -> Candidates:
     shot = shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), tx, rays, depth)
-    mesh = *joined(*meshes), np.zeros(sum(len(each.faces) for each in meshes), np.int64)
+    mesh = group_planes(*joined(*meshes)), np.zeros(sum(len(each.faces) for each in meshes), np.int64)
     parts = list(MeshCandidates(*mesh, shot, tx, rx, depth).blocks(everything(len(rx)), **options))
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
@@ -176,5 +177,5 @@ class TestOpenMesh:
         assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
 
     def test_without_rays_there_is_line_of_sight(self) -> None:
-        kind = MeshCandidates(*joined(self.TRIANGLE), np.zeros(1, np.int64), [], TX, RX, 2)
+        kind = MeshCandidates(group_planes(*joined(self.TRIANGLE)), np.zeros(1, np.int64), [], TX, RX, 2)
         assert [part.rx.tolist() for part, _ in kind.blocks(everything(len(RX)))] == [list(range(len(RX)))]

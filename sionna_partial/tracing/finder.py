@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CellState
 from sionna_partial.errors import BackendError
+from sionna_partial.maps.mesh.cells import narrow_areas
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.progress import part_of
@@ -25,10 +27,14 @@ from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, set_antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
+from sionna_partial.tracing.mesh.crossings import MeshCrossings
+from sionna_partial.tracing.mesh.faces import FaceTree, face_tree
+from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
 from sionna_partial.tracing.mesh.sequences import shoot_rays
+from sionna_partial.tracing.mesh.walls import Bodies, Cells, SolidMesh, closed_bodies
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
-from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior
+from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior, slabs_of
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
@@ -76,16 +82,9 @@ class PlanScene:
         if not self.settings.through_walls:
             yield from _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
             return
-        power = np.zeros(len(rx_m))
-        for candidates, paths in _strong_paths(solver, listed, tx_m, rx_m, self.settings, part_of(report, 0.0, 0.5)):
-            indirect = ~paths.is_direct
-            np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
-            yield candidates, paths
         crossing = CrossingCandidates(self.geometry, room, self.interior, self.settings)
-        blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
-        for candidates, paths in _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.5, 0.8)):
-            np.add.at(power, paths.path_rx, paths.power)
-            yield candidates, paths
+        power = np.zeros(len(rx_m))
+        yield from _with_walls(solver, listed, crossing, (tx_m, rx_m, power), self.settings, part_of(report, 0.0, 0.8))
         if self.settings.diffraction and len(rx_m):
             fixed = self.interior, self.settings, crossing.slabs
             edges = CrossedEdgeCandidates(self.geometry, self.wedges, room, *fixed)
@@ -112,18 +111,41 @@ class MeshScene:
     settings: TraceSettings
     vertices_m: Floats
     triangles: NDArray[np.int64]
+    cells: Cells
 
     def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths likewise, by the sequences of planes that rays meet."""
-        depth = self.settings.max_depth
+        depth, frequency_hz = self.settings.max_depth, self.settings.frequency_hz
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, self.settings.samples_per_tx, depth)
-        mesh = self.vertices_m, self.triangles, solver.material_of_face
-        kind = MeshCandidates(*mesh, rays, tx_m, rx_m, depth)
+        kind = MeshCandidates(self.planes, solver.material_of_face, rays, tx_m, rx_m, depth)
 
         def listed(strengths: Strengths) -> _Blocks:
             return ((*block, "verifying reflections") for block in kind.blocks(strengths))
 
-        return _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
+        if not self.settings.through_walls:
+            yield from _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
+            return
+        slabs = slabs_of(solver.materials.values(), solver.material_of_face, frequency_hz)
+        largest = strengths_of(solver.materials.values(), frequency_hz, 0).largest
+        solid = SolidMesh(self.tree, self.planes, self.bodies, self.cells, slabs)
+        crossing = MeshCrossings(solid, tx_m, rx_m, largest, self.settings)
+        ends = tx_m, rx_m, np.zeros(len(rx_m))
+        yield from _with_walls(solver, listed, crossing, ends, self.settings, report)
+
+    @cached_property
+    def planes(self) -> MeshPlanes:
+        """The planes of its faces."""
+        return group_planes(self.vertices_m, self.triangles)
+
+    @cached_property
+    def tree(self) -> FaceTree:
+        """Its faces, for lines through them."""
+        return face_tree(self.vertices_m[self.triangles], self.planes.plane)
+
+    @cached_property
+    def bodies(self) -> Bodies:
+        """Its closed bodies."""
+        return closed_bodies(self.vertices_m, self.triangles)
 
 
 @dataclass(frozen=True)
@@ -166,7 +188,10 @@ def write_scene_of(
     xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz)
     if isinstance(geometry, SceneMesh):
         shapes = tuple(f"part{index}" for index in range(len(geometry.materials)))
-        return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles)
+        free = partial.state == CellState.FREE
+        free &= ~narrow_areas(free, partial.resolution_m, settings.wall_depth_m)
+        cells = Cells(free, partial.resolution_m, settings.wall_depth_m)
+        return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles, cells)
     floor = floor_cells(partial, scene_settings.floor_extent)
     interior = Interior(partial.state == CellState.FREE, floor, partial.resolution_m, settings.wall_depth_m)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)
@@ -209,6 +234,29 @@ def _strong_paths(
             np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
             yield candidates, paths
         done, expected = needed, power
+
+
+def _with_walls(
+    solver: SceneSolver,
+    listed: Callable[[Strengths], _Blocks],
+    crossing: CrossingCandidates | MeshCrossings,
+    ends: tuple[Floats, Floats, Floats],
+    settings: TraceSettings,
+    report: Progress,
+) -> Iterator[Found]:
+    """Verify the candidates without walls, and those through walls that matter beside them.
+
+    The powers of the links are added to the third of `ends`, but for the direct path.
+    """
+    tx_m, rx_m, power = ends
+    for candidates, paths in _strong_paths(solver, listed, tx_m, rx_m, settings, part_of(report, 0.0, 0.6)):
+        indirect = ~paths.is_direct
+        np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
+        yield candidates, paths
+    blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
+    for candidates, paths in _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.6, 1.0)):
+        np.add.at(power, paths.path_rx, paths.power)
+        yield candidates, paths
 
 
 def _verified(

@@ -54,7 +54,7 @@ INTERACTIONS = (
     Interaction(1, "", ("specular_reflection",), ("plan", "mesh"), reflection_coefficients, reflected_power),
     Interaction(2, "diffuse_reflection", ("diffuse_reflection",), ()),
     Interaction(
-        *(4, "refraction", ("refraction",), ("plan",), transmission_coefficients, transmitted_power),
+        *(4, "refraction", ("refraction",), ("plan", "mesh"), transmission_coefficients, transmitted_power),
         default=lambda settings: settings.through_walls,
     ),
     Interaction(8, "diffraction", ("diffraction", "edge_diffraction"), ("plan",), reflection_coefficients, at_edge),

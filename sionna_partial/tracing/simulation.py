@@ -365,10 +365,10 @@ def trace_links(
     On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge of the walls
     (corners, door jambs) and at most two reflections around it are complete, but for legs of 1 cm or less, which Sionna
     RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays determine
-    the sequences of planes; line of sight and nearly all specular reflections are found. With refraction, diffuse
-    reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver shoots rays instead, receiver by
-    receiver, which is slow and finds most paths, not all. It also does with another release of Sionna RT than 2.2. The
-    answer for a receiver does not depend on the other receivers.
+    the sequences of planes; line of sight and nearly all specular reflections are found. Paths through walls are found
+    likewise. With diffuse reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver shoots rays
+    instead, receiver by receiver, which is slow and finds most paths, not all. It also does with another release of
+    Sionna RT than 2.2. The answer for a receiver does not depend on the other receivers.
 
     Parameters
     ----------

@@ -97,12 +97,12 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
     return replace(partial, mesh=environment.mesh.within(area))
 
 
-def narrow_areas(free: Bools, resolution_m: float) -> Bools:
-    """Find the cells (ny, nx) of free areas that are nowhere `RIM_M` wide."""
+def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bools:
+    """Find the cells (ny, nx) of free areas that are nowhere so wide."""
     area, count = ndimage.label(np.pad(free, 1))
     to_border_m = (ndimage.distance_transform_edt(area > 0) - 0.5) * resolution_m
     widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
-    narrow: Bools = (widest_m < RIM_M)[area][1:-1, 1:-1] & free
+    narrow: Bools = (widest_m < width_m)[area][1:-1, 1:-1] & free
     return narrow
 
 

@@ -16,17 +16,17 @@ from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFLECTION
-from sionna_partial.tracing.mesh.planes import face_at, group_planes
+from sionna_partial.tracing.mesh.planes import MeshPlanes, face_at
 from sionna_partial.tracing.mesh.sequences import Rays, collect_sequences, view_sequences
 
-_REACH, _REACH_M = 1.1, 0.3
+REACH, REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
 
 _LEAF = 8
 """Largest number of receivers in a box that is not divided further."""
 
 
-class _Boxes(NamedTuple):
+class Boxes(NamedTuple):
     """N receivers in a tree of K boxes; box 0 holds all.
 
     Box k holds the part `start` to `stop` of the receivers in `order` (N,), and `child` is the first of the two boxes
@@ -41,7 +41,7 @@ class _Boxes(NamedTuple):
     high_m: NDArray[np.float64]
 
 
-class _View(NamedTuple):
+class View(NamedTuple):
     """Where receivers of one sequence are: image (3,), box of directions, width by which it is enlarged, and reach."""
 
     source: NDArray[np.float64]
@@ -62,26 +62,24 @@ class _Found(NamedTuple):
 class MeshCandidates:
     """All paths by the sequences of planes that rays have met, between a transmitter (3,) and receivers (N, 3).
 
-    The mesh has vertices (V, 3) [m] and triangles (F, 3), each of one of the materials of the bounds (F,). `rays` come
-    from `shoot_rays`, with the same transmitter and `max_depth`, and count the faces like `triangles`.
+    The faces of the mesh, in some planes, are each of one of the materials of the bounds (F,). `rays` come from
+    `shoot_rays`, with the same transmitter and `max_depth`, and count the faces likewise.
     """
 
     def __init__(
         self,
-        vertices_m: NDArray[np.float64],
-        triangles: NDArray[np.int64],
+        planes: MeshPlanes,
         material: NDArray[np.int64],
         rays: Iterable[Rays],
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
         max_depth: int,
     ) -> None:
-        self._material, self._size = material, max(1, max_depth)
-        self._planes = group_planes(vertices_m, triangles)
+        self._material, self._size, self._planes = material, max(1, max_depth), planes
         self._sequences = collect_sequences(rays, self._planes)
         self._views = view_sequences(self._sequences, self._planes, np.asarray(tx_m, np.float64))
         self._rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
-        self._boxes = _divide(self._rx_m)
+        self._boxes = divide(self._rx_m)
         self._best = np.zeros(self._sequences.size, np.uint8)  # level of the strongest candidate of each sequence
 
     def blocks(
@@ -110,7 +108,7 @@ class MeshCandidates:
 
 
 @njit(cache=True)
-def _divide(points):  # type: ignore[no-untyped-def]
+def divide(points):  # type: ignore[no-untyped-def]
     """Divide receivers into boxes, each time at the median of the longest side."""
     size = 4 * (len(points) // _LEAF + 1)
     order = np.arange(len(points))
@@ -131,7 +129,7 @@ def _divide(points):  # type: ignore[no-untyped-def]
             child[box] = count
             count += 2
         box += 1
-    return _Boxes(order, start[:count], stop[:count], child[:count], low[:count], high[:count])
+    return Boxes(order, start[:count], stop[:count], child[:count], low[:count], high[:count])
 
 
 @njit(cache=True)
@@ -150,10 +148,10 @@ def _next_block(first, mesh, rx_m, depth, strengths, best, block):  # type: igno
         if best[node] >= weakest:
             continue
         best[node] = LEVELS
-        reach = _REACH * sequences.reach_m[node] + _REACH_M
-        view = _View(views.source_m[node], sequences.low[node], sequences.high[node], views.margin[node], reach)
-        _bound_view(view, _farthest(view.source, boxes), planes, sequences.plane[node], bounds)
-        number = _receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
+        reach = REACH * sequences.reach_m[node] + REACH_M
+        view = View(views.source_m[node], sequences.low[node], sequences.high[node], views.margin[node], reach)
+        bound_view(view, farthest(view.source, boxes), planes, sequences.plane[node], bounds)
+        number = receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
         if number > 0:
             size = count + number
             out = _Found(grow(out.rx, size), grow(out.face, size), grow(out.points, size))
@@ -164,7 +162,7 @@ def _next_block(first, mesh, rx_m, depth, strengths, best, block):  # type: igno
 
 
 @njit(cache=True)
-def _receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no-untyped-def]
+def receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no-untyped-def]
     """Write the receivers in view of a sequence's image to `found` and count them."""
     source, low, high, margin, reach = view
     count, stack[0], top = 0, 0, 1
@@ -193,7 +191,7 @@ def _receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[n
 
 
 @njit(cache=True)
-def _farthest(source, boxes):  # type: ignore[no-untyped-def]
+def farthest(source, boxes):  # type: ignore[no-untyped-def]
     """Distance that no receiver exceeds."""
     total = 0.0
     for axis in range(3):
@@ -202,7 +200,7 @@ def _farthest(source, boxes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-def]
+def bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-def]
     """Write what bounds the points in view of an image and beyond its last plane, no receiver being farther away.
 
     Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
@@ -246,35 +244,14 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best, out, count):  # type: ignore[no-untyped-def]
-    """Append the candidates among the receivers found for a sequence, and return the new number of candidates.
-
-    The line from the image to a candidate, folded back at every plane of the sequence, meets a face of each.
-    """
-    parent, plane, sources, depth = sequences.parent, sequences.plane, views.source_m, views.depth[node]
-    normals, offsets, bins = planes.normal, planes.offset_m, planes.bins
+    """Append the candidates among the receivers found for a sequence, and return the new number of candidates."""
     rx, face, points = out
+    mesh, depth = (sequences, views, planes, material), views.depth[node]
     for target in found:
-        x, y, z = rx_m[target, 0], rx_m[target, 1], rx_m[target, 2]
-        at, k, power = node, depth - 1, 1.0
-        while k >= 0:
-            p = plane[at]
-            nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
-            sx, sy, sz = sources[at, 0], sources[at, 1], sources[at, 2]
-            length = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (z - sz) ** 2)
-            if k == depth - 1:
-                power = (strengths.wavelength_m / (4.0 * np.pi * length)) ** 2
-            behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
-            if behind * before >= 0.0:
-                break
-            fraction = behind / (behind - before)
-            x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
-            points[count, k, 0], points[count, k, 1], points[count, k, 2] = x, y, z
-            face[count, k] = face_at(bins, p, x, y, z)
-            if face[count, k] < 0:
-                break
-            power *= reflected_power(strengths.largest[material[face[count, k]]], (behind - before) / length)
-            at, k = parent[at], k - 1
-        if k < 0:
+        power = fold_line(
+            node, rx_m[target], mesh, strengths.largest, strengths.wavelength_m, face[count], points[count]
+        )
+        if power >= 0.0:
             level = level_of(power)
             best[node] = min(best[node], level)
             if len(strengths.power):
@@ -286,3 +263,35 @@ def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best
             points[count, depth:] = 0.0
             count += 1
     return count
+
+
+@njit(cache=True)
+def fold_line(node, target, mesh, largest, wavelength, face, points):  # type: ignore[no-untyped-def]
+    """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
+
+    Returns a bound on the power of the path, or -1 where the line, folded back, misses a plane of the sequence.
+    """
+    sequences, views, planes, material = mesh
+    parent, plane, sources, depth = sequences.parent, sequences.plane, views.source_m, views.depth[node]
+    normals, offsets, bins = planes.normal, planes.offset_m, planes.bins
+    x, y, z = target[0], target[1], target[2]
+    at, power = node, 1.0
+    for k in range(depth - 1, -1, -1):
+        p = plane[at]
+        nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
+        sx, sy, sz = sources[at, 0], sources[at, 1], sources[at, 2]
+        length = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (z - sz) ** 2)
+        if k == depth - 1:
+            power = (wavelength / (4.0 * np.pi * length)) ** 2
+        behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
+        if behind * before >= 0.0:
+            return -1.0
+        fraction = behind / (behind - before)
+        x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
+        points[k, 0], points[k, 1], points[k, 2] = x, y, z
+        face[k] = face_at(bins, p, x, y, z)
+        if face[k] < 0:
+            return -1.0
+        power *= reflected_power(largest[material[face[k]]], (behind - before) / length)
+        at = parent[at]
+    return power

@@ -44,7 +44,7 @@ def shoot_rays(
     dr.make_opaque(origin)  # one compiled kernel serves every transmitter
     pending: Any = None
     for start in range(0, count, _RAYS_PER_CHUNK):
-        direction = _directions(np.arange(start, min(start + _RAYS_PER_CHUNK, count)), count)
+        direction = lattice(np.arange(start, min(start + _RAYS_PER_CHUNK, count)), count)
         launched = _launch(mi_scene, first_face, mi.Ray3f(origin, mi.Vector3f(direction.T)), max_depth)
         if pending is not None:
             yield _collect(pending, max_depth)
@@ -65,7 +65,7 @@ def _first_faces(shapes: Sequence[Any]) -> Any:
     return mi.UInt32(table)
 
 
-def _directions(number: NDArray[np.int64], count: int) -> NDArray[np.float32]:
+def lattice(number: NDArray[np.int64], count: int) -> NDArray[np.float32]:
     """Return the unit vectors with the given numbers in the lattice of `count` directions."""
     turn = 2.0 * np.pi * np.modf(number / ((1.0 + np.sqrt(5.0)) / 2.0))[0]
     z = 1.0 - 2.0 * number / max(1, count - 1)
@@ -156,13 +156,13 @@ def _add_rays(sequences, face, leg, direction, plane_of):  # type: ignore[no-unt
             parent, plane, reach = grow(parent, room), grow(plane, room), grow(reach, room)
             low, high = grow(low, room), grow(high, room)
         if 2 * room > len(table):
-            table = _rehash(parent, plane, count, 2 * len(table))
+            table = rehash(parent, plane, count, 2 * len(table))
         above, length = -1, leg[i, 0]
         for k in range(face.shape[1]):
             if face[i, k] < 0:
                 break
             length += leg[i, k + 1]
-            slot = _find(table, parent, plane, above, plane_of[face[i, k]])
+            slot = find_sequence(table, parent, plane, above, plane_of[face[i, k]])
             node = table[slot]
             if node < 0:
                 parent[count], plane[count], reach[count] = above, plane_of[face[i, k]], length
@@ -178,7 +178,7 @@ def _add_rays(sequences, face, leg, direction, plane_of):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _find(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
+def find_sequence(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
     """Slot in the hash table of the sequence that adds the plane `last` to the sequence `node`, or where it belongs."""
     mask = np.uint64(len(table) - 1)
     slot = mix(node + 1, last) & mask
@@ -188,18 +188,20 @@ def _find(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _rehash(parent, plane, count, size):  # type: ignore[no-untyped-def]
+def rehash(parent, plane, count, size):  # type: ignore[no-untyped-def]
     """Hash table of a larger size."""
     table = np.full(size, -1, np.int32)
     for node in range(count):
-        table[_find(table, parent, plane, parent[node], plane[node])] = node
+        table[find_sequence(table, parent, plane, parent[node], plane[node])] = node
     return table
 
 
-def view_sequences(sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.float64]) -> Views:
-    """Find the image, the margin and the order of all sequences."""
+def view_sequences(
+    sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.float64], spacings: float = MARGIN
+) -> Views:
+    """Find the image, the margin, in spacings of the rays, and the order of all sequences."""
     parent, plane = sequences.parent[: sequences.size], sequences.plane[: sequences.size]
-    margin = MARGIN * np.sqrt(4.0 * np.pi / max(1, sequences.rays))
+    margin = spacings * np.sqrt(4.0 * np.pi / max(1, sequences.rays))
     return Views(_depth_first(parent), *_images(parent, plane, planes, tx_m, margin))
 
 

@@ -6,7 +6,7 @@ one wall if they are at most `depth_m` apart, measured across them. Only one fac
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -148,7 +148,9 @@ class CrossingCandidates:
         most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
         self._limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
         self._wavelength_m = SPEED_OF_LIGHT_M_S / settings.frequency_hz
-        self.slabs = slabs_of(geometry, settings.frequency_hz)
+        of_piece = geometry.wall_material[geometry.plan.owner].astype(np.int64)
+        constants = [(*constants_of(each, settings.frequency_hz), each.thickness_m) for each in geometry.materials]
+        self.slabs = slabs_of(constants, of_piece, settings.frequency_hz)
 
     def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
         """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
@@ -250,21 +252,18 @@ def columns_of(
     return {name: column[:, :used] for name, column in columns}
 
 
-def slabs_of(geometry: SceneGeometry, frequency_hz: float) -> Slabs:
-    """Tabulate the coefficients of the materials of a scene."""
+def slabs_of(constants: Iterable[Iterable[float]], material: NDArray[np.int64], frequency_hz: float) -> Slabs:
+    """Tabulate the coefficients of materials, each permittivity, conductivity and thickness (3,)."""
     cosine = np.linspace(0.0, 1.0, _COSINES + 1)
-    constants = [
-        (*constants_of(each, frequency_hz), each.thickness_m, frequency_hz, cosine) for each in geometry.materials
-    ]
+    given = [(*each, frequency_hz, cosine) for each in constants]
     reflection, transmission = (
-        np.stack([np.stack(coefficients(*each), axis=1) for each in constants])
+        np.stack([np.stack(coefficients(*each), axis=1) for each in given])
         for coefficients in (reflection_coefficients, transmission_coefficients)
     )
     reflection[:, 0], transmission[:, 0] = -1.0, 0.0
     reflected, transmitted = (np.max(np.abs(each) ** 2, axis=2) for each in (reflection, transmission))
     most_reflected = np.maximum.accumulate(reflected[:, ::-1], axis=1)[:, ::-1].copy()
-    of_piece = geometry.wall_material[geometry.plan.owner].astype(np.int64)
-    return Slabs(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted, axis=1), of_piece)
+    return Slabs(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted, axis=1), material)
 
 
 def _needed_by_distance(room: Room, needed: Floats, wavelength_m: float) -> Needed:

@@ -1,0 +1,287 @@
+"""Candidates of meshes that go through walls: sequences of planes that rays meet behind walls, and all legs cast.
+
+At every face a ray splits into one that is reflected and one that goes on. The sequences of their reflections list
+candidates as those of opaque meshes do, without regard to what lies between. Then every leg is cast through the mesh,
+the faces on it are grouped to walls, and the power of the path follows.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.process import in_order, njit
+from sionna_partial.scene.floor_plan import grow
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.candidates import Candidates
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+from sionna_partial.tracing.mesh.candidates import (
+    REACH,
+    REACH_M,
+    View,
+    bound_view,
+    divide,
+    farthest,
+    fold_line,
+    receivers_in_view,
+)
+from sionna_partial.tracing.mesh.faces import MOST_FACES, faces_between, scratch
+from sionna_partial.tracing.mesh.sequences import Sequences, Views, collect_sequences, lattice, view_sequences
+from sionna_partial.tracing.mesh.split_rays import Fixed, least_needed, split_rays
+from sionna_partial.tracing.mesh.walls import SolidMesh, is_inside, mark_walls, trail
+from sionna_partial.tracing.plan.crossings import (
+    _COSINES,
+    _MOST_REFLECTIONS,
+    _RARER,
+    _SHORTEST_LEG_M,
+    _USUAL_REFLECTIONS,
+    Limits,
+    least_power,
+    weakest_needed,
+)
+
+_RAYS = 20_000
+"""Number of rays that are split at faces; fewer where fewer are asked for."""
+
+_MARGIN = 4.0
+"""Distance in direction from a sequence's rays up to which its receivers are looked for, in spacings of the rays."""
+
+_PART = 0.5
+"""Part of the weakest power that matters down to which sequences are followed, as rays are only samples of them."""
+
+_AT_ONCE = 20_000
+"""Number of candidates that are written together, which bounds the memory."""
+
+_SEQUENCES_AT_ONCE = 500
+"""Number of sequences whose paths are cast by one thread at a time."""
+
+_ENTRIES = 160
+"""Most faces that a path may meet."""
+
+
+class Traced(NamedTuple):
+    """Sequences of planes that rays met, where their receivers are, and the fraction of power (M,) that is left."""
+
+    sequences: Sequences
+    views: Views
+    loss: Floats
+
+
+class Pairs(NamedTuple):
+    """Paths: the sequence of each (K,), -1 for a straight line, its receiver and its power."""
+
+    node: NDArray[np.int64]
+    rx: NDArray[np.int64]
+    power: Floats
+
+
+class MeshCrossings:
+    """Paths between a transmitter (3,) and receivers (N, 3) that go through walls of a mesh, without diffraction.
+
+    `largest` is that of `Strengths`, of the materials of the mesh.
+    """
+
+    def __init__(self, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, largest: Floats, settings: TraceSettings) -> None:
+        self._tolerance_db, self._rays = settings.power_tolerance_db, min(_RAYS, settings.samples_per_tx)
+        exact = self._tolerance_db == 0.0
+        most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
+        limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
+        tx_m, rx_m = np.array(tx_m, np.float64), np.array(rx_m, np.float64)
+        self._fixed = Fixed(mesh, tx_m, rx_m, limits, largest, SPEED_OF_LIGHT_M_S / settings.frequency_hz)
+
+    def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
+        """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
+        nothing = self._traced(None)
+        straight = _straight(nothing, self._fixed)
+        needed = weakest_needed(found + straight.power, self._tolerance_db)
+        traced = self._traced(needed) if self._fixed.limits.reflections else nothing
+        boxes = divide(self._fixed.rx_m)
+
+        def of_sequences(start: int) -> Pairs:
+            nodes = traced.views.order[start : start + _SEQUENCES_AT_ONCE]
+            return _pairs(nodes, traced, boxes, needed, self._fixed)  # type: ignore[no-any-return]
+
+        starts = range(0, len(traced.views.order), _SEQUENCES_AT_ONCE)
+        parts = [straight, *in_order(of_sequences, starts)]
+        pairs = Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+        pairs = Pairs(*(column[pairs.power > 0.0] for column in pairs))
+        least = least_power(pairs.rx, pairs.power, found, self._tolerance_db)
+        chosen = np.flatnonzero(pairs.power >= least[pairs.rx])
+        for start in range(0, len(chosen), _AT_ONCE):
+            rows = chosen[start : start + _AT_ONCE]
+            face, kind, vertices_m, same_wall = _written(pairs.node[rows], pairs.rx[rows], traced, self._fixed)
+            used = max(1, int((kind > 0).sum(axis=1).max()))
+            columns = kind[:, :used], face[:, :used], vertices_m[:, :used]
+            candidates = Candidates(pairs.rx[rows].astype(np.int32), *columns, same_wall=same_wall[:, :used])
+            yield candidates, min(1.0, (start + _AT_ONCE) / len(chosen))
+
+    def _traced(self, needed: Floats | None) -> Traced:
+        """Split rays at all faces; without `needed`, there are none."""
+        fixed = self._fixed
+        sequences, loss = collect_sequences([], fixed.mesh.planes), np.empty(1024)
+        if needed is not None and len(needed) and len(fixed.mesh.tree.order):
+            direction = lattice(np.arange(self._rays), self._rays).astype(np.float64)
+            least = least_needed(fixed.tx_m, fixed.rx_m, _PART * needed, fixed.wavelength_m)
+            sequences, loss = split_rays(sequences, loss, direction, least, fixed, _spread_m(fixed))
+        return Traced(sequences, view_sequences(sequences, fixed.mesh.planes, fixed.tx_m, _MARGIN), loss)
+
+
+def _spread_m(fixed: Fixed) -> float:
+    """Length that no line within the mesh exceeds."""
+    tree = fixed.mesh.tree
+    low, high = np.minimum(tree.low_m[0], fixed.tx_m), np.maximum(tree.high_m[0], fixed.tx_m)
+    return float(np.linalg.norm(high - low)) + 1.0
+
+
+@njit(cache=True)
+def _follow(node, target, traced, fixed, met, entries, faces, points):  # type: ignore[no-untyped-def]
+    """Write what a path meets; its number of entries, -1 if there is no path through walls that could matter."""
+    mesh, limits = fixed.mesh, fixed.limits
+    reflections, count, crossed = 0 if node < 0 else traced.views.depth[node], 0, 0
+    a, own = fixed.tx_m, np.int64(-1)
+    for k in range(reflections + 1):
+        b, other = target, np.int64(-1)
+        if k < reflections:
+            b, other = points[k], np.int64(mesh.planes.plane[faces[k]])
+        number = faces_between(mesh.tree, a, b, own, other, met)
+        if number == MOST_FACES or count + number + 1 > len(entries.face):
+            return -1
+        crossed += mark_walls(mesh, a, b, number, met, entries, count)
+        inside = number > 0 and (
+            (k > 0 and is_inside(mesh, faces[k - 1], met.face[0], a, b, 0.0, met.at[0]))
+            or (k < reflections and is_inside(mesh, met.face[number - 1], faces[k], a, b, met.at[number - 1], 1.0))
+        )
+        if inside or crossed > limits.walls:
+            return -1
+        count += number
+        if k < reflections:
+            entries.face[count], entries.kind[count], entries.same_wall[count] = faces[k], REFLECTION, False
+            entries.point_m[count] = b
+            count += 1
+        a, own = b, other
+    return count if crossed > 0 and _has_long_legs(entries, count, fixed.tx_m, target) else -1
+
+
+@njit(cache=True)
+def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
+    """Whether no leg of a path is so short that Sionna RT drops it."""
+    for k in range(count + 1):
+        square = 0.0
+        for axis in range(3):
+            before = entries.point_m[k - 1, axis] if k > 0 else tx[axis]
+            after = entries.point_m[k, axis] if k < count else target[axis]
+            square += (after - before) ** 2
+        if square < _SHORTEST_LEG_M**2:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
+    """Power of a path between vertical antennas."""
+    planes, slabs, tx = fixed.mesh.planes, fixed.mesh.slabs, fixed.tx_m
+    first = entries.point_m[0] if count else target
+    kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
+    total = np.sqrt(kx * kx + ky * ky + kz * kz)
+    kx, ky, kz = kx / total, ky / total, kz / total
+    norm = max(np.hypot(kx, ky), 1e-12)
+    ex, ey, ez = complex(kx * kz / norm), complex(ky * kz / norm), complex(-norm)
+    for j in range(count):
+        here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
+        total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)
+        if entries.same_wall[j]:
+            continue
+        face = entries.face[j]
+        p, material = planes.plane[face], slabs.material[face]
+        nx, ny, nz = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
+        along = kx * nx + ky * ny + kz * nz
+        at = min(abs(along), 1.0) * _COSINES
+        low = min(int(at), _COSINES - 1)
+        part = at - low
+        sx, sy, sz = ky * nz - kz * ny, kz * nx - kx * nz, kx * ny - ky * nx
+        norm = np.sqrt(sx * sx + sy * sy + sz * sz)
+        if norm < 1e-9:
+            sx, sy, sz, norm = (-nz, 0.0, nx, np.hypot(nx, nz)) if abs(ny) < 0.5 else (0.0, nz, -ny, np.hypot(ny, nz))
+        sx, sy, sz = sx / norm, sy / norm, sz / norm
+        te = ex * sx + ey * sy + ez * sz
+        px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
+        tm = ex * px + ey * py + ez * pz
+        table = slabs.transmission if entries.kind[j] == REFRACTION else slabs.reflection
+        te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
+        tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
+        if entries.kind[j] == REFLECTION:
+            kx, ky, kz = kx - 2.0 * along * nx, ky - 2.0 * along * ny, kz - 2.0 * along * nz
+            px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
+        ex, ey, ez = te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz
+    norm = max(np.hypot(kx, ky), 1e-12)
+    field = ex * (kx * kz / norm) + ey * (ky * kz / norm) - ez * norm
+    return (fixed.wavelength_m / (4.0 * np.pi * total)) ** 2 * (field.real**2 + field.imag**2)
+
+
+@njit(cache=True, nogil=True)
+def _straight(traced, fixed):  # type: ignore[no-untyped-def]
+    """Straight lines to all receivers, of power 0 where no wall is on them, or too many."""
+    count = len(fixed.rx_m)
+    met, entries, power = scratch(), trail(_ENTRIES), np.zeros(count)
+    faces, points = np.empty(0, np.int32), np.empty((0, 3))
+    for rx in range(count):
+        number = _follow(-1, fixed.rx_m[rx], traced, fixed, met, entries, faces, points)
+        if number >= 0:
+            power[rx] = _power(entries, number, fixed.rx_m[rx], fixed)
+    return Pairs(np.full(count, -1), np.arange(count), power)
+
+
+@njit(cache=True, nogil=True)
+def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
+    """Paths through walls by some sequences that matter to receivers in their view."""
+    sequences, views, mesh = traced.sequences, traced.views, fixed.mesh
+    folded = sequences, views, mesh.planes, mesh.slabs.material
+    met, entries, count = scratch(), trail(_ENTRIES), 0
+    all_node, all_rx, all_power = np.empty(1024, np.int64), np.empty(1024, np.int64), np.empty(1024)
+    faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
+    seen, stack, bounds = np.empty(len(fixed.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    for node in nodes:
+        rarer = fixed.limits.rarer ** max(0, views.depth[node] - _USUAL_REFLECTIONS)
+        reach = REACH * sequences.reach_m[node] + REACH_M
+        source = views.source_m[node]
+        view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)
+        bound_view(view, farthest(source, boxes), mesh.planes, sequences.plane[node], bounds)
+        for k in range(receivers_in_view(view, boxes, fixed.rx_m, bounds, stack, seen)):
+            target = fixed.rx_m[seen[k]]
+            square = (target[0] - source[0]) ** 2 + (target[1] - source[1]) ** 2 + (target[2] - source[2]) ** 2
+            least = needed[seen[k]] / rarer
+            if traced.loss[node] * (fixed.wavelength_m / (4.0 * np.pi)) ** 2 < _PART * least * square:
+                continue
+            if fold_line(node, target, folded, fixed.largest, fixed.wavelength_m, faces, points) < least:
+                continue
+            number = _follow(node, target, traced, fixed, met, entries, faces, points)
+            if number < 0:
+                continue
+            power = _power(entries, number, target, fixed)
+            if power >= least:
+                all_node, all_rx = grow(all_node, count + 1), grow(all_rx, count + 1)
+                all_power = grow(all_power, count + 1)
+                all_node[count], all_rx[count], all_power[count] = node, seen[k], power
+                count += 1
+    return Pairs(all_node[:count].copy(), all_rx[:count].copy(), all_power[:count].copy())
+
+
+@njit(cache=True, nogil=True)
+def _written(nodes, rx, traced, fixed):  # type: ignore[no-untyped-def]
+    """Faces and kinds (C, D) of chosen paths, vertices (C, D, 3), and whether each is of a wall that is crossed."""
+    folded = traced.sequences, traced.views, fixed.mesh.planes, fixed.mesh.slabs.material
+    met, entries, shape = scratch(), trail(_ENTRIES), (len(nodes), _ENTRIES)
+    face, kind, same_wall = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
+    vertices = np.zeros((len(nodes), _ENTRIES, 3))
+    faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
+    for c in range(len(nodes)):
+        target = fixed.rx_m[rx[c]]
+        if nodes[c] >= 0:
+            fold_line(nodes[c], target, folded, fixed.largest, fixed.wavelength_m, faces, points)
+        number = _follow(nodes[c], target, traced, fixed, met, entries, faces, points)
+        face[c, :number], kind[c, :number] = entries.face[:number], entries.kind[:number]
+        vertices[c, :number], same_wall[c, :number] = entries.point_m[:number], entries.same_wall[:number]
+    return face, kind, vertices, same_wall

@@ -1,0 +1,185 @@
+"""Which of the faces that a line through a mesh meets are one wall.
+
+Two faces that follow each other along a line are one wall if they are at most `depth_m` apart, measured across them,
+and either are where the line enters a closed body and leaves it again, or have no free cell of the map between them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sionna_partial.arrays import Bools, Floats
+from sionna_partial.process import njit
+from sionna_partial.tracing.interactions import REFRACTION
+from sionna_partial.tracing.mesh.faces import FaceTree
+from sionna_partial.tracing.mesh.planes import MeshPlanes
+from sionna_partial.tracing.plan.crossings import Slabs
+
+
+class Bodies(NamedTuple):
+    """The closed body that each of F faces bounds (F,), -1 for none, and its normal out of the body (F, 3)."""
+
+    body: NDArray[np.int64]
+    outward: Floats
+
+
+class Cells(NamedTuple):
+    """Which cells (ny, nx) of a map are free, their edge [m], and how deep one wall may be [m]."""
+
+    free: Bools
+    cell_m: float
+    depth_m: float
+
+
+class SolidMesh(NamedTuple):
+    """A mesh that lines go through: its faces, their planes, bodies and materials, and the cells of its map."""
+
+    tree: FaceTree
+    planes: MeshPlanes
+    bodies: Bodies
+    cells: Cells
+    slabs: Slabs
+
+
+def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
+    """Find the connected pieces of a mesh that close around a volume, every edge once in each direction."""
+    if not len(triangles):
+        return Bodies(np.zeros(0, np.int64), np.zeros((0, 3)))
+    count = len(vertices_m)
+    start, end = triangles.ravel().astype(np.int64), np.roll(triangles, -1, axis=1).ravel().astype(np.int64)
+    edge, which, number = np.unique(start * count + end, return_inverse=True, return_counts=True)
+    back = np.searchsorted(edge, end * count + start)
+    back[back == len(edge)] = 0
+    paired = (edge[back] == end * count + start) & (number[back] == number[which])
+    graph = coo_array((np.ones(len(start), bool), (start, end)), (count, count))
+    pieces, piece = connected_components(graph, directed=False)
+    body = piece[triangles[:, 0]].astype(np.int64)
+    opened = np.zeros(pieces, bool)
+    opened[body[~paired.reshape(-1, 3).all(axis=1)]] = True
+    corner_m = (vertices_m - vertices_m.mean(axis=0))[triangles]
+    across = np.cross(corner_m[:, 1] - corner_m[:, 0], corner_m[:, 2] - corner_m[:, 0])
+    volume = np.bincount(body, (corner_m[:, 0] * across).sum(axis=1), pieces)
+    outward = np.sign(volume[body])[:, None] * across / np.linalg.norm(across, axis=1)[:, None]
+    return Bodies(np.where(opened[body], -1, body), outward)
+
+
+class Trail(NamedTuple):
+    """Scratch of one path: what it meets, in order from the transmitter.
+
+    `face` are faces, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a further face of a
+    wall that has been crossed, which costs nothing; `cosine` is that of the incidence there, `point_m` the points.
+    """
+
+    face: NDArray[np.int64]
+    kind: NDArray[np.uint8]
+    same_wall: Bools
+    cosine: Floats
+    point_m: Floats
+
+
+@njit(cache=True)
+def trail(size):  # type: ignore[no-untyped-def]
+    """Make room for a path that meets so many faces."""
+    return Trail(
+        np.empty(size, np.int64),
+        np.empty(size, np.uint8),
+        np.empty(size, np.bool_),
+        np.empty(size),
+        np.empty((size, 3)),
+    )
+
+
+@njit(cache=True)
+def cosine_at(planes, face, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Cosine of the angle of incidence of a direction at a face."""
+    p = planes.plane[face]
+    normal = planes.normal
+    return min(abs(normal[p, 0] * dx + normal[p, 1] * dy + normal[p, 2] * dz), 1.0)
+
+
+@njit(cache=True)
+def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
+    """Whether nothing free lies between two faces, met one after the other at two fractions of a line from a to b."""
+    body, outward = mesh.bodies.body, mesh.bodies.outward
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    if body[first] >= 0 and body[first] == body[second]:
+        entered = outward[first, 0] * dx + outward[first, 1] * dy + outward[first, 2] * dz < 0.0
+        left = outward[second, 0] * dx + outward[second, 1] * dy + outward[second, 2] * dz > 0.0
+        if entered and left:
+            return True
+    free, cell = mesh.cells.free, mesh.cells.cell_m
+    length = np.hypot(dx, dy)
+    along, last = begin * length + cell, end * length - cell  # cells that the faces themselves cut do not count
+    while along <= last:
+        column, row = int((a[0] + along / length * dx) / cell), int((a[1] + along / length * dy) / cell)
+        if 0 <= row < free.shape[0] and 0 <= column < free.shape[1] and free[row, column]:
+            return False
+        along += 0.5 * cell
+    return True
+
+
+@njit(cache=True)
+def is_inside(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
+    """Whether what lies between two faces on a line from a to b, at two fractions of it, is the inside of one wall.
+
+    Faces that are across each other are a wall and the floor that it stands on, or two walls at a corner.
+    """
+    normal, p, q = mesh.planes.normal, mesh.planes.plane[first], mesh.planes.plane[second]
+    if abs(normal[p, 0] * normal[q, 0] + normal[p, 1] * normal[q, 1] + normal[p, 2] * normal[q, 2]) < 0.5:
+        return False
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    kx, ky, kz = dx / length, dy / length, dz / length
+    steep = min(cosine_at(mesh.planes, first, kx, ky, kz), cosine_at(mesh.planes, second, kx, ky, kz))
+    if (end - begin) * length * steep > mesh.cells.depth_m:
+        return False
+    return is_one_wall(mesh, first, second, a, b, begin, end)
+
+
+@njit(cache=True)
+def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyped-def]
+    """Write the faces that a line from a to b meets as entries of a trail from number `begin`; the number of walls.
+
+    Walls are counted from the end whose coordinates are smaller, so that a link is the same in both directions.
+    """
+    dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    turned = dx < 0.0 or (dx == 0.0 and (dy < 0.0 or (dy == 0.0 and dz < 0.0)))
+    near, far = (b, a) if turned else (a, b)
+    walls, opened, start, previous, steep = 0, 0, 0.0, 0.0, 1.0
+    for j in range(count):
+        k = count - 1 - j if turned else j
+        face, t = met.face[k], 1.0 - met.at[k] if turned else met.at[k]
+        cosine = cosine_at(mesh.planes, face, dx / length, dy / length, dz / length)
+        same = j > 0 and (t - start) * length * min(cosine, steep) <= mesh.cells.depth_m
+        if same:
+            before = met.face[k + 1 if turned else k - 1]
+            same = is_one_wall(mesh, before, face, near, far, previous, t)
+        if not same:
+            _choose(entries, begin, count, opened, j, turned)
+            walls, opened, start, steep = walls + 1, j, t, 1.0
+        entry = begin + k
+        entries.face[entry], entries.kind[entry] = face, REFRACTION
+        entries.same_wall[entry], entries.cosine[entry] = True, cosine
+        for axis in range(3):
+            entries.point_m[entry, axis] = a[axis] + met.at[k] * (b[axis] - a[axis])
+        previous, steep = t, min(steep, cosine)
+    _choose(entries, begin, count, opened, count, turned)
+    return walls
+
+
+@njit(cache=True)
+def _choose(entries, begin, count, first, last, turned):  # type: ignore[no-untyped-def]
+    """Let one of the faces of a wall have its loss: that of the median angle."""
+    for j in range(first, last):
+        own, rank = begin + (count - 1 - j if turned else j), 0
+        for k in range(first, last):
+            other = begin + (count - 1 - k if turned else k)
+            rank += entries.cosine[other] < entries.cosine[own] or (
+                entries.cosine[other] == entries.cosine[own] and k < j
+            )
+        if rank == (last - first) // 2:
+            entries.same_wall[own] = False
