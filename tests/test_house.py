@@ -37,7 +37,7 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawings", "bags", "map_files"),
+        *("drawings", "ifc", "bags", "map_files"),
     ),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot"),
     "scene": ("lines", "outlines", "floor_plan", "scene"),
@@ -91,6 +91,7 @@ IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit", "bokeh", "t
 HEAVY = IN_FUNCTIONS | {
     *("numpy", "scipy", "numba", "skimage", "shapely", "trimesh", "matplotlib", "xarray", "rasterio", "h5netcdf"),
     *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed", "rosbags", "ezdxf", "laspy", "pypcd4"),
+    "ifcopenshell",
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
 
@@ -162,7 +163,7 @@ def own_imports(module: str) -> set[str]:
 def declared(kind: str) -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["live"]] if kind == "run" else extras[kind]
+    lines = [*project["dependencies"], *extras["ifc"], *extras["live"]] if kind == "run" else extras[kind]
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
@@ -258,7 +259,8 @@ class TestOneCall:
     def test_no_other_reader_is_loaded(self) -> None:
         read = f"import sionna_partial as sp\nsp.load_map({str(ROOT / 'scenes/apartment/step100/map.yaml')!r})"
         readers = {
-            f"sionna_partial.maps.{name}" for name in ("bags", "drawings", "mesh.cells", "mesh.files", "mesh.points")
+            f"sionna_partial.maps.{name}"
+            for name in ("bags", "drawings", "ifc", "mesh.cells", "mesh.files", "mesh.points")
         }
         assert not after(read, "sys.modules") & (readers | {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"})
 
