@@ -43,7 +43,7 @@ ROOMS = {
     "scene": ("lines", "outlines", "floor_plan", "scene"),
     "tracing": (
         *("slab", "bounds", "interactions", "paths", "candidates", "links", "engine"),
-        *("plan.beams", "plan.specular", "plan.crossings", "plan.diffraction", "plan.crossed_edges"),
+        *("plan.beams", "plan.specular", "plan.crossings", "plan.obstacles", "plan.diffraction", "plan.crossed_edges"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates", "finder"),
         *("path_set", "simulation", "gradients"),
         "antennas",

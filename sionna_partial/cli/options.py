@@ -37,6 +37,10 @@ MaterialOf = Annotated[
         metavar="LAYER=MATERIAL", help="Of a drawing or IFC model: material of a layer or type.", show_default=False
     ),
 ]
+ObstacleHeight = Annotated[
+    float | None,
+    typer.Option(help="Height of what stands free on a robot's map [m]. Default: the ceiling.", show_default=False),
+]
 Storey = Annotated[str | None, typer.Option(metavar="NAME", help="Of an IFC model: a storey.", show_default=False)]
 MaterialText = Annotated[str, typer.Option(help=_MATERIAL_HELP)]
 Frequency = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
@@ -177,6 +181,7 @@ def _read_map(
     wall_height: WallHeight = None,
     material_of: MaterialOf = None,
     storey: Storey = None,
+    obstacle_height: ObstacleHeight = None,
 ) -> Any:
     pairs = [text.rpartition("=") for text in material_of or ()]
     for layer, _, material in pairs:
@@ -191,6 +196,7 @@ def _read_map(
         up=up,
         layer_materials=materials,
         storey=storey,
+        obstacle_height_m=obstacle_height,
     )
 
 

@@ -153,7 +153,8 @@ def _pieces(path: Path, model: Any, height_m: float, given: dict[str, Material])
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
     pieces, triangles = dict[tuple[int, int], _Piece](), 0
-    for shape in ifcopenshell.geom.iterator(settings, model, core_count(), include=products) if products else ():
+    shapes: Any = ifcopenshell.geom.iterator(settings, model, core_count(), include=products) if products else ()
+    for shape in shapes:
         mesh, product = shape.geometry, model.by_id(shape.id)
         corners_m = np.reshape(mesh.verts, (-1, 3))[np.reshape(mesh.faces, (-1, 3)).astype(np.intp)]
         triangles += len(corners_m)

@@ -74,6 +74,7 @@ def load_map(
     up: str | None = None,
     layer_materials: Mapping[str, Material | str] | None = None,
     storey: str | None = None,
+    obstacle_height_m: float | None = None,
 ) -> PartialMap:
     """Read a map from a file or a folder.
 
@@ -115,6 +116,9 @@ def load_map(
         one ("IfcDoor") are closed.
     storey : str or None
         Name of a storey of a building model; it may be left out where one alone has walls.
+    obstacle_height_m : float or None
+        Height of what stands free on a floor plan [m], such as furniture on the map of a robot (see
+        `PartialMap.with_obstacle_height`). By default walls reach the ceiling, but for obstacles that the file has.
 
     Returns
     -------
@@ -151,10 +155,10 @@ def load_map(
     partial = reader.read(file, **{name: given[name] for name in reader.options if given[name] is not None})
     if partial.environment.is_extruded:
         warn_of_odd_states(f"path = '{source}'", partial)
-    if wall_height_m is None:
-        return partial
-    partial = replace(partial, wall_height_m=wall_height_m)
-    return replace(partial, **partial.environment.with_height(partial.wall_height_m))
+    if wall_height_m is not None:
+        partial = replace(partial, wall_height_m=wall_height_m)
+        partial = replace(partial, **partial.environment.with_height(partial.wall_height_m))
+    return partial if obstacle_height_m is None else partial.with_obstacle_height(obstacle_height_m)
 
 
 def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mapping[str, object] | None = None) -> None:
@@ -206,6 +210,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             content["interior_cells"] = partial.interior_cells
         if partial.material is not None:
             content["material"] = json.dumps(asdict(partial.material))
+        if partial.obstacle is not None:
+            content["obstacle"], content["obstacle_heights_m"] = partial.obstacle, partial.obstacle_heights_m
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content, **partial.environment.arrays())
     else:
@@ -429,6 +435,8 @@ def _read_npz(source: Path) -> PartialMap:
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
             walls = content.get("wall_material")
             of_walls = json.loads(str(content["wall_materials"])) if walls is not None else []
+            obstacle = content.get("obstacle")
+            heights_m = tuple(content["obstacle_heights_m"].tolist()) if obstacle is not None else ()
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
@@ -437,7 +445,8 @@ def _read_npz(source: Path) -> PartialMap:
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
             wall_materials = tuple(Material(**record) for record in of_walls)
-    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, walls, wall_materials)
+    layers = walls, wall_materials, obstacle, heights_m
+    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, *layers)
 
 
 def _read_exported(source: Path) -> PartialMap:

@@ -30,6 +30,7 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
+from sionna_partial.tracing.plan.obstacles import Lowered
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
 CANDIDATES_AT_ONCE = 100_000
@@ -82,7 +83,8 @@ class PlanScene:
             np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
             yield candidates, paths
         crossing = CrossingCandidates(self.geometry, room, self.interior, self.settings)
-        blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
+        lowered = Lowered.of(self.geometry, room, self.interior, self.settings.max_walls)
+        blocks = ((lowered(block), done, "verifying paths through walls") for block, done in crossing.blocks(power))
         for candidates, paths in _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.5, 0.8)):
             np.add.at(power, paths.path_rx, paths.power)
             yield candidates, paths
@@ -90,7 +92,8 @@ class PlanScene:
             fixed = self.interior, self.settings, crossing.slabs
             edges = CrossedEdgeCandidates(self.geometry, self.wedges, room, *fixed)
             strengths = strengths_of(solver.materials.values(), self.settings.frequency_hz, len(rx_m))
-            blocks = ((*block, "verifying diffractions through walls") for block in edges.blocks(strengths, power))
+            doing = "verifying diffractions through walls"
+            blocks = ((lowered(block), done, doing) for block, done in edges.blocks(strengths, power))
             yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.8, 1.0))
 
     def _kinds(self, room: Room) -> dict[str, SpecularCandidates | DiffractionCandidates]:
@@ -332,12 +335,13 @@ def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -
     if diffracted.any() and len(wedges.edge_m):
         which = (paths.interactions == DIFFRACTION).argmax(axis=1)
         x, y, z = paths.vertices_m[np.arange(len(diffracted)), which][diffracted].T
-        beside = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))[0] < SAME_EDGE_M
+        distance_m, edge = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))
+        beside, top_m = distance_m < SAME_EDGE_M, wedges.height_m[edge]
         reflected = paths.interactions[diffracted] == REFLECTION
         height_m = paths.vertices_m[diffracted, :, 2]
-        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m - SAME_EDGE_M)
+        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m.max() - SAME_EDGE_M)
         before = np.arange(reflected.shape[1]) < which[diffracted, None]
         few = reflected.sum(axis=1) <= MAX_REFLECTIONS
         few &= ((at_walls & before).sum(axis=1) <= walls_a_side) & ((at_walls & ~before).sum(axis=1) <= walls_a_side)
-        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
+        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < top_m - SAME_EDGE_M)
     return kept
