@@ -172,7 +172,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             return window
 
         names = "wall_material", "obstacle"
-        layers = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
+        layers: dict[str, Any] = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
         x, y = self.origin_m
         origin_m = x + column * self.resolution_m, y + row * self.resolution_m
         return replace(self, state=cut(self.state, beyond), origin_m=origin_m, **layers)
