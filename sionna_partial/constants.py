@@ -44,6 +44,9 @@ POINT_SUFFIXES = (".pcd", ".las", ".laz", ".xyz", ".pts")
 DRAWING_SUFFIXES = (".dxf",)
 """File formats of drawings."""
 
+IFC_SUFFIXES = (".ifc",)
+"""File formats of building models."""
+
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """File formats of rosbags; one of ROS 2 may also be a folder with a metadata.yaml."""
 

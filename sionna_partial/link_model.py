@@ -290,8 +290,8 @@ class LinkModel:
             phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
             phi, prediction = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
-        free = self.partial.state_at(rx_m) == CellState.FREE
-        return PredictedLinks(phi, prediction, np.where(free, 1.0, p_indoor))
+        known = self.partial.state_at(rx_m) != CellState.UNKNOWN
+        return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor))
 
     def coverage(
         self,

@@ -66,6 +66,8 @@ def extrude(
         ceiling=ceiling,
         wall_material=np.zeros(len(index) // 2, np.int64),
         materials=(Material(),),
+        top_m=np.full(len(index) // 2, height_m),
+        lids=(),
         origin_m=(0.0, 0.0),
     )
 

@@ -37,13 +37,13 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawings", "bags", "map_files"),
+        *("drawings", "ifc", "bags", "map_files"),
     ),
     "simulation": ("furniture", "buildings", "homes", "camera", "robot"),
     "scene": ("lines", "outlines", "floor_plan", "scene"),
     "tracing": (
         *("slab", "bounds", "interactions", "paths", "candidates", "links", "engine"),
-        *("plan.beams", "plan.specular", "plan.crossings", "plan.diffraction", "plan.crossed_edges"),
+        *("plan.beams", "plan.specular", "plan.crossings", "plan.obstacles", "plan.diffraction", "plan.crossed_edges"),
         *("mesh.planes", "mesh.sequences", "mesh.candidates"),
         *("mesh.faces", "mesh.walls", "mesh.split_rays", "mesh.crossings", "finder"),
         *("path_set", "simulation", "gradients"),
@@ -92,6 +92,7 @@ IN_FUNCTIONS = {"tensorflow", "keras", "sionna", "mitsuba", "drjit", "bokeh", "t
 HEAVY = IN_FUNCTIONS | {
     *("numpy", "scipy", "numba", "skimage", "shapely", "trimesh", "matplotlib", "xarray", "rasterio", "h5netcdf"),
     *("h5py", "PIL", "yaml", "pandas", "pyarrow", "dask", "distributed", "rosbags", "ezdxf", "laspy", "pypcd4"),
+    "ifcopenshell",
 }
 """Not loaded by `import sionna_partial`, nor by `--help`."""
 
@@ -163,7 +164,7 @@ def own_imports(module: str) -> set[str]:
 def declared(kind: str) -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["live"]] if kind == "run" else extras[kind]
+    lines = [*project["dependencies"], *extras["ifc"], *extras["live"]] if kind == "run" else extras[kind]
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
@@ -259,14 +260,15 @@ class TestOneCall:
     def test_no_other_reader_is_loaded(self) -> None:
         read = f"import sionna_partial as sp\nsp.load_map({str(ROOT / 'scenes/apartment/step100/map.yaml')!r})"
         readers = {
-            f"sionna_partial.maps.{name}" for name in ("bags", "drawings", "mesh.cells", "mesh.files", "mesh.points")
+            f"sionna_partial.maps.{name}"
+            for name in ("bags", "drawings", "ifc", "mesh.cells", "mesh.files", "mesh.points")
         }
         assert not after(read, "sys.modules") & (readers | {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"})
 
     def test_few_modules_are_imported(self) -> None:
         modules = "name for name, each in sys.modules.items() if not hasattr(each, '__path__')"
         loaded = after("import sionna_partial as sp\nsp.predict_map", f"{{{modules}}}")
-        assert len([name for name in loaded if name.startswith("sionna_partial.")]) <= 63
+        assert len([name for name in loaded if name.startswith("sionna_partial.")]) <= 64
 
 
 class TestPublicNames:

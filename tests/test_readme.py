@@ -56,6 +56,12 @@ def write_scans(folder: Path) -> None:
     corners = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
     plan.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "A-WALL-FULL"})
     plan.saveas(folder / "plan.dxf")
+    from ifc_building import Building  # needs an extra
+
+    building = Building(0.0, 3.0)
+    building.rooms(0.0, 0)
+    building.rooms(3.0, 1)
+    building.model.write(str(folder / "building.ifc"))
 
 
 PAGES_WITH_PYTHON = tuple(page for page in PAGES if blocks(page, "python"))

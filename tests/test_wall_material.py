@@ -45,7 +45,10 @@ class TestMap:
         ("changes", "message"),
         [
             ({"wall_material": np.ones((3, 3), int)}, r"wall_material has shape \(3, 3\)"),
-            ({"wall_material": np.full((40, 60), 3)}, "wall_material has values 3 to 3: use 0"),
+            (
+                {"wall_material": np.full((40, 60), 3)},
+                "wall_material has values 3 to 3, and wall_materials has 2",
+            ),
             ({"wall_materials": ("brick",)}, "wall_materials holds a str"),
             ({"wall_materials": tuple(sp.Material(2.0 + k) for k in range(300))}, "give at most 255"),
         ],
@@ -79,6 +82,7 @@ class TestFiles:
         ("value", "message"),
         [
             (["brick"], "has shades up to 2 for 1 materials"),
+            (["brick", None], "names none of its materials at place 2"),
             (["brick", "cheese"], "wall_material = 'cheese' is not allowed"),
             ("brick", "give an image and a list of materials"),
         ],
@@ -103,7 +107,7 @@ class TestFiles:
         row, column = read.cell_index(np.array([[3.01, 1.0], [0.01, 2.0]]))
         assert read.wall_material is not None
         assert read.wall_material[row, column].tolist() == [0, 1]
-        with pytest.raises(MapError, match=r"layer_materials\['roof'\] = 'concrete' names no layer with walls"):
+        with pytest.raises(MapError, match=r"layer_materials\['roof'\] names no layer with walls"):
             sp.load_map(tmp_path / "plan.dxf", layer_materials={"roof": "concrete"})
 
 

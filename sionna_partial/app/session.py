@@ -27,6 +27,7 @@ from sionna_partial.constants import (
     DEFAULT_HEIGHT_M,
     DRAWING_SUFFIXES,
     GAIN_FLOOR_DB,
+    IFC_SUFFIXES,
     MESH_SUFFIXES,
     POINT_SUFFIXES,
     CellState,
@@ -75,7 +76,7 @@ _FINEST_M, _MOST_RECEIVERS = 0.15, 30_000
 
 _IMAGES, _SHEETS = (".pgm", ".png", ".bmp"), (".yaml", ".yml")
 
-MAP_SUFFIXES = (*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *BAG_SUFFIXES)
+MAP_SUFFIXES = (*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES)
 """Maps that can be uploaded; a ROS map with its image, or as a zip of both."""
 
 _ONE_AT_A_TIME = ThreadPoolExecutor(1, "coverage of the app")

@@ -18,7 +18,7 @@ from sionna_partial.files import require_writable
 from sionna_partial.progress import reporting
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
-MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, or DXF floor plan."
+MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, DXF floor plan, or IFC model."
 _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
 _MATERIAL_HELP = "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
 
@@ -33,8 +33,15 @@ WallHeight = Annotated[
 ]
 MaterialOf = Annotated[
     list[str] | None,
-    typer.Option(metavar="LAYER=MATERIAL", help="Of a drawing: material of the walls on a layer.", show_default=False),
+    typer.Option(
+        metavar="LAYER=MATERIAL", help="Of a drawing or IFC model: material of a layer or type.", show_default=False
+    ),
 ]
+ObstacleHeight = Annotated[
+    float | None,
+    typer.Option(help="Height of what stands free on a robot's map [m]. Default: the ceiling.", show_default=False),
+]
+Storey = Annotated[str | None, typer.Option(metavar="NAME", help="Of an IFC model: a storey.", show_default=False)]
 MaterialText = Annotated[str, typer.Option(help=_MATERIAL_HELP)]
 Frequency = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
 MaxDepth = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
@@ -173,6 +180,8 @@ def _read_map(
     up: Up = None,
     wall_height: WallHeight = None,
     material_of: MaterialOf = None,
+    storey: Storey = None,
+    obstacle_height: ObstacleHeight = None,
 ) -> Any:
     pairs = [text.rpartition("=") for text in material_of or ()]
     for layer, _, material in pairs:
@@ -186,6 +195,8 @@ def _read_map(
         height_band_m=height_band,
         up=up,
         layer_materials=materials,
+        storey=storey,
+        obstacle_height_m=obstacle_height,
     )
 
 

@@ -223,6 +223,8 @@ def _packed(partial: PartialMap) -> dict[str, object]:
     if partial.wall_material is not None:
         material["wall_material"] = _deflated(partial.wall_material)
         material["wall_materials"] = material_records(partial.wall_materials)
+    if partial.obstacle is not None:
+        material |= {"obstacle": _deflated(partial.obstacle), "obstacle_heights_m": [*partial.obstacle_heights_m]}
     return {
         "shape": list(partial.shape),
         "cells": _deflated(partial.state),
@@ -253,6 +255,8 @@ def _unpacked(entry: Any) -> PartialMap:
     if "wall_material" in entry:
         rest["wall_material"] = inflated(entry["wall_material"])
         rest["wall_materials"] = tuple(Material(**record) for record in entry["wall_materials"])
+    if "obstacle" in entry:
+        rest |= {"obstacle": inflated(entry["obstacle"]), "obstacle_heights_m": tuple(entry["obstacle_heights_m"])}
     return PartialMap(inflated(entry["cells"]), origin_m=tuple(entry["origin_m"]), **rest)
 
 

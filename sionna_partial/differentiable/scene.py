@@ -35,6 +35,7 @@ from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
+from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, link_features
@@ -151,6 +152,11 @@ class DifferentiableScene:
         self.simulation = model.simulation
         self.simulation.require_exact()
         self.partial = self.simulation.partial
+        if self.partial.obstacle is not None:
+            raise MapError(
+                "scene has obstacles below the ceiling, which smooth lengths in walls do not know: give "
+                "dataclasses.replace(partial, obstacle=None)."
+            )
         self.predictor = Predictor.load(model.asked)
         self.networks = parts(self.predictor.model)
 

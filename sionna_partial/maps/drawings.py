@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Floats, States
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
@@ -130,14 +130,14 @@ def map_from_drawing(
             "unit_m in which it is drawn (0.001 for millimetres), or the wall_layers of one plan."
         )
     empty = fitted_grid(np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]), resolution_m)
-    state = _states(segments, empty)
+    state = states_of_lines(segments, empty)
     if not (state == CellState.FREE).any():
         raise MapError(
             f"path = '{source}': the walls of {shown(sorted(layers))} enclose nothing: name the layers that close the "
             f"rooms as wall_layers; it has {_listed(drawing)}."
         )
     partial = PartialMap(state, empty.resolution_m, empty.origin_m, wall_height_m)
-    return _with_materials(partial, segments, on_layer, materials) if materials else partial
+    return with_materials(partial, segments, on_layer, materials) if materials else partial
 
 
 def _of_layers(
@@ -150,18 +150,24 @@ def _of_layers(
         raise MapError(f"layer_materials = {shown(given)} is not allowed: give materials by the names of layers.")
     found: dict[Material, set[str]] = {}
     for name, value in given.items():
-        material = Material.named(value) if isinstance(value, str) else value
+        material = material_given(name, value)
         own = {layer for layer in layers if fnmatch(layer, str(name).lower())}
-        if not isinstance(material, Material) or not own:
-            what = f"layer_materials[{shown(name)}] = {shown(value)}"
-            raise MapError(
-                f"{what} names no layer with walls of path = '{path}', or no material: it has {_listed(drawing)}."
-            )
+        if not own:
+            what = f"layer_materials[{shown(name)}] names no layer with walls of path = '{path}'"
+            raise MapError(f"{what}: it has {_listed(drawing)}.")
         found[material] = found.get(material, set()) | own
     return found
 
 
-def _with_materials(
+def material_given(name: str, value: object) -> Material:
+    """Return the material that `layer_materials` has for a name."""
+    material = Material.named(value) if isinstance(value, str) else value
+    if not isinstance(material, Material):
+        raise MapError(f"layer_materials[{shown(name)}] = {shown(value)} is no material: give one, or its name.")
+    return material
+
+
+def with_materials(
     partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], materials: dict[Material, set[str]]
 ) -> PartialMap:
     """Give each wall the material of the nearest line."""
@@ -300,15 +306,15 @@ def _unit(path: Path, drawing: Any, segments: Segments) -> float:
     return found[0]
 
 
-def _states(segments: Segments, empty: PartialMap) -> States:
-    """Cell states (ny, nx): walls, what they enclose, and unknown cells."""
+def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:
+    """Cell states (ny, nx): walls, those of `solid` among them, what they enclose, and unknown cells."""
     cell_m = empty.resolution_m
     corners = np.zeros((len(segments), 5, 2))
     corners[:, :2] = (segments - empty.origin_m) / cell_m
     margin = math.ceil(OPENING_M / cell_m)
     cells = np.zeros(empty.shape, dtype=np.bool_)
     mark_cells(corners, np.full(len(segments), 2), cells, BORDER_M / cell_m, True)
-    wall = np.pad(cells, margin)
+    wall = np.pad(cells if solid is None else cells | solid, margin)
     # A disc of half the opening's width that rolls along the outer walls does not enter the building.
     radius = OPENING_M / 2 / cell_m
     to_wall = ndimage.distance_transform_edt(~wall)

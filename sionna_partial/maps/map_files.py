@@ -20,6 +20,7 @@ from sionna_partial.constants import (
     BAG_SUFFIXES,
     DEFAULT_WALL_HEIGHT_M,
     DRAWING_SUFFIXES,
+    IFC_SUFFIXES,
     MESH_SUFFIXES,
     POINT_SUFFIXES,
     CellState,
@@ -43,7 +44,8 @@ ACCEPTED = (
     "a ROS map YAML (.yaml, .yml), a map written by save_map (.npz), an exported scene (folder or scene.xml), "
     "the folder of a calibration, "
     f"a Mitsuba scene (folder or .xml), a mesh ({', '.join(MESH_SUFFIXES)}), a point cloud "
-    f"({', '.join(POINT_SUFFIXES)}, .ply), a drawing ({', '.join(DRAWING_SUFFIXES)}), or a rosbag "
+    f"({', '.join(POINT_SUFFIXES)}, .ply), a drawing ({', '.join(DRAWING_SUFFIXES)}), "
+    f"a building model ({', '.join(IFC_SUFFIXES)}), or a rosbag "
     f"({', '.join(BAG_SUFFIXES)}, or a folder)"
 )
 """What load_map reads."""
@@ -71,6 +73,8 @@ def load_map(
     resolution_m: float | None = None,
     up: str | None = None,
     layer_materials: Mapping[str, Material | str] | None = None,
+    storey: str | None = None,
+    obstacle_height_m: float | None = None,
 ) -> PartialMap:
     """Read a map from a file or a folder.
 
@@ -84,7 +88,9 @@ def load_map(
         exported scene: its folder or its `scene.xml`; the folder that `sionna-partial calibrate` wrote; a mesh in
         metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene of meshes, with the radio materials of Sionna RT: its
         `.xml`, or a folder with one; a point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS; see `map_from_points`); a
-        floor plan (DXF; see `map_from_drawing`); or a rosbag (.bag, .mcap, .db3, or a folder; see `map_from_bag`).
+        floor plan (DXF; see `map_from_drawing`); a building model (IFC, with the extra `sionna-partial[ifc]`), whose
+        walls, columns, windows and curtain walls are cut 1.2 m above a storey, and whose doors are open; or a rosbag
+        (.bag, .mcap, .db3, or a folder; see `map_from_bag`).
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
@@ -99,12 +105,20 @@ def load_map(
         What has been observed of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it
         is. By default all cells above or below which the mesh has a surface.
     resolution_m : float or None
-        Edge of the cells of the map of a mesh, cloud or drawing [m], 0.05 by default. They lie on multiples of it.
+        Edge of the cells of the map of a mesh, cloud, drawing or building model [m], 0.05 by default. They lie on
+        multiples of it.
     up : {"z", "y"} or None
         Axis of a mesh or cloud that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB
         files.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers of a drawing, or their names as of `Material.named` (see `map_from_drawing`).
+        Of a building model, by types such as "IfcWall", in place of those that its materials name. Doors that are given
+        one ("IfcDoor") are closed.
+    storey : str or None
+        Name of a storey of a building model; it may be left out where one alone has walls.
+    obstacle_height_m : float or None
+        Height of what stands free on a floor plan [m], such as furniture on the map of a robot (see
+        `PartialMap.with_obstacle_height`). By default walls reach the ceiling, but for obstacles that the file has.
 
     Returns
     -------
@@ -132,19 +146,19 @@ def load_map(
         raise MapError(f"path = '{source}' is not there: give {ACCEPTED}.")
     file, reader = _reader_of(source)
     given: dict[str, Any] = {"height_band_m": height_band_m, "observed": observed, "resolution_m": resolution_m}
-    given |= {"up": up, "layer_materials": layer_materials}
+    given |= {"up": up, "layer_materials": layer_materials, "storey": storey}
     for name, value in given.items():
         if value is not None and name not in reader.options:
-            kinds = "drawings" if name == "layer_materials" else "scans"
+            kinds = {"layer_materials": "drawings and building models", "storey": "building models"}.get(name, "scans")
             raise MapError(f"{name} is for {kinds} alone, but path = '{source}' is {reader.what}: leave it out.")
     given["strict"] = strict or None
     partial = reader.read(file, **{name: given[name] for name in reader.options if given[name] is not None})
     if partial.environment.is_extruded:
         warn_of_odd_states(f"path = '{source}'", partial)
-    if wall_height_m is None:
-        return partial
-    partial = replace(partial, wall_height_m=wall_height_m)
-    return replace(partial, **partial.environment.with_height(partial.wall_height_m))
+    if wall_height_m is not None:
+        partial = replace(partial, wall_height_m=wall_height_m)
+        partial = replace(partial, **partial.environment.with_height(partial.wall_height_m))
+    return partial if obstacle_height_m is None else partial.with_obstacle_height(obstacle_height_m)
 
 
 def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mapping[str, object] | None = None) -> None:
@@ -196,6 +210,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             content["interior_cells"] = partial.interior_cells
         if partial.material is not None:
             content["material"] = json.dumps(asdict(partial.material))
+        if partial.obstacle is not None:
+            content["obstacle"], content["obstacle_heights_m"] = partial.obstacle, partial.obstacle_heights_m
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content, **partial.environment.arrays())
     else:
@@ -391,6 +407,12 @@ def _read_drawing(source: Path, **options: Any) -> PartialMap:
     return map_from_drawing(source, **options)
 
 
+def _read_ifc(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.ifc import map_from_ifc
+
+    return map_from_ifc(source, **options)
+
+
 def _read_bag(source: Path) -> PartialMap:
     from sionna_partial.maps.bags import map_from_bag
 
@@ -413,6 +435,8 @@ def _read_npz(source: Path) -> PartialMap:
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
             walls = content.get("wall_material")
             of_walls = json.loads(str(content["wall_materials"])) if walls is not None else []
+            obstacle = content.get("obstacle")
+            heights_m = tuple(content["obstacle_heights_m"].tolist()) if obstacle is not None else ()
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
@@ -421,7 +445,8 @@ def _read_npz(source: Path) -> PartialMap:
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
             wall_materials = tuple(Material(**record) for record in of_walls)
-    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, walls, wall_materials)
+    layers = walls, wall_materials, obstacle, heights_m
+    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, *layers)
 
 
 def _read_exported(source: Path) -> PartialMap:
@@ -449,6 +474,9 @@ _READERS = {
     **dict.fromkeys(POINT_SUFFIXES, _Reader("a point cloud", _read_cloud, _OF_SCANS)),
     ".ply": _Reader("a mesh or a point cloud", _read_ply, _OF_SCANS),
     **dict.fromkeys(DRAWING_SUFFIXES, _Reader("a drawing", _read_drawing, ("resolution_m", "layer_materials"))),
+    **dict.fromkeys(
+        IFC_SUFFIXES, _Reader("a building model", _read_ifc, ("resolution_m", "layer_materials", "storey"))
+    ),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
 """Readers by suffix. Their modules, and the libraries that these need, are imported when a file is read."""

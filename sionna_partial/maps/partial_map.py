@@ -29,7 +29,10 @@ MAX_INTERIOR_CELLS = 2**53
 """Largest number of free cells of a complete home: more is damage, and no file could hold it."""
 
 MAX_WALL_MATERIALS = 255
-"""Most materials of the walls of a map, which a byte per cell counts."""
+"""Most materials of the walls of a map, and most heights of obstacles, which a byte per cell counts."""
+
+FREE_STANDING_M = 2.5
+"""Extent along x and y up to which walls that stand free are furniture [m]."""
 
 ODD_CELLS = 1000
 """Number of cells from which a map has free and wall cells."""
@@ -80,6 +83,11 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         is no wall. A mesh has its own. See `with_wall_material`.
     wall_materials : tuple of Material
         At most 255 materials that `wall_material` counts.
+    obstacle : (ny, nx) uint8 array or None
+        Which wall cells end below the ceiling: k for those of `obstacle_heights_m[k - 1]`, 0 for walls that reach it.
+        Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
+    obstacle_heights_m : tuple of float
+        At most 255 heights that `obstacle` counts [m].
 
     Raises
     ------
@@ -103,6 +111,8 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     material: Material | None = None
     wall_material: NDArray[np.uint8] | None = None
     wall_materials: tuple[Material, ...] = ()
+    obstacle: NDArray[np.uint8] | None = None
+    obstacle_heights_m: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "state", _checked_state(self.state))
@@ -123,20 +133,23 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             kind = type(self.material).__name__
             raise MapError(f"material is of type {kind}: give a Material, or None for that of SceneSettings.")
         object.__setattr__(self, "wall_materials", _checked_materials(self.wall_materials))
-        object.__setattr__(self, "wall_material", self._checked_wall_material())
+        object.__setattr__(self, "wall_material", self._layer("wall_material", "wall_materials"))
+        object.__setattr__(self, "obstacle_heights_m", _checked_heights(self.obstacle_heights_m))
+        object.__setattr__(self, "obstacle", self._layer("obstacle", "obstacle_heights_m"))
 
-    def _checked_wall_material(self) -> NDArray[np.uint8] | None:
-        """Return the materials of the wall cells as a new read-only array, None where all are of the default."""
-        if self.wall_material is None:
+    def _layer(self, name: str, counted: str) -> NDArray[np.uint8] | None:
+        """Return the numbers of the wall cells as a new read-only array, None where all are 0."""
+        values = getattr(self, name)
+        if values is None:
             return None
         if self.mesh is not None:
-            raise MapError("wall_material is for floor plans: a mesh has materials of its own.")
-        cells = grid_array("wall_material", self.wall_material, "iub")
+            raise MapError(f"{name} is for floor plans: a mesh has walls of its own.")
+        cells, count = grid_array(name, values, "iub"), len(getattr(self, counted))
         if cells.shape != self.shape:
-            raise MapError(f"wall_material has shape {cells.shape} and state {self.shape}: give arrays of one shape.")
-        if cells.min() < 0 or cells.max() > len(self.wall_materials):
-            what = f"wall_material has values {cells.min()} to {cells.max()}"
-            raise MapError(f"{what}: use 0 (material) to {len(self.wall_materials)}, one for each of wall_materials.")
+            raise MapError(f"{name} has shape {cells.shape} and state {self.shape}: give arrays of one shape.")
+        if cells.min() < 0 or cells.max() > count:
+            what = f"{name} has values {cells.min()} to {cells.max()}, and {counted} has {count} entries"
+            raise MapError(f"{what}: give one for each value from 1 on; 0 is the default.")
         cells = np.where(self.state == CellState.WALL, cells, 0).astype(np.uint8)
         cells.setflags(write=False)
         return cells if cells.any() else None
@@ -158,10 +171,11 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             window[inside] = cells[own]
             return window
 
-        walls = None if self.wall_material is None else cut(self.wall_material, 0)
+        names = "wall_material", "obstacle"
+        layers: dict[str, Any] = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
         x, y = self.origin_m
         origin_m = x + column * self.resolution_m, y + row * self.resolution_m
-        return replace(self, state=cut(self.state, beyond), origin_m=origin_m, wall_material=walls)
+        return replace(self, state=cut(self.state, beyond), origin_m=origin_m, **layers)
 
     def with_wall_material(self, material: Material | str, where: object) -> "PartialMap":
         """Return the map with the walls of an area made of a material.
@@ -194,6 +208,40 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         materials = _checked_materials(materials)
         cells[self._cells_within(where)] = materials.index(material) + 1
         return replace(self, wall_material=cells, wall_materials=materials)
+
+    def with_obstacle_height(self, height_m: float, where: object = None) -> "PartialMap":
+        """Return the map with the walls of an area ending at a height: what a low lidar saw need not be a wall.
+
+        Paths go over such obstacles, and radios may stand above them.
+
+        Parameters
+        ----------
+        height_m : float
+            Height of their tops [m]; from `wall_height_m` on they are walls.
+        where : (ny, nx) bool array, (M, 2) array-like, shapely geometry or None
+            The area as in `with_wall_material`. None is all that stands free: wall cells that touch each other, within
+            2.5 m along x and y, with nothing but free cells around them. Pillars are among them.
+
+        Raises
+        ------
+        MapError
+            For a height that is no positive number, an area of another kind, a mesh, or more than 255 heights.
+
+        Examples
+        --------
+        >>> import numpy as np, sionna_partial as sp
+        >>> room = np.pad(np.zeros((30, 40), np.uint8), 1, constant_values=1)
+        >>> room[10:14, 10:18] = 1  # a table
+        >>> low = sp.PartialMap(room, resolution_m=0.1).with_obstacle_height(0.75)
+        >>> low.radios_can_stand(np.array([[1.5, 1.2, 0.7], [1.5, 1.2, 1.0], [0.05, 1.2, 1.0]])).tolist()
+        [False, True, False]
+        """
+        height_m = _number("height_m", height_m, 0.01, 100.0)
+        cells = np.zeros(self.shape, np.uint8) if self.obstacle is None else self.obstacle.copy()
+        area = free_standing(self.state, self.resolution_m) if where is None else self._cells_within(where)
+        heights_m = tuple(dict.fromkeys((*self.obstacle_heights_m, height_m)))
+        cells[area] = heights_m.index(height_m) + 1 if height_m < self.wall_height_m else 0
+        return replace(self, obstacle=cells, obstacle_heights_m=heights_m)
 
     def _cells_within(self, where: object) -> Bools:
         """Cells (ny, nx) of a mask, or whose centres are in a polygon or a shapely geometry [m]."""
@@ -299,6 +347,32 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             freest = np.minimum(freest, _RANK[padded[row, column]])
         return _FREEST[freest]
 
+    @cached_property
+    def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
+        """Heights up to which walls reach [m], and a map with the walls of that height alone; first those of a room.
+
+        The first map has free cells in place of obstacles and of what they enclose, and the infinite height.
+        """
+        if self.obstacle is None:
+            return ((math.inf, self),)
+        plain = replace(self, obstacle=None)
+        within = ndimage.binary_fill_holes(self.obstacle > 0) & (self.state == CellState.UNKNOWN)
+        state = np.where((self.obstacle > 0) | within, CellState.FREE, self.state)
+        levels = [(math.inf, replace(plain, state=state))]
+        for number in np.unique(self.obstacle[self.obstacle > 0]).tolist():
+            other = np.where(self.state == CellState.UNKNOWN, CellState.UNKNOWN, CellState.FREE)
+            state = np.where(self.obstacle == number, CellState.WALL, other)
+            levels.append((self.obstacle_heights_m[number - 1], replace(plain, state=state)))
+        return tuple(levels)
+
+    def is_wall_at(self, points_m: Floats) -> Bools:
+        """Whether world points (..., 3) [m] are in walls, which reach to the ceiling or to the height of obstacles."""
+        found = [
+            (points_m[..., 2] <= top_m) & (level.state_at(points_m) == CellState.WALL)
+            for top_m, level in self.wall_levels
+        ]
+        return np.asarray(np.any(found, axis=0))
+
     def require_positions(self, name: str, points_m: object, *, least: int = 1) -> Floats:
         """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
 
@@ -324,7 +398,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
         can_tell = len(points_m) >= 3 and self.environment.is_extruded and bool((np.abs(points_m) < 1e8).all())
         for name, state in turns.items() if can_tell else ():
-            if (replace(self, state=state, wall_material=None).state_at(points_m) == CellState.FREE).all():
+            if (PartialMap(state, self.resolution_m, self.origin_m).state_at(points_m) == CellState.FREE).all():
                 return f" All {len(points_m)} are free on the map {name}."
         return ""
 
@@ -338,7 +412,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         low, high = self.height_range_m
         finite = np.asarray(np.isfinite(points_m).all(axis=1))
         x, y, z = np.where(finite[:, None], points_m, 0.0).T
-        state = self.state_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1)]))
+        walled = self.is_wall_at(np.column_stack([np.clip(x, x0, x1), np.clip(y, y0, y1), z]))
         outside = (x < x0) | (x > x1) | (y < y0) | (y > y1)
         beyond = f"is outside the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m"
         too_high = f"is not between floor and ceiling ({low:g} to {high:g} m)"
@@ -346,7 +420,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             (~finite, "is not finite", "give finite numbers in metres."),
             (outside, beyond, "move it inside, or extend the map with unknown cells."),
             ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
-            (state == CellState.WALL, "is inside a wall", "move it to a free or unknown cell."),
+            (walled, "is inside a wall", "move it to a free or unknown cell."),
         ]
 
 
@@ -460,6 +534,34 @@ def _checked_state(values: ArrayLike) -> States:
     state = np.array(state, dtype=np.uint8)
     state.setflags(write=False)
     return state
+
+
+def free_standing(state: States, resolution_m: float) -> Bools:
+    """Wall cells (ny, nx) that stand free: pieces of at most `FREE_STANDING_M` along x and y with free cells around.
+
+    Unknown cells that only walls touch are part of them.
+    """
+    state, square = np.pad(state, 1, constant_values=CellState.UNKNOWN), np.ones((3, 3), dtype=bool)
+    unknown, _ = ndimage.label(state == CellState.UNKNOWN)
+    is_open = np.zeros(unknown.max() + 1, dtype=bool)
+    is_open[unknown[ndimage.binary_dilation(state == CellState.FREE)]] = True
+    is_open[unknown[0, 0]] = True
+    beyond = is_open[unknown] & (unknown > 0)
+    solid = (state != CellState.FREE) & ~beyond
+    pieces, _ = ndimage.label(solid, square)
+    most = FREE_STANDING_M / resolution_m + 1e-6
+    small = [max(part.stop - part.start for part in extent) <= most for extent in ndimage.find_objects(pieces)]
+    stands = np.array([False, *small])
+    stands[pieces[ndimage.binary_dilation(beyond, square)]] = False
+    return np.asarray((stands[pieces] & (state == CellState.WALL))[1:-1, 1:-1])
+
+
+def _checked_heights(values: object) -> tuple[float, ...]:
+    """Return heights of obstacles as a tuple, or raise a MapError."""
+    heights = tuple(values) if isinstance(values, tuple | list) else (values,)
+    if len(heights) > MAX_WALL_MATERIALS:
+        raise MapError(f"obstacle_heights_m has {len(heights)} heights: give at most {MAX_WALL_MATERIALS}.")
+    return tuple(_number("obstacle_heights_m", each, 0.01, 100.0) for each in heights)
 
 
 def _checked_materials(values: object) -> tuple[Material, ...]:

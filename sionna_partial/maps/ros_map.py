@@ -4,7 +4,7 @@ import logging
 import math
 import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -125,32 +125,47 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
     mesh = _exported_mesh(path.parent, raw) if "mesh" in raw else None
-    walls: tuple[States | None, tuple[Material, ...]] = None, ()
-    if "wall_material" in raw:
-        given = raw["wall_material"]
-        image = _image_path(path, given.get("image") if isinstance(given, dict) else None, confined=confined)
-        walls = _wall_material(path, given, _decode(sheet._replace(image=image)), pixels.level.shape, origin)
-    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, *walls)
+    layers: dict[str, Any] = {}
+    for name, (listed, target, made) in _LAYERS.items():
+        if name in raw:
+            given = raw[name]
+            image = _image_path(path, given.get("image") if isinstance(given, dict) else None, confined=confined)
+            cells = _decode(sheet._replace(image=image))
+            layers[target] = tuple(made(path, name, each) for each in _listed(path, name, given, listed))
+            layers[name] = _layer(path, name, cells, (listed, layers[target]), pixels.level.shape, origin)
+    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, **layers)
 
 
-def _wall_material(
-    path: Path, value: Any, image: Image.Image, shape: tuple[int, ...], origin: tuple[float, float, float]
-) -> tuple[States, tuple[Material, ...]]:
-    """Return the materials of the wall cells, which the shades of an image count."""
-    if not isinstance(value.get("materials"), list):
-        raise _refuse(path, "wall_material", value, "give an image and a list of materials, as save_map does.")
-    records = [_material(path, "wall_material", record) for record in value["materials"]]
+def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
+    """Return what the shades of the image of a layer count."""
+    if not isinstance(given.get(listed), list):
+        raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
+    values: list[Any] = given[listed]
+    return values
+
+
+def _layer(
+    path: Path,
+    name: str,
+    image: Image.Image,
+    counted: tuple[str, tuple[Any, ...]],
+    shape: tuple[int, ...],
+    origin: tuple[float, float, float],
+) -> States:
+    """Return the numbers of the wall cells, which are the shades of an image."""
     if image.mode != "L" or image.size != shape[::-1]:
-        what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th material."
-        raise _refuse(path, "wall_material", value.get("image"), f"give {what}")
-    cells = np.flipud(np.asarray(image))
-    if cells.max(initial=0) > len(records) or None in records:
-        what = f"has shades up to {cells.max()} for {len(records)} materials"
-        raise MapError(f"{path}: wall_material {what}: list a material for each shade from 1 on.")
+        what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th listed."
+        raise MapError(f"{path}: the image of {name} is of another size or kind: give {what}")
+    cells, (listed, values) = np.flipud(np.asarray(image)), counted
+    if None in values:
+        raise MapError(f"{path}: {name} names none of its {listed} at place {values.index(None) + 1}: give each one.")
+    if cells.max(initial=0) > len(values):
+        what = f"has shades up to {cells.max()} for {len(values)} {listed}"
+        raise MapError(f"{path}: {name} {what}: list one for each shade from 1 on.")
     turns = round(origin[2] / (math.pi / 2))
     if abs(origin[2] - turns * math.pi / 2) * math.hypot(*cells.shape) > 0.5:
-        raise _refuse(path, "origin", [*origin], "with wall_material its yaw must be a quarter turn, or 0.")
-    return np.rot90(cells, -turns), tuple(record for record in records if record is not None)
+        raise _refuse(path, "origin", [*origin], f"with {name} its yaw must be a quarter turn, or 0.")
+    return np.rot90(cells, -turns)
 
 
 def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
@@ -172,6 +187,10 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
     image = f"{path.stem}_wall_material.pgm"
     sheet |= partial.environment.sheet(image)
     images = {} if partial.wall_material is None else {path.with_name(image): partial.wall_material}
+    if partial.obstacle is not None:
+        image = f"{path.stem}_obstacle.pgm"
+        sheet["obstacle"] = {"image": image, "heights": [*partial.obstacle_heights_m]}
+        images[path.with_name(image)] = partial.obstacle
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet
@@ -206,7 +225,7 @@ def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint
 def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
     """Return the YAML of a map with further keys, which can be read again as they are."""
     names = [] if not isinstance(extra, Mapping) else [*extra]
-    own = sorted({*sheet, "interior_cells", "material", "mesh", "wall_material"}.intersection(map(str, names)))
+    own = sorted({*sheet, "interior_cells", "material", "mesh", *_LAYERS}.intersection(map(str, names)))
     if own or names != [name for name in names if isinstance(name, str)] or not isinstance(extra, Mapping):
         what = f"holds {own[0]!r}, which the map sets itself" if own else "has keys that are no text"
         raise OutputError(f"extra = {shown(extra)} {what}: give a mapping of further keys.")
@@ -301,6 +320,17 @@ def _material(path: Path, field: str, value: object) -> Material | None:
     except (TypeError, SettingsError) as error:
         names = ", ".join(each.name for each in fields(Material))
         raise _refuse(path, field, value, f"give a name, or {names} ({error}).") from error
+
+
+def _height_m(path: Path, field: str, value: object) -> float:
+    return _number(path, {field: value}, field, 0.01, 100.0, "metres")
+
+
+_LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
+    "wall_material": ("materials", "wall_materials", _material),
+    "obstacle": ("heights", "obstacle_heights_m", _height_m),
+}
+"""Layers of a map by their keys in the YAML: the key of what their shades count, its field of the map, its reader."""
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:

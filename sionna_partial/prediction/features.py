@@ -23,6 +23,7 @@ from sionna_partial.prediction.unobserved import (
     is_enclosed,
     lengths_in_unknown_m,
     map_line_fractions,
+    parts_at_walls,
     unobserved_lengths_m,
     walled_lengths_m,
 )
@@ -279,19 +280,20 @@ def _possible_states(
 
 def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
     """Whether the lines `_ASIDE_CELLS` to the left and right of direct lines (N,) both run into known walls."""
-    starts, ends = in_cells(partial, tx_m), in_cells(partial, rx_m)
-    along = ends - starts
-    lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
-    aside = _ASIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
-    left, right = (
-        map_line_fractions(partial, starts + step, ends + step)[:, CellState.WALL] > GRAZE for step in (aside, -aside)
-    )
-    return left & right
+    crosses = np.zeros((2, len(rx_m)), dtype=bool)
+    for walls, rows, *ends_m in parts_at_walls(partial, tx_m, rx_m):
+        starts, ends = (in_cells(partial, end_m) for end_m in ends_m)
+        along = ends - starts
+        lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
+        aside = _ASIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
+        for side, step in enumerate((aside, -aside)):
+            crosses[side, rows] |= map_line_fractions(walls, starts + step, ends + step)[:, CellState.WALL] > GRAZE
+    return np.asarray(crosses.all(axis=0))
 
 
 def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
     """Whether both ends of links (N,) are in different regions, and whether both are in one that is wholly observed."""
-    state = np.pad(partial.state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
+    state = np.pad(partial.wall_levels[0][1].state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
     regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
     observed = np.ones(count + 1, dtype=bool)
     observed[regions[state == CellState.UNKNOWN]] = False

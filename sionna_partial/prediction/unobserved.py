@@ -1,12 +1,13 @@
 """Fractions of straight lines in each kind of cell: the grid integral behind d_unobs (paper, Section III-C)."""
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap, alike_cells
 from sionna_partial.process import core_count, in_order, njit
@@ -47,9 +48,29 @@ def lengths_in_unknown_m(partial: PartialMap, start_m: Floats, end_m: Floats) ->
 def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
     """Return the lengths (N,) [m] of segments inside cells of known walls; ends are (N, 3) or (3,) [m].
 
-    Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are.
+    Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are. Above
+    obstacles there is none.
     """
-    return _lengths_m(partial, CellState.WALL, *np.broadcast_arrays(start_m, end_m))
+    start_m, end_m = np.broadcast_arrays(start_m, end_m)
+    lengths_m = np.zeros(len(end_m))
+    for walls, rows, *ends_m in parts_at_walls(partial, start_m, end_m):
+        lengths_m[rows] += _lengths_m(walls, CellState.WALL, *ends_m)
+    return lengths_m
+
+
+def parts_at_walls(
+    partial: PartialMap, start_m: Floats, end_m: Floats
+) -> Iterator[tuple[PartialMap, Indices, Floats, Floats]]:
+    """Yield, for walls of each height, a map with them alone, the segments (N,) that go below it, and that part."""
+    for top_m, walls in partial.wall_levels:
+        low, high = np.minimum(start_m[:, 2], end_m[:, 2]), np.maximum(start_m[:, 2], end_m[:, 2])
+        rows = np.flatnonzero(low < top_m)
+        part = np.clip((top_m - low[rows]) / np.maximum(high - low, 1e-12)[rows], 0.0, 1.0)[:, None]
+        start, end = start_m[rows], end_m[rows]
+        rises = start[:, 2:] <= end[:, 2:]
+        above = part < 1.0
+        ends = np.where(above & rises, start + part * (end - start), end)
+        yield walls, rows, np.where(above & ~rises, end + part * (start - end), start), ends
 
 
 def _lengths_m(partial: PartialMap, kind: CellState, start_m: Floats, end_m: Floats) -> Floats:

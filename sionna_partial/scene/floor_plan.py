@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.planar import cross, span_in_strip
 from sionna_partial.process import njit
 
@@ -36,12 +36,13 @@ class Plan(NamedTuple):
     """Walls of a floor plan, cut where they cross.
 
     `pieces_m` (K, 2, 2) are the end points of the pieces [m], `owner` (K,) the wall segments that they are parts of,
-    and `line` (K,) the numbers of the infinite lines that they lie on.
+    `line` (K,) the numbers of the infinite lines that they lie on, and `low` (K,) whether they end below the ceiling.
     """
 
     pieces_m: Floats
     owner: NDArray[np.int32]
     line: NDArray[np.int32]
+    low: Bools
     cells: WallIndex
 
 
@@ -58,10 +59,11 @@ class PointBins(NamedTuple):
     grid: Floats
 
 
-def prepare_plan(walls_m: Floats) -> Plan:
-    """Cut walls (S, 2, 2) [m] where they cross, and find collinear ones."""
+def prepare_plan(walls_m: Floats, low: Bools | None = None) -> Plan:
+    """Cut walls (S, 2, 2) [m], of which some may be `low` (S,), where they cross, and find collinear ones."""
     pieces_m, owner = _split_at_crossings(walls_m)
-    return Plan(pieces_m, owner, _line_ids(pieces_m), _index(pieces_m))
+    low = np.zeros(len(walls_m), dtype=np.bool_) if low is None else low
+    return Plan(pieces_m, owner, _line_ids(pieces_m), low[owner], _index(pieces_m))
 
 
 def bin_points(points_m: Floats) -> PointBins:

@@ -4,10 +4,11 @@ import itertools
 import logging
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -15,7 +16,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
@@ -39,6 +40,23 @@ SIONNA_LOAD_GHZ = 3.5
 """Frequency at which Sionna RT evaluates the materials of a scene while it loads it [GHz]."""
 
 
+class _Walls(NamedTuple):
+    """Outlines, and of each segment the number of its material (S,) and its height (S,) [m]."""
+
+    outlines: Outlines
+    material: Indices
+    top_m: Floats
+
+
+class Lid(NamedTuple):
+    """Top of an obstacle: corners (K, 2) [m], triangles (T, 3), height [m], and index of the material."""
+
+    corners_m: Floats
+    triangles: NDArray[np.int64]
+    top_m: float
+    material: int
+
+
 @dataclass(frozen=True)
 class SceneGeometry:
     """Walls, floor and ceiling of a map in its local frame: the origin is the lower-left corner of the grid, on z = 0.
@@ -55,6 +73,10 @@ class SceneGeometry:
         Index of the material of each wall in `materials`; walls are in the order of their materials.
     materials : tuple of Material
         The first is that of floor and ceiling.
+    top_m : (S,) float64 array
+        Height of each wall: `height_m`, or that of an obstacle below it [m].
+    lids : tuple of Lid
+        Tops of obstacles that enclose an area.
     floor_m : (R, 4) float64 array
         Rectangles x0, y0, x1, y1 of floor and ceiling [m], on a lattice of `cell_m`; they do not overlap.
     origin_m : (float, float)
@@ -66,6 +88,8 @@ class SceneGeometry:
     open_end: Bools
     wall_material: NDArray[np.int64]
     materials: tuple[Material, ...]
+    top_m: Floats
+    lids: tuple[Lid, ...]
     floor_m: Floats
     cell_m: float
     height_m: float
@@ -75,7 +99,8 @@ class SceneGeometry:
     @property
     def shapes(self) -> tuple[str, ...]:
         """Names of the shapes in the order in which faces are counted; those that are empty are not exported."""
-        return (*(f"walls{index or ''}" for index in range(len(self.materials))), *FLAT_SHAPES)
+        walls = (f"walls{index or ''}" for index in range(len(self.materials)))
+        return (*walls, *FLAT_SHAPES, *(f"lid{number}" for number in range(len(self.lids))))
 
     @property
     def walls_m(self) -> Floats:
@@ -85,7 +110,7 @@ class SceneGeometry:
     @cached_property
     def plan(self) -> Plan:
         """The walls, cut where they cross."""
-        return prepare_plan(self.walls_m)
+        return prepare_plan(self.walls_m, self.top_m < self.height_m)
 
     @property
     def floor_face(self) -> int:
@@ -96,6 +121,12 @@ class SceneGeometry:
     def ceiling_face(self) -> int:
         """First face of the ceiling, -1 if there is none."""
         return self.floor_face + len(self.floor_mesh[1]) if len(self.floor_m) and self.ceiling else -1
+
+    @property
+    def lid_faces(self) -> list[int]:
+        """First face of each lid."""
+        flats = len(self.floor_mesh[1]) * (1 + self.ceiling) if len(self.floor_m) else 0
+        return np.cumsum([2 * len(self.segments) + flats, *(len(each.triangles) for each in self.lids)])[:-1].tolist()
 
     @cached_property
     def floor_mesh(self) -> tuple[Floats, NDArray[np.int64]]:
@@ -121,23 +152,42 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
     """Turn a map into walls, floor and ceiling."""
     require_map("partial", partial)
     settings = scene_settings_of(partial, settings)
-    if settings.outline == "cells":
-        outlines = lattice_outlines(partial)
-    else:
-        tolerance_cells, gap_m = settings.outline_tolerance_cells, settings.bridge_gap_m
-        outlines = wall_outlines(partial, tolerance_cells=tolerance_cells, bridge_gap_m=gap_m)
-    outlines, wall_material = cut_by_material(outlines, partial)
+    walls = _walls(partial, settings)
     return SceneGeometry(
-        vertices_m=outlines.vertices_m,
-        segments=outlines.segments,
-        open_end=_open_ends(partial, outlines),
-        wall_material=wall_material,
+        vertices_m=walls.outlines.vertices_m,
+        segments=walls.outlines.segments,
+        open_end=_open_ends(partial, walls.outlines),
+        wall_material=walls.material,
         materials=(settings.material, *partial.wall_materials),
+        top_m=walls.top_m,
+        lids=tuple(_lids(partial, walls)),
         floor_m=_rectangles(floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
         cell_m=partial.resolution_m,
         height_m=partial.wall_height_m,
         ceiling=settings.ceiling,
         origin_m=partial.origin_m,
+    )
+
+
+def _walls(partial: PartialMap, settings: SceneSettings) -> _Walls:
+    """Outline walls, and obstacles of each height on their own, in the order of their materials."""
+    parts, count = list[_Walls](), 0
+    for top_m, walls in partial.wall_levels:
+        if settings.outline == "cells":
+            outlines = lattice_outlines(walls)
+        else:
+            tolerance_cells, gap_m = settings.outline_tolerance_cells, settings.bridge_gap_m
+            outlines = wall_outlines(walls, tolerance_cells=tolerance_cells, bridge_gap_m=gap_m)
+        outlines, material = cut_by_material(outlines, walls)
+        height_m = np.full(len(material), min(top_m, partial.wall_height_m))
+        parts.append(_Walls(replace(outlines, segments=outlines.segments + count), material, height_m))
+        count += len(outlines.vertices_m)
+    material = np.concatenate([each.material for each in parts])
+    order = np.argsort(material, kind="stable")
+    vertices_m = np.concatenate([each.outlines.vertices_m for each in parts])
+    segments = np.concatenate([each.outlines.segments for each in parts])[order]
+    return _Walls(
+        Outlines(vertices_m, segments), material[order], np.concatenate([each.top_m for each in parts])[order]
     )
 
 
@@ -231,6 +281,7 @@ def write_scene(
     scene = _new_scene(folder)
     meshes = {name: mesh for name, mesh in _meshes(geometry).items() if len(mesh[1])}
     number = {name: 0 if name in FLAT_SHAPES else index for index, name in enumerate(geometry.shapes)}
+    number |= {f"lid{index}": lid.material for index, lid in enumerate(geometry.lids)}
     for index in sorted({0, *(number[name] for name in meshes)}):
         _add_material(scene, f"material{index or ''}", geometry.materials[index], frequency_hz)
     for name, (vertices, faces) in meshes.items():
@@ -329,16 +380,42 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64
     """Vertices (V, 3) [m] and triangles (F, 3) of each shape, in the local frame."""
     low = np.column_stack([geometry.vertices_m, np.zeros(len(geometry.vertices_m))])
     up = np.array([0.0, 0.0, geometry.height_m])
-    (a, b), count = geometry.segments.T, len(low)
-    walls = np.stack([a, b, b + count, a, b + count, a + count], axis=1).reshape(-1, 3)
+    (a, b), levels = geometry.segments.T, np.unique([geometry.height_m, *geometry.top_m])
+    above = len(low) * (1 + np.searchsorted(levels, geometry.top_m))
+    walls = np.stack([a, b, b + above, a, b + above, a + above], axis=1).reshape(-1, 3)
     corners, triangles = geometry.floor_mesh
     floor = np.column_stack([corners, np.zeros(len(corners))])
     ends = 2 * np.searchsorted(geometry.wall_material, np.arange(len(geometry.materials) + 1))
     of_material = (walls[first:last] for first, last in itertools.pairwise(ends))
-    vertices = np.concatenate([low, low + up])
+    vertices = np.concatenate([low, *(low + np.array([0.0, 0.0, level]) for level in levels)])
     meshes = {name: (vertices, faces) for name, faces in zip(geometry.shapes, of_material, strict=False)}
     meshes["floor"] = floor, triangles
-    return meshes | ({"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {})
+    meshes |= {"ceiling": (floor + up, triangles[:, ::-1])} if geometry.ceiling else {}
+    for index, lid in enumerate(geometry.lids):
+        meshes[f"lid{index}"] = np.column_stack([lid.corners_m, np.full(len(lid.corners_m), lid.top_m)]), lid.triangles
+    return meshes
+
+
+def _lids(partial: PartialMap, walls: _Walls) -> Iterator[Lid]:
+    """Cover the areas that outlines of obstacles of one height enclose, and that are not for the most part free."""
+    free = partial.state == CellState.FREE
+    row, column = np.indices(partial.shape)
+    centres_m = (np.stack([column, row], axis=-1) + 0.5) * partial.resolution_m
+    for top_m in np.unique(walls.top_m[walls.top_m < partial.wall_height_m]).tolist():
+        sides = np.flatnonzero(walls.top_m == top_m)
+        lines = shapely.linestrings(walls.outlines.vertices_m[walls.outlines.segments[sides]])
+        for area in shapely.get_parts(shapely.polygonize(lines)):
+            first, last = (np.floor(np.reshape(area.bounds, (2, 2)) / partial.resolution_m)).astype(int)
+            window = slice(max(first[1], 0), last[1] + 1), slice(max(first[0], 0), last[0] + 1)
+            inside = shapely.contains_xy(area, *np.moveaxis(centres_m[window], -1, 0))
+            if 2 * (inside & free[window]).sum() > inside.sum():
+                continue
+            beside = sides[shapely.covers(shapely.buffer(shapely.boundary(area), 1e-6), lines)]
+            material = int(np.bincount(walls.material[beside], minlength=1).argmax())
+            parts = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
+            rings = shapely.get_coordinates(shapely.orient_polygons(parts)).reshape(-1, 4, 2)[:, :3]
+            corners, index = np.unique(rings.reshape(-1, 2), axis=0, return_inverse=True)
+            yield Lid(corners, index.reshape(-1, 3).astype(np.int64), top_m, material)
 
 
 def _open_ends(partial: PartialMap, outlines: Outlines) -> Bools:
@@ -383,7 +460,7 @@ def floor_cells(partial: PartialMap, extent: str) -> Bools:
         return np.zeros(partial.shape, dtype=bool)
     if extent == "map":
         return np.ones(partial.shape, dtype=bool)
-    free = partial.state == CellState.FREE
+    free = partial.wall_levels[0][1].state == CellState.FREE
     beside = ndimage.binary_dilation(free, structure=np.ones((3, 3)))
     return free | (beside & (partial.state == CellState.WALL))
 

@@ -17,13 +17,13 @@ class Wedges:
     each other, so an edge diffracts in one sector at most, and where three or more walls meet mostly in none. A free
     end of a wall has both of its sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
 
-    `edge_m` (W, 2) are the edges in the plan, which rise from 0 to `height_m` [m]; `face` (2 W, 2) the 0-face and the
-    n-face of the scene, where the sector of wedge i < W ends counterclockwise; `normal` (2 W, 2, 2) their unit normals,
-    which point into the sector.
+    `edge_m` (W, 2) are the edges in the plan, which rise from 0 to `height_m` (W,) [m]; `face` (2 W, 2) the 0-face and
+    the n-face of the scene, where the sector of wedge i < W ends counterclockwise; `normal` (2 W, 2, 2) their unit
+    normals, which point into the sector.
     """
 
     edge_m: Floats
-    height_m: float
+    height_m: Floats
     face: NDArray[np.int32]
     normal: Floats
 

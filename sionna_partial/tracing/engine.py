@@ -436,7 +436,8 @@ class SceneSolver:
         from sionna.rt.utils.wedges import WedgeGeometry
 
         upward = index < len(wedges.edge_m)
-        x, y = wedges.edge_m[index % len(wedges.edge_m)].T
+        edge = index % len(wedges.edge_m)
+        (x, y), height_m = wedges.edge_m[edge].T, wedges.height_m[edge]
         face, normal, flat = wedges.face[index], wedges.normal[index], np.zeros(len(index))
 
         def vectors(kind: Any, *columns: Floats) -> Any:
@@ -447,9 +448,9 @@ class SceneSolver:
             prim0=to_device(mi.UInt, self._primitive_of_face[face[:, 0]]),
             primn=to_device(mi.UInt, self._primitive_of_face[face[:, 0]] + (face[:, 0] != face[:, 1])),
             local_edge=dr.zeros(mi.UInt, len(index)),
-            o=vectors(mi.Point3f, x, y, np.where(upward, 0.0, wedges.height_m)),
+            o=vectors(mi.Point3f, x, y, np.where(upward, 0.0, height_m)),
             e_hat=vectors(mi.Vector3f, flat, flat, np.where(upward, 1.0, -1.0)),
-            length=dr.full(mi.Float, wedges.height_m, len(index)),
+            length=to_device(mi.Float, height_m.astype(np.float32)),
             n0=vectors(mi.Normal3f, *normal[:, 0].T, flat),
             nn=vectors(mi.Normal3f, *normal[:, 1].T, flat),
         )

@@ -36,6 +36,7 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior, slabs_of
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
+from sionna_partial.tracing.plan.obstacles import Lowered
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
 CANDIDATES_AT_ONCE = 100_000
@@ -83,13 +84,20 @@ class PlanScene:
             yield from _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
             return
         crossing = CrossingCandidates(self.geometry, room, self.interior, self.settings)
+        lowered = Lowered.of(self.geometry, room, self.interior, self.settings.max_walls)
+
+        def through_walls(power: Floats) -> Iterator[tuple[Candidates, float]]:
+            return ((lowered(block), fraction) for block, fraction in crossing.blocks(power))
+
         power = np.zeros(len(rx_m))
-        yield from _with_walls(solver, listed, crossing, (tx_m, rx_m, power), self.settings, part_of(report, 0.0, 0.8))
+        part = part_of(report, 0.0, 0.8)
+        yield from _with_walls(solver, listed, through_walls, (tx_m, rx_m, power), self.settings, part)
         if self.settings.diffraction and len(rx_m):
             fixed = self.interior, self.settings, crossing.slabs
             edges = CrossedEdgeCandidates(self.geometry, self.wedges, room, *fixed)
             strengths = strengths_of(solver.materials.values(), self.settings.frequency_hz, len(rx_m))
-            blocks = ((*block, "verifying diffractions through walls") for block in edges.blocks(strengths, power))
+            doing = "verifying diffractions through walls"
+            blocks = ((lowered(block), done, doing) for block, done in edges.blocks(strengths, power))
             yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.8, 1.0))
 
     def _kinds(self, room: Room) -> dict[str, SpecularCandidates | DiffractionCandidates]:
@@ -130,7 +138,7 @@ class MeshScene:
         solid = SolidMesh(self.tree, self.planes, self.bodies, self.cells, slabs)
         crossing = MeshCrossings(solid, tx_m, rx_m, largest, self.settings)
         ends = tx_m, rx_m, np.zeros(len(rx_m))
-        yield from _with_walls(solver, listed, crossing, ends, self.settings, report)
+        yield from _with_walls(solver, listed, crossing.blocks, ends, self.settings, report)
 
     @cached_property
     def planes(self) -> MeshPlanes:
@@ -239,12 +247,12 @@ def _strong_paths(
 def _with_walls(
     solver: SceneSolver,
     listed: Callable[[Strengths], _Blocks],
-    crossing: CrossingCandidates | MeshCrossings,
+    through_walls: Callable[[Floats], Iterator[tuple[Candidates, float]]],
     ends: tuple[Floats, Floats, Floats],
     settings: TraceSettings,
     report: Progress,
 ) -> Iterator[Found]:
-    """Verify the candidates without walls, and those through walls that matter beside them.
+    """Verify the candidates without walls, and those that `through_walls` lists for links of so much power (N,).
 
     The powers of the links are added to the third of `ends`, but for the direct path.
     """
@@ -253,7 +261,7 @@ def _with_walls(
         indirect = ~paths.is_direct
         np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
         yield candidates, paths
-    blocks = ((*block, "verifying paths through walls") for block in crossing.blocks(power))
+    blocks = ((*block, "verifying paths through walls") for block in through_walls(power))
     for candidates, paths in _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.6, 1.0)):
         np.add.at(power, paths.path_rx, paths.power)
         yield candidates, paths
@@ -380,12 +388,13 @@ def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -
     if diffracted.any() and len(wedges.edge_m):
         which = (paths.interactions == DIFFRACTION).argmax(axis=1)
         x, y, z = paths.vertices_m[np.arange(len(diffracted)), which][diffracted].T
-        beside = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))[0] < SAME_EDGE_M
+        distance_m, edge = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))
+        beside, top_m = distance_m < SAME_EDGE_M, wedges.height_m[edge]
         reflected = paths.interactions[diffracted] == REFLECTION
         height_m = paths.vertices_m[diffracted, :, 2]
-        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m - SAME_EDGE_M)
+        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m.max() - SAME_EDGE_M)
         before = np.arange(reflected.shape[1]) < which[diffracted, None]
         few = reflected.sum(axis=1) <= MAX_REFLECTIONS
         few &= ((at_walls & before).sum(axis=1) <= walls_a_side) & ((at_walls & ~before).sum(axis=1) <= walls_a_side)
-        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < wedges.height_m - SAME_EDGE_M)
+        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < top_m - SAME_EDGE_M)
     return kept

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress, no_progress, require, require_choice, require_memory, settings_or_default
-from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
@@ -448,9 +448,9 @@ def nearest_m(frequency_hz: float) -> float:
 
 def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
     """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
-    clear: Bools = partial.state_at(points_m) != CellState.WALL
+    clear, lower_m = ~partial.is_wall_at(points_m), 0.0 if partial.obstacle is None else -SHORTEST_M
     for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
-        clear &= partial.state_at(points_m[..., :2] + corner) != CellState.WALL
+        clear &= ~partial.is_wall_at(points_m + np.array([*corner, lower_m]))
     return clear
 
 

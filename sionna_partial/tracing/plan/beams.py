@@ -58,6 +58,8 @@ def trace_beams(plan: Plan, tx_m: Floats, rx_m: Floats, max_depth: int) -> Beams
 def trace_beams_in(plan: Plan, receivers: PointBins, sources_m: Floats, max_depth: NDArray[np.int64]) -> Beams:
     """Do the work of `trace_beams` for several sources (E, 2) [m], each with its own largest depth (E,)."""
     beam, node, pair = _trace_beams(plan, _root_beams(sources_m), max_depth, receivers)
+    if plan.low.any():
+        node, pair = _without_passes(node, pair)
     parent, piece, depth = node[:, :3].T.copy()
     pair_node, pair_rx = pair.T.copy()
     sequence = _sequence_ids(parent, np.append(plan.line, -1)[piece], depth)
@@ -65,6 +67,17 @@ def trace_beams_in(plan: Plan, receivers: PointBins, sources_m: Floats, max_dept
     _, first = np.unique(sequence[pair_node] * max(1, len(receivers.order)) + pair_rx, return_index=True)
     segment = np.append(plan.owner, -1)[piece].astype(np.int32)
     return Beams(parent, segment, beam[:, :2].copy(), pair_node[first], pair_rx[first])
+
+
+def _without_passes(node: NDArray[np.int32], pair: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Put in place of beams that passed over obstacles those that they are the rest of: the same image, and walls."""
+    node, own = node.copy(), np.arange(len(node), dtype=np.int32)
+    passed = np.flatnonzero(node[:, 4])
+    for each in passed:  # parents come first
+        own[each] = own[node[each, 0]]
+    node[:, 0] = np.where(node[:, 0] < 0, -1, own[node[:, 0]])
+    node[passed, 0] = own[passed]
+    return node[:, :4], np.stack([own[pair[:, 0]], pair[:, 1]], axis=1)
 
 
 def _sequence_ids(parent: NDArray[np.int32], line: NDArray[np.int32], depth: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -104,10 +117,11 @@ class _Scratch(NamedTuple):
 def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
     """Breadth-first beam trees and the points inside each beam (see `trace_beams`).
 
-    Returns the beams (M, 6), their (parent, segment, depth, depth left) and the pairs (node, point).
+    At a low wall a beam is reflected, and also goes on over it. Returns the beams (M, 6), their (parent, segment,
+    depth, depth left, whether it passed) and the pairs (node, point).
     """
-    walls, count = plan.pieces_m, len(beam)
-    node = np.empty((count, 4), np.int32)
+    walls, low, count = plan.pieces_m, plan.low, len(beam)
+    node = np.zeros((count, 5), np.int32)
     for root in range(count):
         node[root, 0], node[root, 1], node[root, 2], node[root, 3] = -1, -1, 0, left[root // 4]
     pair = np.empty((4096, 2), np.int32)
@@ -128,12 +142,18 @@ def _trace_beams(plan, beam, left, receivers):  # type: ignore[no-untyped-def]
         for i in range(_visible_pieces(plan, beam[k], own, scratch)):
             pair, pairs = _add_points(beam[k], own >= 0, scratch.piece[i], receivers, k, pair, pairs)
             wall = scratch.piece_wall[i]
+            if wall >= 0 and low[wall] and not was_met(node[:, 0], node[:, 1], node[:, 4], k, wall):
+                beam, node = grow(beam, count + 1), grow(node, count + 1)
+                if _pass(beam[k], scratch.piece[i], beam[count]):
+                    node[count, 0], node[count, 1] = k, wall
+                    node[count, 2], node[count, 3], node[count, 4] = node[k, 2], node[k, 3], 1
+                    count += 1
             if wall < 0 or node[k, 3] == 0:
                 continue
             beam, node = grow(beam, count + 1), grow(node, count + 1)
             if _reflect(beam[k], scratch.piece[i], walls[wall], beam[count]):
                 node[count, 0], node[count, 1] = k, wall
-                node[count, 2], node[count, 3] = node[k, 2] + 1, node[k, 3] - 1
+                node[count, 2], node[count, 3], node[count, 4] = node[k, 2] + 1, node[k, 3] - 1, 0
                 count += 1
         k += 1
     return beam[:count], node[:count], pair[:pairs]
@@ -199,7 +219,10 @@ def _visible_pieces(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
         same = pieces > 0 and (
             scratch.piece_wall[pieces - 1] == wall
             or (
-                wall >= 0 and scratch.piece_wall[pieces - 1] >= 0 and line[scratch.piece_wall[pieces - 1]] == line[wall]
+                wall >= 0
+                and scratch.piece_wall[pieces - 1] >= 0
+                and line[scratch.piece_wall[pieces - 1]] == line[wall]
+                and plan.low[scratch.piece_wall[pieces - 1]] == plan.low[wall]
             )
         )
         if same:
@@ -368,6 +391,30 @@ def _reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
     child[0], child[1] = sx + 2.0 * away * dy, sy - 2.0 * away * dx
     area = (child[2] - child[0]) * (child[5] - child[1]) - (child[3] - child[1]) * (child[4] - child[0])
     return area > 1e-15
+
+
+@njit(cache=True)
+def _pass(beam, piece, child):  # type: ignore[no-untyped-def]
+    """Write the rest of a beam beyond one visible piece of a wall; False if it is too thin to matter."""
+    child[0], child[1] = sx, sy = beam[0], beam[1]
+    for k in range(2):
+        t, w = piece[2 * k], piece[2 * k + 1]
+        child[2 + 2 * k] = sx + ((1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)) / w
+        child[3 + 2 * k] = sy + ((1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)) / w
+    area = (child[2] - sx) * (child[5] - sy) - (child[3] - sy) * (child[4] - sx)
+    return np.hypot(child[2] - child[4], child[3] - child[5]) >= 1e-9 and area > 1e-15
+
+
+@njit(cache=True)
+def was_met(parent, wall_of, passed, node, wall):  # type: ignore[no-untyped-def]
+    """Whether a beam has met a wall since it was reflected: no line does twice, slivers at corners would for ever."""
+    while node >= 0:
+        if wall_of[node] == wall:
+            return True
+        if passed[node] == 0:
+            break
+        node = parent[node]
+    return False
 
 
 @njit(cache=True)

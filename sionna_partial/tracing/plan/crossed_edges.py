@@ -28,6 +28,7 @@ from sionna_partial.tracing.plan.crossings import (
     empty_paths,
     has_long_legs,
     least_power,
+    most_walls,
     trail_of,
     weakest_needed,
     write_kinds,
@@ -75,7 +76,7 @@ class CrossedEdgeCandidates:
     ) -> None:
         self._geometry, self._wedges, self._room, self._interior = geometry, wedges, room, interior
         self._slabs, self._tolerance_db = slabs, settings.power_tolerance_db
-        self._limits = Limits(settings.max_depth, 0, settings.max_walls, 1.0)
+        self._limits = Limits(settings.max_depth, 0, most_walls(geometry, settings), 1.0)
         self._edges = edges_of(wedges, room.wall_material)
 
     def blocks(self, strengths: Strengths, found: Floats) -> Iterator[tuple[Candidates, float]]:
@@ -104,11 +105,11 @@ class CrossedEdgeCandidates:
 
 
 @njit(cache=True)
-def _leg_power(trail, start, count, slabs):  # type: ignore[no-untyped-def]
-    """Fraction of the power that the walls leave of a horizontal path among some entries of a trail."""
+def _leg_power(trail, start, count, plan, slabs):  # type: ignore[no-untyped-def]
+    """Fraction of the power that the walls leave of a horizontal path at most among some entries of a trail."""
     power = 1.0
     for k in range(start, count):
-        if not trail.same_wall[k]:
+        if not (trail.same_wall[k] or plan.low[trail.surface[k]]):
             power *= transmitted_power(slabs.transmission[slabs.material[trail.surface[k]]], trail.cosine[k])
     return power
 
@@ -147,7 +148,7 @@ def _arrivals(edges, plan, interior, room, slabs, limits, trail):  # type: ignor
         entries, crossed[e] = _to_edge(plan, interior, room.tx_m, origin, length[e], length[e], trail)
         good[e] = entries >= 0 and crossed[e] <= limits.walls
         if good[e]:
-            power[e] = _leg_power(trail, 0, entries, slabs)
+            power[e] = _leg_power(trail, 0, entries, plan, slabs)
         from_0 = angle_rad(edges.face_rad[e], exterior, x, y)
         angle[e, 0], angle[e, 1], angle[e, 2], angle[e, 3] = wedge_angle(from_0, exterior)
         for k, from_face in enumerate((from_0, exterior - from_0)):
@@ -191,7 +192,7 @@ def _listed(group, edges, arrivals, strengths, needed, plan, interior, room, sla
             walls = crossed + arrivals.crossed[e]
             if count < 0 or walls == 0 or walls > limits.walls:
                 continue
-            behind = _leg_power(trail, 0, count, slabs)
+            behind = _leg_power(trail, 0, count, plan, slabs)
             for variant in range(_VARIANTS):
                 bounces, first, possible = can_bounce_as(variant, room)
                 if not possible or bounces > limits.depth - 1:

@@ -31,6 +31,7 @@ from sionna_partial.tracing.plan.specular import (
     Room,
     can_bounce,
     faces_of,
+    height_at,
     merge_heights,
     unfolded_height,
 )
@@ -146,7 +147,8 @@ class CrossingCandidates:
         self._tolerance_db = settings.power_tolerance_db
         exact = self._tolerance_db == 0.0
         most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
-        self._limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
+        walls = most_walls(geometry, settings)
+        self._limits = Limits(settings.max_depth, min(settings.max_depth, most), walls, rarer)
         self._wavelength_m = SPEED_OF_LIGHT_M_S / settings.frequency_hz
         of_piece = geometry.wall_material[geometry.plan.owner].astype(np.int64)
         constants = [(*constants_of(each, settings.frequency_hz), each.thickness_m) for each in geometry.materials]
@@ -216,6 +218,11 @@ class CrossingCandidates:
             tree, chosen, variant, geometry.plan, self._interior, self._room, self._limits, trail_of(geometry.plan)
         )
         return Candidates(tree.pair[chosen, 1].astype(np.int32), **columns_of(geometry, *written))
+
+
+def most_walls(geometry: SceneGeometry, settings: TraceSettings) -> int:
+    """Return the most walls on a line in the plan, where obstacles may lie below it and are counted later."""
+    return settings.max_walls if not geometry.plan.low.any() else _FACES
 
 
 def weakest_needed(power: Floats, tolerance_db: float) -> Floats:
@@ -331,7 +338,8 @@ def _trace(plan, beam, receivers, slabs, depth_m, limits, needed, height_m):  # 
                     same = _apart(beam[first, 2:], ends[2:]) * min(value[k, 1], least) <= depth_m
                 if not same:
                     first, crossed = count, crossed + 1
-                    loss *= slabs.most_transmitted[slabs.material[wall], min(int(most * _COSINES) + 1, _COSINES)]
+                    most_left = slabs.most_transmitted[slabs.material[wall], min(int(most * _COSINES) + 1, _COSINES)]
+                    loss *= 1.0 if plan.low[wall] else most_left
                 else:
                     cosine = min(value[k, 1], least)
                 last = state[k, 0] == limits.reflections
@@ -697,6 +705,8 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
             item += 1
             if trail.same_wall[item - 1]:
                 continue
+            if kind == REFRACTION and plan.low[i] and is_above(i, done, bounces, first, plan, room, target):
+                continue
         else:
             stop = trail.points[item, 2] if item < count else 1.0
             bx = trail.points[item, 0] if item < count else target[0]
@@ -730,6 +740,14 @@ def _path_power(trail, count, length, room, target, bounces, first, plan, interi
     norm = max(np.hypot(kx, ky), 1e-12)
     field = ex * (kx * kz / norm) + ey * (ky * kz / norm) - ez * norm
     return (wavelength / (4.0 * np.pi * total)) ** 2 * (field.real**2 + field.imag**2)
+
+
+@njit(cache=True)
+def is_above(piece, fraction, bounces, first, plan, room, target):  # type: ignore[no-untyped-def]
+    """Whether a path is above a piece of a wall after a fraction of its length."""
+    to_first = room.tx_m[2] if first == FLOOR else room.height_m - room.tx_m[2]
+    unfolded = unfolded_height(room, target, bounces, first) if bounces else 1.0
+    return height_at(fraction, room, target, bounces, first, to_first, unfolded) > room.top_m[plan.owner[piece]]
 
 
 @njit(cache=True, nogil=True)

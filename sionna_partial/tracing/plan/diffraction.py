@@ -133,7 +133,7 @@ def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
     normal = np.array([[-np.sin(first), np.cos(first)], [np.sin(last), -np.cos(last)]]).transpose(2, 0, 1)
     return Wedges(
         edge_m=geometry.vertices_m[vertex[wide]],
-        height_m=geometry.height_m,
+        height_m=geometry.top_m[pair[:, 0] // 2],
         face=np.concatenate([pair, pair[:, ::-1]]),
         normal=np.concatenate([normal, normal[:, ::-1]]),
     )

@@ -30,7 +30,7 @@ class Room(NamedTuple):
     """What paths meet between a transmitter (3,) and receivers (N, 3), in the local frame [m].
 
     Walls (S, 2, 2) stand between the floor at 0 and the ceiling at `height_m`; `floor` and `ceiling` are whether they
-    reflect. `wall_material` (S,) and `flat_material` are indices of materials.
+    reflect. `wall_material` (S,) and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls.
     """
 
     walls_m: Floats
@@ -41,6 +41,7 @@ class Room(NamedTuple):
     rx_m: Floats
     wall_material: NDArray[np.int64]
     flat_material: int
+    top_m: Floats
 
     @classmethod
     def of(cls, geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, material_of_face: NDArray[np.int64]) -> "Room":
@@ -48,7 +49,7 @@ class Room(NamedTuple):
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
         materials = material_of_face[: 2 * len(geometry.segments) : 2], of_flats
-        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m, *materials)
+        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m, *materials, geometry.top_m)
 
 
 class SpecularCandidates:
@@ -238,7 +239,7 @@ def merge_heights(met, points, room, target, bounces, first, surface, vertices):
             px, py, done = points[at_met, 0], points[at_met, 1], points[at_met, 2]
             surface[depth] = met[at_met]
             vertices[depth, 0], vertices[depth, 1] = px, py
-            vertices[depth, 2] = _height_at(done, room, target, bounces, first, to_first, unfolded)
+            vertices[depth, 2] = height_at(done, room, target, bounces, first, to_first, unfolded)
             at_met += 1
             continue
         nx, ny, stop = target[0], target[1], 1.0
@@ -253,7 +254,7 @@ def merge_heights(met, points, room, target, bounces, first, surface, vertices):
 
 
 @njit(cache=True)
-def _height_at(fraction, room, target, bounces, first, to_first, unfolded):  # type: ignore[no-untyped-def]
+def height_at(fraction, room, target, bounces, first, to_first, unfolded):  # type: ignore[no-untyped-def]
     """Height of a path after a fraction of its length."""
     tx_z, height = room.tx_m[2], room.height_m
     if bounces == 0:
