@@ -53,6 +53,15 @@ class TestOneWall:
         loss = loss_db(walled(cells), tx, rx)
         assert loss == pytest.approx(slab_loss_db(np.cos(np.radians(angle_deg))), abs=0.02)
 
+    @pytest.mark.parametrize("cells", [3, 6])
+    def test_reflects_as_much_however_deep_it_is(self, cells: int) -> None:
+        """Both links lose the same to a deep wall as to a thin one: its far face reflects nothing."""
+        for rx in ((2.5, 3.9, 1.5), (6.5, 3.9, 1.5)):
+            losses = [
+                loss_db(walled(each), (2.5, 2.17, 1.5), rx, max_depth=3, diffraction=False) for each in (1, cells)
+            ]
+            assert losses[1] == pytest.approx(losses[0], abs=0.02)
+
     def test_costs_the_same_where_one_face_was_seen(self) -> None:
         tx, rx = (2.5, 2.97, 1.5), (6.5, 3.11, 1.5)
         assert loss_db(walled(1, unseen=True), tx, rx) == pytest.approx(loss_db(walled(1), tx, rx), abs=0.02)

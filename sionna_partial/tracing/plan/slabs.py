@@ -1,0 +1,54 @@
+"""What walls reflect and let through, tabulated over the angle of incidence."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats
+from sionna_partial.process import njit
+from sionna_partial.scene.scene import SceneGeometry, constants_of
+from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
+
+COSINES = 2048
+"""Steps of the tables over the cosine of the angle of incidence."""
+
+
+class Slabs(NamedTuple):
+    """Coefficients (M, K + 1, 2) of M materials, TE and TM, where the cosine of the angle of incidence is k / K.
+
+    `most_reflected` (M, K + 1) is the largest |R|^2 at this cosine or a larger one, `most_transmitted` (M, K + 1) the
+    largest |T|^2 at this cosine or a smaller one. `material` (P,) is that of the pieces of walls of the plan; floor and
+    ceiling are of the first.
+    """
+
+    reflection: NDArray[np.complex128]
+    transmission: NDArray[np.complex128]
+    most_reflected: Floats
+    most_transmitted: Floats
+    material: NDArray[np.int64]
+
+
+def slabs_of(geometry: SceneGeometry, frequency_hz: float) -> Slabs:
+    """Tabulate the coefficients of the materials of a scene."""
+    cosine = np.linspace(0.0, 1.0, COSINES + 1)
+    constants = [
+        (*constants_of(each, frequency_hz), each.thickness_m, frequency_hz, cosine) for each in geometry.materials
+    ]
+    reflection, transmission = (
+        np.stack([np.stack(coefficients(*each), axis=1) for each in constants])
+        for coefficients in (reflection_coefficients, transmission_coefficients)
+    )
+    reflection[:, 0], transmission[:, 0] = -1.0, 0.0
+    reflected, transmitted = (np.max(np.abs(each) ** 2, axis=2) for each in (reflection, transmission))
+    most_reflected = np.maximum.accumulate(reflected[:, ::-1], axis=1)[:, ::-1].copy()
+    of_piece = geometry.wall_material[geometry.plan.owner].astype(np.int64)
+    return Slabs(reflection, transmission, most_reflected, np.maximum.accumulate(transmitted, axis=1), of_piece)
+
+
+@njit(cache=True)
+def reflected_part(slabs, material, cosine):  # type: ignore[no-untyped-def]
+    """Largest fraction of the power, however polarised, that a reflection leaves near a cosine."""
+    at = min(int(cosine * COSINES + 0.5), COSINES)
+    te, tm = slabs.reflection[material, at]
+    return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
