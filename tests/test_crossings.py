@@ -20,6 +20,7 @@ BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
 STRAIGHT = sp.TraceSettings(frequency_hz=5e9, max_depth=0, power_tolerance_db=0.0)
 REFRACTION, DIFFRACTION = 4, 8
+BOWLUS = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson" / "Bowlus" / "map.yaml"
 BLEFLAT = Path(__file__).resolve().parents[1] / ".." / "shared" / "measured" / "bleflat" / "map.yaml"
 
 
@@ -233,6 +234,20 @@ def test_slopes_of_materials() -> None:
         np.testing.assert_allclose(
             slope[strong], expected[strong], rtol=0.05, atol=0.02 * np.abs(expected[strong]).max()
         )
+
+
+@pytest.mark.skipif(not BOWLUS.is_file(), reason="the home is not here")
+def test_one_direct_path_a_link() -> None:
+    """Paths over an edge that have a leg of 1 cm are none, and not direct ones."""
+    home = sp.load_map(BOWLUS)
+    column, row = np.random.default_rng(3).permutation(np.argwhere(home.state == 0)[:, ::-1])[:400].T
+    points_m = np.column_stack([home.origin_m[0] + (column + 0.5) * 0.05, home.origin_m[1] + (row + 0.5) * 0.05])
+    points_m = np.column_stack([points_m, np.full(len(points_m), 1.5)])
+    points_m = points_m[home.radios_can_stand(points_m)]
+    settings = sp.TraceSettings(2.4e9, power_tolerance_db=0.01)
+    links = sp.trace_links(home, points_m[0], points_m[1:], trace_settings=settings)
+    direct = ~(links.interactions > 0).any(axis=1)
+    assert np.bincount(links.path_rx[direct]).max() == 1
 
 
 @pytest.mark.skipif(not BLEFLAT.is_file(), reason="the measured flat is not here")

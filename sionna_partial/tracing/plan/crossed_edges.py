@@ -86,7 +86,9 @@ class CrossedEdgeCandidates:
         wedge = np.where(arrivals.lit[edge], edge, edge + len(self._wedges.edge_m)).astype(np.int32)
         columns = columns_of(self._geometry, *written)
         columns["face"] = np.where(columns["kind"] == DIFFRACTION, self._wedges.face[wedge, :1], columns["face"])
-        yield Candidates(rx.astype(np.int32), **columns, wedge=wedge, wedges=self._wedges), 1.0
+        candidates = Candidates(rx.astype(np.int32), **columns, wedge=wedge, wedges=self._wedges)
+        possible = (candidates.kind > 0).any(axis=1)  # a row without any would be a direct path once more
+        yield candidates.rows(np.flatnonzero(possible)), 1.0
 
 
 @njit(cache=True)

@@ -112,7 +112,7 @@ class _Beam(NamedTuple):
     window: Floats
     reflected: float
     left: float
-    crossed: int
+    crossed: np.int64
 
 
 class _Layers(NamedTuple):

@@ -53,7 +53,7 @@ class Listed(NamedTuple):
 
     def sums(self, count: int) -> Floats:
         """Sum up the power of each of `count` receivers."""
-        return np.bincount(self.pair[:, 1], self.power, count)
+        return np.bincount(self.pair[:, 1], self.power, count).astype(np.float64)
 
 
 class CrossingCandidates:
@@ -96,11 +96,11 @@ class CrossingCandidates:
             needed = needed_of(weakest, room, self.building.wavelength_m)
             reflected, pair, through = self._followed(beams, Task(order, receivers, self.building, needed))
             new = first_of_each(beams.sequence[pair[:, 0]], pair[:, 1])
-            listed.append(self._paths(tree, pair[new] + [first, 0], through[new], weakest))
+            listed.append(self._paths(tree, pair[new] + np.array([first, 0]), through[new], weakest))
             total += listed[-1].sums(count)
             first, beams = len(tree.parent), reflected._replace(parent=reflected.parent + first)
-            more = beams.parent, beams.piece, beams.window[:, :2]
-            tree = Tree(*(np.concatenate(column) for column in zip(tree, more, strict=True)))
+            parent, piece = np.append(tree.parent, beams.parent), np.append(tree.piece, beams.piece)
+            tree = Tree(parent, piece, np.concatenate([tree.source_m, beams.window[:, :2]]))
         return tree, Listed(*(np.concatenate(column) for column in zip(*listed, strict=True)))
 
     def _followed(self, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.int64], Floats]:

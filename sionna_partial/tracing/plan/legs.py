@@ -67,8 +67,8 @@ class Leg(NamedTuple):
 
     start: tuple[float, float]
     end: tuple[float, float]
-    own: int
-    other: int
+    own: np.int64
+    other: np.int64
     done: float
     stop: float
 
