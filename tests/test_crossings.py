@@ -210,7 +210,7 @@ def test_weak_paths_that_are_left_out_do_not_matter() -> None:
         for tolerance_db in (0.0, 0.1)
     )
     assert len(short.a) < len(whole.a)
-    np.testing.assert_allclose(short.gain_db, whole.gain_db, atol=0.15)
+    np.testing.assert_allclose(short.gain_db, whole.gain_db, atol=0.2)
 
 
 def test_on_by_default_below_24_ghz() -> None:

@@ -31,10 +31,10 @@ from sionna_partial.tracing.plan.specular import Room
 _MOST_REFLECTIONS = 4
 """Most reflections at walls of a path through walls, unless all paths are asked for."""
 
-_WEAKEST, _WEAKEST_OF_ALL = 3e-4, 1e-6
+_WEAKEST, _WEAKEST_OF_ALL = 5e-4, 1e-6
 """Paths that bring less than this fraction of a link's power are left out; the second where all are asked for."""
 
-_RARER = 0.1
+_RARER = 0.03
 """Fraction of its power that counts of a beam with more than the usual reflections."""
 
 _AT_ONCE = 100_000
@@ -59,7 +59,7 @@ class Listed(NamedTuple):
 class CrossingCandidates:
     """Paths between the transmitter and the receivers of a room that go through walls, without diffraction.
 
-    They have at most four reflections at walls, and two at floor and ceiling. Paths that bring less than 3e-4 of the
+    They have at most four reflections at walls, and two at floor and ceiling. Paths that bring less than 5e-4 of the
     power of their link are left out.
     """
 
