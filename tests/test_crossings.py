@@ -20,6 +20,7 @@ BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
 STRAIGHT = sp.TraceSettings(frequency_hz=5e9, max_depth=0, power_tolerance_db=0.0)
 REFRACTION, DIFFRACTION = 4, 8
+BOWLUS = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson" / "Bowlus" / "map.yaml"
 BLEFLAT = Path(__file__).resolve().parents[1] / ".." / "shared" / "measured" / "bleflat" / "map.yaml"
 
 
@@ -52,6 +53,15 @@ class TestOneWall:
         tx, rx = (3.0, 2.97 - aside, 1.5), (6.0, 2.97 + aside, 1.5)
         loss = loss_db(walled(cells), tx, rx)
         assert loss == pytest.approx(slab_loss_db(np.cos(np.radians(angle_deg))), abs=0.02)
+
+    @pytest.mark.parametrize("cells", [3, 6])
+    def test_reflects_as_much_however_deep_it_is(self, cells: int) -> None:
+        """Both links lose the same to a deep wall as to a thin one: its far face reflects nothing."""
+        for rx in ((2.5, 3.9, 1.5), (6.5, 3.9, 1.5)):
+            losses = [
+                loss_db(walled(each), (2.5, 2.17, 1.5), rx, max_depth=3, diffraction=False) for each in (1, cells)
+            ]
+            assert losses[1] == pytest.approx(losses[0], abs=0.02)
 
     def test_costs_the_same_where_one_face_was_seen(self) -> None:
         tx, rx = (2.5, 2.97, 1.5), (6.5, 3.11, 1.5)
@@ -200,7 +210,7 @@ def test_weak_paths_that_are_left_out_do_not_matter() -> None:
         for tolerance_db in (0.0, 0.1)
     )
     assert len(short.a) < len(whole.a)
-    np.testing.assert_allclose(short.gain_db, whole.gain_db, atol=0.15)
+    np.testing.assert_allclose(short.gain_db, whole.gain_db, atol=0.2)
 
 
 def test_on_by_default_below_24_ghz() -> None:
@@ -224,6 +234,20 @@ def test_slopes_of_materials() -> None:
         np.testing.assert_allclose(
             slope[strong], expected[strong], rtol=0.05, atol=0.02 * np.abs(expected[strong]).max()
         )
+
+
+@pytest.mark.skipif(not BOWLUS.is_file(), reason="the home is not here")
+def test_one_direct_path_a_link() -> None:
+    """Paths over an edge that have a leg of 1 cm are none, and not direct ones."""
+    home = sp.load_map(BOWLUS)
+    column, row = np.random.default_rng(3).permutation(np.argwhere(home.state == 0)[:, ::-1])[:400].T
+    points_m = np.column_stack([home.origin_m[0] + (column + 0.5) * 0.05, home.origin_m[1] + (row + 0.5) * 0.05])
+    points_m = np.column_stack([points_m, np.full(len(points_m), 1.5)])
+    points_m = points_m[home.radios_can_stand(points_m)]
+    settings = sp.TraceSettings(2.4e9, power_tolerance_db=0.01)
+    links = sp.trace_links(home, points_m[0], points_m[1:], trace_settings=settings)
+    direct = ~(links.interactions > 0).any(axis=1)
+    assert np.bincount(links.path_rx[direct]).max() == 1
 
 
 @pytest.mark.skipif(not BLEFLAT.is_file(), reason="the measured flat is not here")

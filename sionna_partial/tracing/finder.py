@@ -34,9 +34,11 @@ from sionna_partial.tracing.mesh.sequences import shoot_rays
 from sionna_partial.tracing.mesh.walls import Bodies, Cells, SolidMesh, closed_bodies
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
-from sionna_partial.tracing.plan.crossings import CrossingCandidates, Interior, slabs_of
+from sionna_partial.tracing.plan.crossings import CrossingCandidates
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
+from sionna_partial.tracing.plan.legs import Interior, solid_sides
 from sionna_partial.tracing.plan.obstacles import Lowered
+from sionna_partial.tracing.plan.slabs import slabs_of
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 
 CANDIDATES_AT_ONCE = 100_000
@@ -93,8 +95,8 @@ class PlanScene:
         part = part_of(report, 0.0, 0.8)
         yield from _with_walls(solver, listed, through_walls, (tx_m, rx_m, power), self.settings, part)
         if self.settings.diffraction and len(rx_m):
-            fixed = self.interior, self.settings, crossing.slabs
-            edges = CrossedEdgeCandidates(self.geometry, self.wedges, room, *fixed)
+            fixed = crossing.building, self.settings.power_tolerance_db
+            edges = CrossedEdgeCandidates(self.geometry, self.wedges, *fixed)
             strengths = strengths_of(solver.materials.values(), self.settings.frequency_hz, len(rx_m))
             doing = "verifying diffractions through walls"
             blocks = ((lowered(block), done, doing) for block, done in edges.blocks(strengths, power))
@@ -201,7 +203,9 @@ def write_scene_of(
         cells = Cells(free, partial.resolution_m, settings.wall_depth_m)
         return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles, cells)
     floor = floor_cells(partial, scene_settings.floor_extent)
-    interior = Interior(partial.state == CellState.FREE, floor, partial.resolution_m, settings.wall_depth_m)
+    walls = (partial.state == CellState.WALL) & (settings.wall_depth_m > 0.0)
+    solid = solid_sides(geometry.plan, walls, partial.resolution_m)
+    interior = Interior(partial.state == CellState.FREE, floor, solid, partial.resolution_m, settings.wall_depth_m)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)
     return PlanScene(xml, geometry.shapes, settings, geometry, wedges, interior)
 

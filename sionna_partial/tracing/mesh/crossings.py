@@ -32,16 +32,10 @@ from sionna_partial.tracing.mesh.faces import MOST_FACES, faces_between, scratch
 from sionna_partial.tracing.mesh.sequences import Sequences, Views, collect_sequences, lattice, view_sequences
 from sionna_partial.tracing.mesh.split_rays import Fixed, least_needed, split_rays
 from sionna_partial.tracing.mesh.walls import SolidMesh, is_inside, mark_walls, trail
-from sionna_partial.tracing.plan.crossings import (
-    _COSINES,
-    _MOST_REFLECTIONS,
-    _RARER,
-    _SHORTEST_LEG_M,
-    _USUAL_REFLECTIONS,
-    Limits,
-    least_power,
-    weakest_needed,
-)
+from sionna_partial.tracing.plan.crossing_beams import USUAL_REFLECTIONS, Limits
+from sionna_partial.tracing.plan.crossings import MOST_REFLECTIONS, RARER, least_power, weakest_needed
+from sionna_partial.tracing.plan.legs import SHORTEST_LEG_M
+from sionna_partial.tracing.plan.slabs import COSINES
 
 _RAYS = 20_000
 """Number of rays that are split at faces; fewer where fewer are asked for."""
@@ -87,7 +81,7 @@ class MeshCrossings:
     def __init__(self, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, largest: Floats, settings: TraceSettings) -> None:
         self._tolerance_db, self._rays = settings.power_tolerance_db, min(_RAYS, settings.samples_per_tx)
         exact = self._tolerance_db == 0.0
-        most, rarer = (settings.max_depth, 1.0) if exact else (_MOST_REFLECTIONS, _RARER)
+        most, rarer = (settings.max_depth, 1.0) if exact else (MOST_REFLECTIONS, RARER)
         limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
         tx_m, rx_m = np.array(tx_m, np.float64), np.array(rx_m, np.float64)
         self._fixed = Fixed(mesh, tx_m, rx_m, limits, largest, SPEED_OF_LIGHT_M_S / settings.frequency_hz)
@@ -106,8 +100,9 @@ class MeshCrossings:
 
         starts = range(0, len(traced.views.order), _SEQUENCES_AT_ONCE)
         parts = [straight, *in_order(of_sequences, starts)]
-        pairs = Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-        pairs = Pairs(*(column[pairs.power > 0.0] for column in pairs))
+        node, rx, power = (np.concatenate(column) for column in zip(*parts, strict=True))
+        some = power > 0.0
+        pairs = Pairs(node[some], rx[some], power[some])
         least = least_power(pairs.rx, pairs.power, found, self._tolerance_db)
         chosen = np.flatnonzero(pairs.power >= least[pairs.rx])
         for start in range(0, len(chosen), _AT_ONCE):
@@ -174,7 +169,7 @@ def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
             before = entries.point_m[k - 1, axis] if k > 0 else tx[axis]
             after = entries.point_m[k, axis] if k < count else target[axis]
             square += (after - before) ** 2
-        if square < _SHORTEST_LEG_M**2:
+        if square < SHORTEST_LEG_M**2:
             return False
     return True
 
@@ -198,8 +193,8 @@ def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
         p, material = planes.plane[face], slabs.material[face]
         nx, ny, nz = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
         along = kx * nx + ky * ny + kz * nz
-        at = min(abs(along), 1.0) * _COSINES
-        low = min(int(at), _COSINES - 1)
+        at = min(abs(along), 1.0) * COSINES
+        low = min(int(at), COSINES - 1)
         part = at - low
         sx, sy, sz = ky * nz - kz * ny, kz * nx - kx * nz, kx * ny - ky * nx
         norm = np.sqrt(sx * sx + sy * sy + sz * sz)
@@ -244,7 +239,7 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
     seen, stack, bounds = np.empty(len(fixed.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     for node in nodes:
-        rarer = fixed.limits.rarer ** max(0, views.depth[node] - _USUAL_REFLECTIONS)
+        rarer = fixed.limits.rarer ** max(0, views.depth[node] - USUAL_REFLECTIONS)
         reach = REACH * sequences.reach_m[node] + REACH_M
         source = views.source_m[node]
         view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)

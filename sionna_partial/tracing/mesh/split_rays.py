@@ -11,7 +11,8 @@ from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.mesh.faces import MOST_FACES, Met, faces_between, scratch
 from sionna_partial.tracing.mesh.sequences import Sequences, find_sequence, rehash
 from sionna_partial.tracing.mesh.walls import SolidMesh, cosine_at, is_one_wall
-from sionna_partial.tracing.plan.crossings import _COSINES, _USUAL_REFLECTIONS, Limits
+from sionna_partial.tracing.plan.crossing_beams import USUAL_REFLECTIONS, Limits
+from sionna_partial.tracing.plan.slabs import COSINES
 
 
 class Least(NamedTuple):
@@ -85,8 +86,8 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
     for axis in range(3):
         end[axis] = a[axis] + far * d[axis]
     own = sequences.plane[node] if node >= 0 else -1
-    rare = limits.rarer ** max(0, depth - _USUAL_REFLECTIONS)
-    rarer = limits.rarer ** max(0, depth + 1 - _USUAL_REFLECTIONS)
+    rare = limits.rarer ** max(0, depth - USUAL_REFLECTIONS)
+    rarer = limits.rarer ** max(0, depth + 1 - USUAL_REFLECTIONS)
     stop, start, steep = far, 0.0, 1.0
     for j in range(faces_between(mesh.tree, a, end, own, -1, met)):
         face, t = met.face[j], met.at[j]
@@ -96,7 +97,7 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
         if same and is_one_wall(mesh, met.face[j - 1], face, a, end, met.at[j - 1], t):
             continue
         material = mesh.slabs.material[face]
-        after = left * mesh.slabs.most_reflected[material, int(cosine * _COSINES)]
+        after = left * mesh.slabs.most_reflected[material, int(cosine * COSINES)]
         if depth < limits.reflections and _matters(after * rarer, near, least):
             sequences, loss, child = _add_sequence(sequences, loss, node, mesh.planes.plane[face])
             _reflect(sequences, child, a, d, t * far, mesh.planes, waiting.value[top])
@@ -104,7 +105,7 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
             waiting.value[top, 6], waiting.value[top, 7] = near, after
             waiting.number[top, 0], waiting.number[top, 1], waiting.number[top, 2] = child, depth + 1, crossed
             top += 1
-        left *= mesh.slabs.most_transmitted[material, int(cosine * _COSINES)]
+        left *= mesh.slabs.most_transmitted[material, int(cosine * COSINES)]
         crossed, start, steep = crossed + 1, t, cosine
         if crossed > limits.walls or not _matters(left * rare, near, least):
             stop = t * far

@@ -16,7 +16,7 @@ from sionna_partial.process import njit
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree
 from sionna_partial.tracing.mesh.planes import MeshPlanes
-from sionna_partial.tracing.plan.crossings import Slabs
+from sionna_partial.tracing.plan.slabs import Slabs
 
 
 class Bodies(NamedTuple):

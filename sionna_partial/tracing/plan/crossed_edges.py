@@ -14,27 +14,23 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.bounds import Strengths, at_edge, at_flats, transmitted_power, utd_terms, wedge_angle
 from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.interactions import DIFFRACTION
-from sionna_partial.tracing.plan.crossings import (
-    Interior,
-    Limits,
-    Slabs,
-    can_bounce_as,
+from sionna_partial.tracing.plan.crossing_beams import Building
+from sionna_partial.tracing.plan.crossing_powers import can_bounce_as
+from sionna_partial.tracing.plan.crossings import least_power, weakest_needed
+from sionna_partial.tracing.plan.diffraction import angle_rad, edges_of, outside
+from sionna_partial.tracing.plan.legs import (
+    Leg,
     columns_of,
     cross_leg,
     empty_paths,
     has_long_legs,
-    least_power,
-    most_walls,
     trail_of,
-    weakest_needed,
     write_kinds,
 )
-from sionna_partial.tracing.plan.diffraction import angle_rad, edges_of, outside
-from sionna_partial.tracing.plan.specular import WALLS, Room, merge_heights, unfolded_height
+from sionna_partial.tracing.plan.specular import WALLS, merge_heights, unfolded_height
 
 _EDGES_AT_ONCE = 16
 
@@ -65,31 +61,20 @@ class Arrivals(NamedTuple):
 class CrossedEdgeCandidates:
     """All paths over one vertical edge, through a wall at least, without reflections at walls."""
 
-    def __init__(
-        self,
-        geometry: SceneGeometry,
-        wedges: Wedges,
-        room: Room,
-        interior: Interior,
-        settings: TraceSettings,
-        slabs: Slabs,
-    ) -> None:
-        self._geometry, self._wedges, self._room, self._interior = geometry, wedges, room, interior
-        self._slabs, self._tolerance_db = slabs, settings.power_tolerance_db
-        self._limits = Limits(settings.max_depth, 0, most_walls(geometry, settings), 1.0)
-        self._edges = edges_of(wedges, room.wall_material)
+    def __init__(self, geometry: SceneGeometry, wedges: Wedges, building: Building, tolerance_db: float) -> None:
+        self._geometry, self._wedges, self._building, self._tolerance_db = geometry, wedges, building, tolerance_db
+        self._edges = edges_of(wedges, building.room.wall_material)
 
     def blocks(self, strengths: Strengths, found: Floats) -> Iterator[tuple[Candidates, float]]:
         """Yield the candidates that links need whose other indirect paths have the power `found` (N,)."""
         if not len(self._wedges.edge_m):
             return
         plan, needed = self._geometry.plan, weakest_needed(found, self._tolerance_db)
-        fixed = plan, self._interior, self._room, self._slabs, self._limits
-        arrivals = _arrivals(self._edges, *fixed, trail_of(plan))
+        arrivals = _arrivals(self._edges, self._building, trail_of(plan))
 
         def listed(first: int) -> tuple[Indices, Indices, Indices, Floats]:
             some = np.arange(first, min(first + _EDGES_AT_ONCE, len(self._wedges.edge_m)))
-            return _listed(some, self._edges, arrivals, strengths, needed, *fixed, trail_of(plan))  # type: ignore[no-any-return]
+            return _listed(some, self._edges, arrivals, strengths, needed, self._building, trail_of(plan))  # type: ignore[no-any-return]
 
         parts = list(in_order(listed, range(0, len(self._wedges.edge_m), _EDGES_AT_ONCE)))
         edge, rx, variant, power = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -97,43 +82,48 @@ class CrossedEdgeCandidates:
         if not kept.any():
             return
         edge, rx, variant = edge[kept], rx[kept], variant[kept]
-        written = _written(edge, rx, variant, self._edges, *fixed, trail_of(plan))
+        written = _written(edge, rx, variant, self._edges, self._building, trail_of(plan))
         wedge = np.where(arrivals.lit[edge], edge, edge + len(self._wedges.edge_m)).astype(np.int32)
         columns = columns_of(self._geometry, *written)
         columns["face"] = np.where(columns["kind"] == DIFFRACTION, self._wedges.face[wedge, :1], columns["face"])
-        yield Candidates(rx.astype(np.int32), **columns, wedge=wedge, wedges=self._wedges), 1.0
+        candidates = Candidates(rx.astype(np.int32), **columns, wedge=wedge, wedges=self._wedges)
+        possible = (candidates.kind > 0).any(axis=1)  # a row without any would be a direct path once more
+        yield candidates.rows(np.flatnonzero(possible)), 1.0
 
 
 @njit(cache=True)
-def _leg_power(trail, start, count, plan, slabs):  # type: ignore[no-untyped-def]
-    """Fraction of the power that the walls leave of a horizontal path at most among some entries of a trail."""
-    power = 1.0
-    for k in range(start, count):
-        if not (trail.same_wall[k] or plan.low[trail.surface[k]]):
+def _leg_power(trail, count, building):  # type: ignore[no-untyped-def]
+    """Fraction of the power that the walls of a leg leave at most, if it is horizontal, however polarised."""
+    power, slabs = 1.0, building.slabs
+    for k in range(count):
+        if not (trail.same_wall[k] or building.plan.low[trail.surface[k]]):
             power *= transmitted_power(slabs.transmission[slabs.material[trail.surface[k]]], trail.cosine[k])
     return power
 
 
 @njit(cache=True)
-def _to_edge(plan, interior, tx_m, origin, length, total, trail):  # type: ignore[no-untyped-def]
+def _to_edge(building, origin, length, total, trail):  # type: ignore[no-untyped-def]
     """Write what a line meets from the transmitter to an edge; the number of entries, and of walls."""
-    part = 1.0 - _ASIDE_M / length
+    part, tx_m = 1.0 - _ASIDE_M / length, building.room.tx_m
     x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
-    return cross_leg(plan, interior, tx_m[0], tx_m[1], x, y, -1, -1, 0.0, part * length / total, 0, trail)
+    leg = Leg((tx_m[0], tx_m[1]), (x, y), np.int64(-1), np.int64(-1), 0.0, part * length / total)
+    return cross_leg(building.plan, building.interior, leg, 0, trail)
 
 
 @njit(cache=True)
-def _from_edge(plan, interior, origin, target, length, total, count, trail):  # type: ignore[no-untyped-def]
+def _from_edge(building, origin, target, length, total, count, trail):  # type: ignore[no-untyped-def]
     """Add what a line of some length meets from an edge to a receiver likewise."""
     part = _ASIDE_M / length
     x, y = origin[0] + part * (target[0] - origin[0]), origin[1] + part * (target[1] - origin[1])
     done = (total - length + _ASIDE_M) / total
-    return cross_leg(plan, interior, x, y, target[0], target[1], -1, -1, done, 1.0, count, trail)
+    leg = Leg((x, y), (target[0], target[1]), np.int64(-1), np.int64(-1), done, 1.0)
+    return cross_leg(building.plan, building.interior, leg, count, trail)
 
 
 @njit(cache=True)
-def _arrivals(edges, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
+def _arrivals(edges, building, trail):  # type: ignore[no-untyped-def]
     """Follow the lines from the transmitter to all edges."""
+    room = building.room
     count = len(edges.position_m)
     good, lit = np.zeros(count, np.bool_), np.zeros(count, np.bool_)
     length, power, crossed = np.zeros(count), np.zeros(count), np.zeros(count, np.int64)
@@ -145,10 +135,10 @@ def _arrivals(edges, plan, interior, room, slabs, limits, trail):  # type: ignor
         lit[e], in_front = outside(edges.normals[e], x, y)
         if not in_front or length[e] < 20.0 * _ASIDE_M:
             continue
-        entries, crossed[e] = _to_edge(plan, interior, room.tx_m, origin, length[e], length[e], trail)
-        good[e] = entries >= 0 and crossed[e] <= limits.walls
+        entries, crossed[e] = _to_edge(building, origin, length[e], length[e], trail)
+        good[e] = entries >= 0 and crossed[e] <= building.limits.walls
         if good[e]:
-            power[e] = _leg_power(trail, 0, entries, plan, slabs)
+            power[e] = _leg_power(trail, entries, building)
         from_0 = angle_rad(edges.face_rad[e], exterior, x, y)
         angle[e, 0], angle[e, 1], angle[e, 2], angle[e, 3] = wedge_angle(from_0, exterior)
         for k, from_face in enumerate((from_0, exterior - from_0)):
@@ -157,8 +147,9 @@ def _arrivals(edges, plan, interior, room, slabs, limits, trail):  # type: ignor
 
 
 @njit(cache=True, nogil=True)
-def _listed(group, edges, arrivals, strengths, needed, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
+def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type: ignore[no-untyped-def]
     """Edges, receivers, variants and powers of the paths over some edges that are strong enough."""
+    room = building.room
     out, power, used = np.empty((1024, 3), np.int64), np.empty(1024), 0
     terms, wavelength = np.empty((4, 3)), strengths.wavelength_m
     largest, coefficients, transition = strengths.largest, strengths.faces, strengths.transition
@@ -188,14 +179,14 @@ def _listed(group, edges, arrivals, strengths, needed, plan, interior, room, sla
             )
             if level[0] ** 2 * spread / total < needed[rx]:
                 continue
-            count, crossed = _from_edge(plan, interior, origin, target, onward, total, 0, trail)
+            count, crossed = _from_edge(building, origin, target, onward, total, 0, trail)
             walls = crossed + arrivals.crossed[e]
-            if count < 0 or walls == 0 or walls > limits.walls:
+            if count < 0 or walls == 0 or walls > building.limits.walls:
                 continue
-            behind = _leg_power(trail, 0, count, plan, slabs)
+            behind = _leg_power(trail, count, building)
             for variant in range(_VARIANTS):
                 bounces, first, possible = can_bounce_as(variant, room)
-                if not possible or bounces > limits.depth - 1:
+                if not possible or bounces > building.limits.depth - 1:
                     continue
                 height = unfolded_height(room, target, bounces, first)
                 length = np.hypot(total, height)
@@ -221,22 +212,22 @@ def _listed(group, edges, arrivals, strengths, needed, plan, interior, room, sla
 
 
 @njit(cache=True)
-def _written(edge, rx, variants, edges, plan, interior, room, slabs, limits, trail):  # type: ignore[no-untyped-def]
+def _written(edge, rx, variants, edges, building, trail):  # type: ignore[no-untyped-def]
     """Write paths as `write_paths` does."""
     surface, kind, vertices, same_wall = empty_paths(len(rx), trail)
-    item = WALLS + np.arange(len(trail.surface))
+    room, item = building.room, WALLS + np.arange(len(trail.surface))
     for c in range(len(rx)):
         origin, target = edges.position_m[edge[c]], room.rx_m[rx[c]]
         before = np.hypot(room.tx_m[0] - origin[0], room.tx_m[1] - origin[1])
         onward = np.hypot(target[0] - origin[0], target[1] - origin[1])
         total = before + onward
-        count, _ = _to_edge(plan, interior, room.tx_m, origin, before, total, trail)
+        count, _ = _to_edge(building, origin, before, total, trail)
         trail.kind[count], trail.same_wall[count] = DIFFRACTION, False
         trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = origin[0], origin[1], before / total
-        count, _ = _from_edge(plan, interior, origin, target, onward, total, count + 1, trail)
+        count, _ = _from_edge(building, origin, target, onward, total, count + 1, trail)
         if count < 0 or not has_long_legs(trail, count, total):
             continue
         bounces, first, _ = can_bounce_as(variants[c], room)
         merge_heights(item[:count], trail.points[:count], room, target, bounces, first, surface[c], vertices[c])
-        write_kinds(trail, plan, count + bounces, surface[c], kind[c], same_wall[c])
+        write_kinds(trail, building.plan, count + bounces, surface[c], kind[c], same_wall[c])
     return surface, kind, vertices, same_wall

@@ -9,7 +9,7 @@ from sionna_partial.process import njit
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFRACTION
-from sionna_partial.tracing.plan.crossings import Interior
+from sionna_partial.tracing.plan.legs import Interior
 from sionna_partial.tracing.plan.specular import Room
 
 _MOST_LIDS = 8
