@@ -34,7 +34,7 @@ def slabs_of(constants: Iterable[ArrayLike], material: NDArray[np.int64], freque
     cosine = np.linspace(0.0, 1.0, COSINES + 1)
     given = np.array(list(constants), dtype=np.float64).reshape(-1, 3)
     reflection, transmission = (
-        np.stack([np.stack(coefficients(*each, frequency_hz, cosine), axis=1) for each in given])
+        np.stack([np.stack(coefficients(e, s, d, frequency_hz, cosine), axis=1) for e, s, d in given])
         for coefficients in (reflection_coefficients, transmission_coefficients)
     )
     reflection[:, 0], transmission[:, 0] = -1.0, 0.0
