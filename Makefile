@@ -9,7 +9,7 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_
 LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
 FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
-.PHONY: help demo test docs hostile lint format lock scenes predictor wheel wheel-check clean
+.PHONY: help demo test kernels docs hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -17,8 +17,12 @@ help: ## List what can be made
 demo: $(READY) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
 	@$(BIN)/sionna-partial demo --out demo-output
 
-test: lint ## Check style and types, and run the tests
+test: $(READY) ## Check style and types, and run the tests
+	@$(MAKE) --no-print-directory -j 2 lint kernels
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2 --dist loadfile
+
+kernels: $(READY)
+	@$(ONE_THREAD) $(BIN)/python tests/compile_kernels.py
 
 docs: $(READY) ## Build the site, with its pages, notebooks and examples run (build/docs/index.html)
 	@$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 -m pages tests/test_readme.py
