@@ -1,66 +1,59 @@
-"""Prediction from a trace through walls: what walls that were not seen take from its gains.
+"""What the known walls of a map lose and reflect on average: materials -> two numbers that networks read."""
 
-The shipped networks were trained on opaque walls at 28 GHz, and know nothing of gains behind walls. Here the gain falls
-by the loss of a wall times the number of walls that unobserved space has on a direct line, on average. The constants
-were fitted to 14 procedural homes at 5 GHz, of drywall and of brick; `benchmarks/unseen_walls.py` measures others.
-"""
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.constants import CellState
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import constants_of
-from sionna_partial.settings import Material
-from sionna_partial.tracing.slab import transmission_coefficients
+from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
 
-WALL_LOSSES = "the mean loss of unobserved walls"
-"""Stands for the predictor's name in coverage maps."""
-
-LOS_RANGE_M, LOS_FALL = 2.2, 2.2
-"""Unobserved length at which a link that is traced in line of sight has LOS in half of all cases [m], and the exponent
-with which that falls beyond."""
-
-FIRST_WALLS, WALLS_PER_M = 0.6, 0.17
-"""Walls that a link loses which turns out to have no LOS, and those on each unobserved metre of its direct line."""
-
-HIDDEN_WALLS_PER_M, HIDDEN_FROM_M = 0.16, 1.5
-"""Walls on each unobserved metre, beyond the first, of links that are traced without LOS: unseen reflections make up
-for part of them."""
-
-LOS_GAIN_DB, SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 1.0, 0.5, 0.4, 0.45
-"""By how much unseen reflections add to a link with LOS, for the square root of a metre; standard deviations of gains
-whose direct line is observed, and of links with LOS likewise [dB]; and of all other links, in losses of a wall [1]."""
+MOST_LOSS_DB = 60.0
+"""Loss of a wall from which on it counts as opaque [dB]."""
 
 _ANGLES_DEG = np.arange(0.0, 61.0, 10.0)
-"""Angles of incidence over which the loss of a wall is averaged."""
+"""Angles of incidence over which a wall is averaged: that at normal incidence alone has deep interference fringes."""
+
+
+class WallLosses(NamedTuple):
+    """Mean losses of the walls of a map for vertical antennas, at most `MOST_LOSS_DB`: transmitted, reflected [dB]."""
+
+    loss_db: float
+    reflection_db: float
+
+    @classmethod
+    def of(cls, partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> "WallLosses":
+        """Average over the known wall cells of a map, whose default material is that of the settings.
+
+        Walls that no path goes through lose the most.
+        """
+        materials = scene_settings.material, *partial.wall_materials
+        cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
+        count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
+        weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
+        used, frequency_hz = np.flatnonzero(weights), trace_settings.frequency_hz
+        loss_db = sum(weights[k] * wall_loss_db(materials[k], frequency_hz) for k in used)
+        reflection_db = sum(weights[k] * wall_reflection_db(materials[k], frequency_hz) for k in used)
+        return cls(float(loss_db) if trace_settings.through_walls else MOST_LOSS_DB, float(reflection_db))
 
 
 def wall_loss_db(material: Material, frequency_hz: float) -> float:
-    """Return the mean loss of a wall [dB] for vertical antennas at angles of incidence up to 60 degrees."""
+    """Return the mean loss [dB] of going through a wall at angles of incidence up to 60 degrees."""
+    return _mean_loss_db(transmission_coefficients, material, frequency_hz)
+
+
+def wall_reflection_db(material: Material, frequency_hz: float) -> float:
+    """Return the mean loss [dB] of being reflected at a wall, likewise."""
+    return _mean_loss_db(reflection_coefficients, material, frequency_hz)
+
+
+def _mean_loss_db(
+    coefficients: Callable[..., tuple[np.ndarray, np.ndarray]], material: Material, frequency_hz: float
+) -> float:
     permittivity, conductivity_s_m = constants_of(material, frequency_hz)
     cosine = np.cos(np.radians(_ANGLES_DEG))
-    te, _ = transmission_coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
-    return float(np.mean(-20.0 * np.log10(np.maximum(np.abs(te), 1e-8))))
-
-
-def predict_through_walls(phi: LinkFeatures, wall_loss_db: float) -> LinkPrediction:
-    """Predict links (N,) from features of a trace through walls, each of which loses `wall_loss_db` [dB].
-
-    A link that is traced in line of sight has LOS the rarer, the longer its direct line is unobserved.
-    """
-    unseen_m, los = phi.unobserved_distance_m, phi.link_state == LinkState.LOS
-    root_m = np.sqrt(unseen_m)
-    p_los = np.where(los, 1.0 / (1.0 + (unseen_m / LOS_RANGE_M) ** LOS_FALL), 0.0)
-    hidden = HIDDEN_WALLS_PER_M * np.maximum(unseen_m - HIDDEN_FROM_M, 0.0)
-    walls = np.where(los, FIRST_WALLS + WALLS_PER_M * unseen_m, hidden)
-    mean_db = np.maximum(phi.gain_db - wall_loss_db * walls, GAIN_FLOOR_DB)
-    p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
-    los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root_m, 0.0)
-    means_db = np.stack([np.full(len(root_m), GAIN_FLOOR_DB), los_db, mean_db])
-    los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root_m)
-    std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * wall_loss_db * root_m)
-    stds_db = np.stack([np.zeros(len(root_m)), los_std_db, std_db])
-    probabilities: NDArray[np.float64] = np.stack([p_outage, p_los, 1.0 - p_los - p_outage])
-    return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+    te, _ = coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
+    return float(np.mean(np.minimum(-20.0 * np.log10(np.maximum(np.abs(te), 1e-8)), MOST_LOSS_DB)))
