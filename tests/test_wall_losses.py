@@ -5,11 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from predictor_links import QUIET
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.home_walls import MIXED_FREQUENCIES_HZ, with_drawn_walls
+from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.errors import PredictorError, SettingsError
+from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.through_walls import WALL_LOSSES, predict_through_walls
 from sionna_partial.prediction.wall_losses import MOST_LOSS_DB, WallLosses, wall_loss_db, wall_reflection_db
 
@@ -116,3 +120,25 @@ def test_measured_powers_through_walls() -> None:
     error_db = found.gain_mean_db + fitted.offset_db - power_dbm[20:]
     assert np.sqrt(np.mean(error_db**2)) < 4.0
     assert (found.gain_std_db > 0.5).all()
+
+
+@QUIET
+def test_a_predictor_for_walls_that_let_waves_through() -> None:
+    """It reads losses and frequencies of each link, and is used where paths go through walls without a warning."""
+    home, settings = sp.make_home(3), sp.DatasetSettings(walls="mixed", links_per_home=60, stages=(50, 100))
+    tables = [home_links(home, name, settings) for name in ("one", "two")]
+    links = LinkTable.concatenate(tables)
+    assert len(np.unique(links.features.carrier_hz)) == 2
+    learning = sp.PredictorSettings("paths", passes=4, steps=20, through_walls=True)
+    fits = [sp.Predictor.fit(links.features, links.link_state, links.gain_db, settings=learning) for _ in range(2)]
+    assert fits[0].fingerprint == fits[1].fingerprint
+    found = fits[0].predict(links.features)
+    assert np.isfinite(found.gain_mean_db).all()
+    apart = [fits[0].predict(each.features).gain_mean_db for each in tables]
+    np.testing.assert_allclose(found.gain_mean_db, np.concatenate(apart), atol=1e-3)
+    with pytest.raises(PredictorError, match="parts have a frequency_hz, and none: give it for all"):
+        LinkFeatures.concatenate([links.features, replace(links.features, frequency_hz=None)])
+    with pytest.raises(PredictorError, match=r"frequency_hz\[0\] = 0 is not allowed: give frequencies in Hz"):
+        replace(links.features, frequency_hz=np.zeros(len(links)))
+    with pytest.raises(SettingsError, match="links through walls have no gradients"):
+        sp.DifferentiableScene(half_seen(), fits[0])

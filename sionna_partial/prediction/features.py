@@ -30,8 +30,9 @@ from sionna_partial.prediction.unobserved import (
 from sionna_partial.prediction.wall_losses import WallLosses
 from sionna_partial.prediction.windows import draw_windows, transmitters
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
+from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
-from sionna_partial.tracing.paths import REFRACTION, SolvedPaths
+from sionna_partial.tracing.paths import SolvedPaths
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
