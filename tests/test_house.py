@@ -51,7 +51,7 @@ ROOMS = {
         "antennas",
     ),
     "prediction": (
-        *("unobserved", "windows", "wall_losses", "features", "inputs"),
+        *("unobserved", "windows", "features", "inputs"),
         *("paper_networks", "map_networks", "predictor_files", "predictor", "through_walls", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),

@@ -13,9 +13,9 @@ from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.home_walls import MIXED_FREQUENCIES_HZ, with_drawn_walls
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.features import LinkFeatures, WallLosses
 from sionna_partial.prediction.through_walls import WALL_LOSSES, predict_through_walls
-from sionna_partial.prediction.wall_losses import MOST_LOSS_DB, WallLosses, wall_loss_db, wall_reflection_db
+from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db, wall_reflection_db
 
 WIFI = sp.TraceSettings(5e9, max_depth=2)
 

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,12 +27,12 @@ from sionna_partial.prediction.unobserved import (
     unobserved_lengths_m,
     walled_lengths_m,
 )
-from sionna_partial.prediction.wall_losses import WallLosses
 from sionna_partial.prediction.windows import draw_windows, transmitters
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db, wall_reflection_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
@@ -54,6 +54,28 @@ _OPAQUE_CELLS = 3.0
 
 _BEYOND_CELLS = 2
 """Width of what is labelled around a map, so that walls that reach its border do not part it [cells]."""
+
+
+class WallLosses(NamedTuple):
+    """Mean losses of the walls of a map for vertical antennas, at most `MOST_LOSS_DB`: transmitted, reflected [dB]."""
+
+    loss_db: float
+    reflection_db: float
+
+    @classmethod
+    def of(cls, partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> "WallLosses":
+        """Average over the known wall cells of a map, whose default material is that of the settings.
+
+        Walls that no path goes through lose the most.
+        """
+        materials = scene_settings.material, *partial.wall_materials
+        cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
+        count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
+        weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
+        used, frequency_hz = np.flatnonzero(weights), trace_settings.frequency_hz
+        loss_db = sum(weights[k] * wall_loss_db(materials[k], frequency_hz) for k in used)
+        reflection_db = sum(weights[k] * wall_reflection_db(materials[k], frequency_hz) for k in used)
+        return cls(float(loss_db) if trace_settings.through_walls else MOST_LOSS_DB, float(reflection_db))
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +110,8 @@ class LinkContext(Shown):
     straight_walls : (N,) float64 array
         Number of known walls that it crosses; 0 where there is no direct path.
     wall_loss_db, wall_reflection_db : (N,) float64 arrays
-        What a known wall of the map loses on average where a path goes through it, and where it is reflected, both at
-        normal incidence [dB]: see `wall_losses`.
+        What a known wall of the map loses on average where a path goes through it, and where it is reflected [dB]:
+        see `WallLosses`.
     window_index : (N,) int array
         The transmitter, and window, of each link.
     """
