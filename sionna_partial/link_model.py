@@ -49,8 +49,8 @@ from sionna_partial.measurements.measurements import (
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
+from sionna_partial.prediction.through_walls import WALL_LOSSES, predict_through_walls
 from sionna_partial.prediction.unobserved import is_enclosed
-from sionna_partial.prediction.wall_losses import WALL_LOSSES, predict_through_walls, wall_loss_db
 from sionna_partial.prediction.windows import map_windows
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -243,12 +243,12 @@ class LinkModel:
         self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         complete = np.concatenate([self._complete(*each_m) for each_m in ends_m])
-        frequency_hz = self.simulation.trace_settings.frequency_hz
+        traced = self.simulation.trace_settings, self.simulation.scene_settings
         settings, found = None if complete.all() else self.predictor.settings, []
         context = not complete.all() and (settings is None or settings.networks != "paper")
         for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
             windows = self._windows_around(tx_m) if context else None
-            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, frequency_hz, windows))
+            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, traced, windows))
         phi = LinkFeatures.concatenate(found)
         return phi, self.predict_features(phi, complete), complete
 
@@ -266,8 +266,7 @@ class LinkModel:
         if complete.all():
             return trace
         if self._by_wall_losses:
-            settings, material = self.simulation.trace_settings, self.simulation.scene_settings.material
-            return predict_through_walls(phi, wall_loss_db(material, settings.frequency_hz)).where(complete, trace)
+            return predict_through_walls(phi).where(complete, trace)
         return self.predictor.predict(phi).where(complete, trace)
 
     def links(
@@ -393,13 +392,15 @@ def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]
 def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
     """Warn if a predictor is used on traces of another kind than it was trained on."""
     trained = model.settings
-    if not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
+    if trained.through_walls != settings.through_walls:
+        then, now = (f"{'through' if each.through_walls else 'on opaque'} walls" for each in (trained, settings))
+    elif not trained.through_walls and not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
         then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
     elif trained.diffraction != settings.diffraction:
         then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
     elif settings.max_depth < _LEAST_DEPTH:
         then, now = (f"with max_depth = {depth}" for depth in (TraceSettings.max_depth, settings.max_depth))
-    elif scene_settings.material.itu == "metal":
+    elif not trained.through_walls and scene_settings.material.itu == "metal":
         then, now = "on walls that transmit", "on walls of metal"
     else:
         return

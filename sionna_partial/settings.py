@@ -369,6 +369,9 @@ class DatasetSettings(Checked):
         How maps become scenes.
     trace : TraceSettings
         What is traced, on the complete and on the partial maps.
+    walls : {"given", "mixed"}
+        "mixed" draws for each home, by `seed` and its name, a carrier frequency from 0.7 to 100 GHz and the materials
+        of its walls, through which paths go, in place of those of `scene` and `trace`.
 
     Raises
     ------
@@ -394,6 +397,7 @@ class DatasetSettings(Checked):
     short_link_fraction: Fraction = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
+    walls: Literal["given", "mixed"] = "given"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -436,6 +440,9 @@ class PredictorSettings(Checked):
         and of prior knowledge.
     seed : int
         Of first weights and batches.
+    through_walls : bool
+        Whether paths go through walls. Frequency and losses of walls are then inputs of the added networks, and
+        `frequency_hz` is that of the paper's networks alone.
 
     Raises
     ------
@@ -458,6 +465,7 @@ class PredictorSettings(Checked):
     learning_rate: Annotated[float, Within(0.0, 1.0, open_low=True)] = 0.01
     minimum_links: Count = 100
     seed: Annotated[int, Within(0, 1_000_000_000)] = 0
+    through_walls: bool = False
 
 
 @dataclass(frozen=True)

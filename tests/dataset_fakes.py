@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
+from predictor_links import walls_of_links
 
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.datasets.link_table import LinkTable
@@ -91,6 +92,7 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
         unobserved_distance_m=distance_m / 2,
         indirect_gain_db=gains_db,
         strongest_unobserved_m=strongest_m,
+        **walls_of_links(count),
     )
     return LinkTable(
         home=np.full(count, name),

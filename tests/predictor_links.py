@@ -54,6 +54,16 @@ def corridor_of(phi):
     return 2 * (phi.distance_m < 10.0) + (phi.unobserved_distance_m < 2.0)
 
 
+def walls_of_links(count, loss_db=60.0):
+    """Return what a trace shows of walls that lose so much, none of which any direct path crosses [dB]."""
+    return {
+        "straight_gain_db": np.full(count, -150.0),
+        "straight_walls": np.zeros(count),
+        "wall_loss_db": np.full(count, loss_db),
+        "wall_reflection_db": np.full(count, 6.0),
+    }
+
+
 def make_context(phi):
     """Return the context of links along the corridor."""
     count = len(phi)
@@ -68,6 +78,7 @@ def make_context(phi):
         rx_m=tx_m + np.column_stack([phi.distance_m, np.zeros((count, 2))]),
         indirect_gain_db=10.0 * np.log10(np.maximum(power[:, None] * kept, 1e-15)),
         strongest_unobserved_m=np.where(linked, crossed_m, phi.distance_m),
+        **walls_of_links(count),
         link_state=phi.link_state,
         unobserved_distance_m=crossed_m,
     )
@@ -110,6 +121,7 @@ def features(
         unobserved_distance_m=unobserved_m,
         indirect_gain_db=np.full((count, len(ATTENUATION_LENGTHS_M)), indirect_db),
         strongest_unobserved_m=unobserved_m,
+        **walls_of_links(count),
     )
     distance_m = np.linalg.norm(rx_m - tx_m, axis=1) if distance_m is None else np.full(count, distance_m)
     phi = LinkFeatures(state, unobserved_m, distance_m, np.full(count, gain_db), context)

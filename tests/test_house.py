@@ -52,7 +52,7 @@ ROOMS = {
     ),
     "prediction": (
         *("unobserved", "windows", "features", "inputs"),
-        *("paper_networks", "map_networks", "predictor_files", "predictor", "wall_losses", "path_model"),
+        *("paper_networks", "map_networks", "predictor_files", "predictor", "through_walls", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("coverage_map", "link_model", "coverage"),
@@ -66,7 +66,16 @@ ROOMS = {
     "placement": ("area", "placement", "several"),
     "exploration": ("next_views", "explore"),
     "live": ("coverage", "topics", "bags", "dds", "rosbridge"),
-    "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
+    "datasets": (
+        "link_table",
+        "home_sources",
+        "home_walls",
+        "home_links",
+        "shards",
+        "home_process",
+        "dataset",
+        "dataset_links",
+    ),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training", "path_training"),
     "plots": (

@@ -93,7 +93,10 @@ class TestPaths:
 
     def test_direct_path_is_left_out(self):
         bounced = (1e-4, [(6.5, 2.5, 1.5)])
-        assert same(of_paths((0.5, []), bounced, rx=NEAR), of_paths(bounced, rx=NEAR))
+        found, without = of_paths((0.5, []), bounced, rx=NEAR), of_paths(bounced, rx=NEAR)
+        assert found.straight_gain_db == pytest.approx([-6.02], abs=0.01)
+        assert without.straight_gain_db == [GAIN_FLOOR_DB]
+        assert same(dataclasses.replace(found, straight_gain_db=without.straight_gain_db), without)
 
     @pytest.mark.parametrize("paths", [[], [(0.5, [])]])
     @pytest.mark.parametrize("partial", [HALF, WHOLE])

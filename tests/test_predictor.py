@@ -21,6 +21,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
 from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
+from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -148,7 +149,7 @@ def test_shipped_predictor(name):
 class TestNetworksOfMapsAndPaths:
     def test_its_networks_answer_where_maps_are_partial(self, seeing):
         phi = make_seen_links(100, seed=3)[0]
-        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, 28e9))
+        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, PredictorSettings()))
         for name, values in arrays(seeing.predict(phi)).items():
             np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
 

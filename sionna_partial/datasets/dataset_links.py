@@ -10,31 +10,37 @@ from pathlib import Path
 
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.datasets.shards import INDEX_FILE, read_dataset, read_index
-from sionna_partial.errors import PredictorError
+from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import NetworkKind, PredictorSettings
+from sionna_partial.settings import NetworkKind, PredictorSettings, TraceSettings
 
 
 @dataclass(frozen=True)
 class LinkTraces:
-    """How links were traced: carrier frequency [Hz], and whether with diffraction on plans."""
+    """How links were traced: carrier frequency [Hz], and whether with diffraction on plans, and through walls.
+
+    Through walls links have frequencies of their own.
+    """
 
     frequency_hz: float
     diffraction: bool
+    through_walls: bool = False
 
     @classmethod
     def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
         """Return those of a predictor's settings."""
-        return cls(settings.frequency_hz, settings.diffraction)
+        return cls(settings.frequency_hz, settings.diffraction, settings.through_walls)
 
     def __str__(self) -> str:
         """Return them in words."""
-        return f"at {self.frequency_hz / 1e9:g} GHz {'with' if self.diffraction else 'without'} diffraction"
+        where = "through walls" if self.through_walls else f"at {self.frequency_hz / 1e9:g} GHz"
+        return f"{where} {'with' if self.diffraction else 'without'} diffraction"
 
     def is_like(self, other: "LinkTraces") -> bool:
         """Whether frequency (within 1e-6) and diffraction are the same."""
         alike = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
-        return alike and self.diffraction == other.diffraction
+        same = self.diffraction == other.diffraction and self.through_walls == other.through_walls
+        return same and (alike or self.through_walls)
 
 
 Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
@@ -93,7 +99,8 @@ def settings_for(
 ) -> PredictorSettings:
     """Return settings of a training on such links; None takes the defaults."""
     known = traces or LinkTraces.of_settings(PredictorSettings())
-    return PredictorSettings(networks, known.frequency_hz, known.diffraction, passes, seed=seed)
+    through = {"through_walls": known.through_walls}
+    return PredictorSettings(networks, known.frequency_hz, known.diffraction, passes, seed=seed, **through)
 
 
 def require_like(
@@ -107,8 +114,10 @@ def require_like(
 def _read_traces(folder: Path) -> LinkTraces:
     index = read_index(folder)
     try:
-        trace = index["settings"]["trace"]
-        return LinkTraces(float(trace["frequency_hz"]), trace["diffraction"] is not False)
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        settings = index["settings"]
+        trace = TraceSettings(**settings["trace"])
+        through_walls = settings.get("walls") == "mixed" or trace.through_walls
+        return LinkTraces(trace.frequency_hz, trace.diffraction is not False, through_walls)
+    except (ValueError, KeyError, TypeError, AttributeError, SettingsError) as error:
         path = folder / INDEX_FILE
         raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error

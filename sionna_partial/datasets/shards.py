@@ -22,14 +22,14 @@ from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
 from sionna_partial.maps.mesh.mesh import material_records
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkContext, LinkFeatures
+from sionna_partial.prediction.features import LinkContext, LinkFeatures, one_or_each
 from sionna_partial.prediction.inputs import FEATURES, columns_of, features_of_columns
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
 """Files and folders of a data set: settings and homes, a shard for each home, a note for each home that failed."""
 
-FORMAT = "sionna-partial links 2"
+FORMAT = "sionna-partial links 3"
 """Name and version of the shards' format, in their metadata."""
 
 _MAX_LINKS, _MAX_CELLS, _MAX_BYTES = 10_000_000, 100_000_000, 4_000_000_000
@@ -207,8 +207,9 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
     }
     maps, map_index = tuple(_unpacked(each) for each in notes["partial"]), columns.pop("map_index")
     found = features_of_columns(columns)
-    of_context = {name: found.pop(name) for name in ("indirect_gain_db", "strongest_unobserved_m")}
+    of_context = {name: found.pop(name) for name in [*found] if name in LinkContext.__dataclass_fields__}
     traced = {name: found[name] for name in ("link_state", "unobserved_distance_m")}
+    found["frequency_hz"] = one_or_each(found.pop("carrier_hz"))
     context = LinkContext.on_maps(maps, map_index, **traced, **of_context, **positions)
     table = {name: columns[name] for name in COLUMNS if name != "home"}
     home = columns["home"].astype(np.str_)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import number_of, require_bool, require_type, shown
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
@@ -28,8 +28,11 @@ from sionna_partial.prediction.unobserved import (
     walled_lengths_m,
 )
 from sionna_partial.prediction.windows import draw_windows, transmitters
+from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
+from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db, wall_reflection_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
@@ -51,6 +54,28 @@ _OPAQUE_CELLS = 3.0
 
 _BEYOND_CELLS = 2
 """Width of what is labelled around a map, so that walls that reach its border do not part it [cells]."""
+
+
+class WallLosses(NamedTuple):
+    """Mean losses of the walls of a map for vertical antennas, at most `MOST_LOSS_DB`: transmitted, reflected [dB]."""
+
+    loss_db: float
+    reflection_db: float
+
+    @classmethod
+    def of(cls, partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> "WallLosses":
+        """Average over the known wall cells of a map, whose default material is that of the settings.
+
+        Walls that no path goes through lose the most.
+        """
+        materials = scene_settings.material, *partial.wall_materials
+        cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
+        count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
+        weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
+        used, frequency_hz = np.flatnonzero(weights), trace_settings.frequency_hz
+        loss_db = sum(weights[k] * wall_loss_db(materials[k], frequency_hz) for k in used)
+        reflection_db = sum(weights[k] * wall_reflection_db(materials[k], frequency_hz) for k in used)
+        return cls(float(loss_db) if trace_settings.through_walls else MOST_LOSS_DB, float(reflection_db))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +105,13 @@ class LinkContext(Shown):
         Unobserved length of the strongest path but the direct one [m]; the distance where there is none.
     windows : (W, *WINDOWS) uint8 array, optional
         What the map networks read around the transmitters.
+    straight_gain_db : (N,) float64 array
+        Gain of the direct path, through whatever known walls it crosses [dB], at least -150.
+    straight_walls : (N,) float64 array
+        Number of known walls that it crosses; 0 where there is no direct path.
+    wall_loss_db, wall_reflection_db : (N,) float64 arrays
+        What a known wall of the map loses on average where a path goes through it, and where it is reflected [dB]:
+        see `WallLosses`.
     window_index : (N,) int array
         The transmitter, and window, of each link.
     """
@@ -95,6 +127,10 @@ class LinkContext(Shown):
     possible: Bools
     indirect_gain_db: Floats
     strongest_unobserved_m: Floats
+    straight_gain_db: Floats
+    straight_walls: Floats
+    wall_loss_db: Floats
+    wall_reflection_db: Floats
     window_index: Indices
     windows: NDArray[np.uint8] | None = None
 
@@ -112,12 +148,12 @@ class LinkContext(Shown):
         rx_m: Floats,
         link_state: States,
         unobserved_distance_m: Floats,
-        indirect_gain_db: Floats,
-        strongest_unobserved_m: Floats,
+        **traced: Any,
     ) -> "LinkContext":
         """Compute what the maps show of links, without windows.
 
-        `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`.
+        `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`: those
+        from `tx_m` on which are not found here.
         """
         count = len(map_index)
         tx_seen, rx_seen, complete, nearly = (np.zeros(count, dtype=bool) for _ in range(4))
@@ -134,7 +170,7 @@ class LinkContext(Shown):
             possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
         found = (tx_seen, rx_seen, complete, nearly, walled_m, wall_noise, possible)
         _, window_index = transmitters(map_index, tx_m)
-        return cls(tx_m, rx_m, *found, indirect_gain_db, strongest_unobserved_m, window_index)
+        return cls(tx_m, rx_m, *found, window_index=window_index, **traced)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkContext":
         """Return the context with the windows of the maps that `on_maps` was given."""
@@ -169,11 +205,15 @@ _COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "w
 
 
 class IndirectPaths:
-    """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced."""
+    """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced.
 
-    def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats) -> None:
-        self.partial, self.tx_m, self.rx_m = partial, tx_m, rx_m
+    `walls` are the mean losses of the walls of the map.
+    """
+
+    def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats, walls: WallLosses) -> None:
+        self.partial, self.tx_m, self.rx_m, self.walls = partial, tx_m, rx_m, walls
         count = len(tx_m) * len(rx_m)
+        self._straight_power, self._straight_walls = np.zeros(count), np.zeros(count)
         self._power, self._strongest = np.zeros((len(ATTENUATION_LENGTHS_M), count)), np.zeros(count)
         self._strongest_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
 
@@ -186,6 +226,10 @@ class IndirectPaths:
             interactions, vertices_m = paths.interactions[indirect], paths.vertices_m[indirect]
             unobserved_m = path_unobserved_m(self.partial, self.tx_m[tx], interactions, vertices_m, self.rx_m[rx])
             self._add(tx.astype(np.int64) * len(self.rx_m) + rx, np.abs(paths.a[indirect]) ** 2, unobserved_m)
+        straight = np.isin(paths.interactions, (0, REFRACTION)).all(axis=1)
+        link = paths.path_tx[straight].astype(np.int64) * len(self.rx_m) + paths.path_rx[straight]
+        self._straight_power[link] += np.abs(paths.a[straight]) ** 2
+        self._straight_walls[link] = np.count_nonzero(paths.interactions[straight], axis=1)
 
     def _add(self, link: NDArray[np.int64], power: Floats, unobserved_m: Floats) -> None:
         for total, length_m in zip(self._power, ATTENUATION_LENGTHS_M, strict=True):
@@ -209,6 +253,10 @@ class IndirectPaths:
             unobserved_distance_m=unobserved_distance_m,
             indirect_gain_db=np.stack([path_gain_db(total) for total in self._power], axis=1),
             strongest_unobserved_m=self._strongest_m,
+            straight_gain_db=path_gain_db(self._straight_power),
+            straight_walls=self._straight_walls,
+            wall_loss_db=np.full(len(tx_m), self.walls.loss_db),
+            wall_reflection_db=np.full(len(tx_m), self.walls.reflection_db),
         )
 
 
@@ -334,7 +382,7 @@ class LinkFeatures(Shown):
     context : LinkContext, optional
         What the map shows along and around the links, as arrays, from `link_features`; one link after the other. The
         paper's predictor does not use it.
-    frequency_hz : float, optional
+    frequency_hz : float or (N,) array, optional
         Carrier frequency of the trace [Hz], from `link_features`. None is that of the predictor.
 
     Raises
@@ -355,7 +403,7 @@ class LinkFeatures(Shown):
     distance_m: Floats
     gain_db: Floats
     context: LinkContext | None = None
-    frequency_hz: float | None = None
+    frequency_hz: float | Floats | None = None
 
     def __post_init__(self) -> None:
         count, shape = np.size(self.distance_m), np.shape(self.distance_m)
@@ -368,11 +416,19 @@ class LinkFeatures(Shown):
         require_each(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
         remedy = f"clip gains at {GAIN_FLOOR_DB:g} dB, the gain of an outage."
         require_each(self.gain_db >= GAIN_FLOOR_DB, "gain_db", self.gain_db, remedy)
-        if self.frequency_hz is not None and not 1e6 <= number_of(self.frequency_hz) <= 1e12:
-            what = f"frequency_hz = {shown(self.frequency_hz)} is not allowed"
-            raise PredictorError(f"{what}: give a frequency in Hz, or None for that of the predictor.")
+        self._check_frequency()
         if self.context is not None and len(self.context) != count:
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
+
+    def _check_frequency(self) -> None:
+        given = self.frequency_hz
+        if isinstance(given, np.ndarray):
+            frequency_hz = link_numbers("frequency_hz", given, (len(self),))
+            known = (frequency_hz >= FREQUENCIES_HZ[0]) & (frequency_hz <= FREQUENCIES_HZ[1])
+            require_each(known, "frequency_hz", frequency_hz, "give frequencies in Hz.")
+        elif given is not None and not FREQUENCIES_HZ[0] <= number_of(given) <= FREQUENCIES_HZ[1]:
+            what = f"frequency_hz = {shown(given)} is not allowed"
+            raise PredictorError(f"{what}: give a frequency in Hz, or None for that of the predictor.")
 
     def __len__(self) -> int:
         """Return the number of links, N or T N."""
@@ -391,10 +447,19 @@ class LinkFeatures(Shown):
         """Return the links that an index array, a mask or a slice selects, one after the other."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
-        return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz)
+        frequency_hz = self.frequency_hz[index] if isinstance(self.frequency_hz, np.ndarray) else self.frequency_hz
+        return LinkFeatures(**columns, context=context, frequency_hz=frequency_hz)
 
-    def free_space_shift_db(self, frequency_hz: float) -> float:
-        """Return how much stronger free space is at another frequency [dB]."""
+    @property
+    def carrier_hz(self) -> Floats:
+        """Carrier frequency (N,) of each link [Hz]; where none is given 28 GHz."""
+        given = CARRIER_FREQUENCY_HZ if self.frequency_hz is None else self.frequency_hz
+        return np.broadcast_to(given, len(self))
+
+    def free_space_shift_db(self, frequency_hz: float) -> Any:
+        """Return how much stronger free space is at another frequency [dB], one number or one of each link (N,)."""
+        if isinstance(self.frequency_hz, np.ndarray):
+            return 20.0 * np.log10(self.frequency_hz / frequency_hz)
         return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
@@ -402,14 +467,15 @@ class LinkFeatures(Shown):
         """Return the links of all `parts`, one after the other."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
-        frequencies_hz = {part.frequency_hz for part in parts}
-        if len(frequencies_hz) > 1:
-            given = ", ".join(sorted(f"{each:g}" if each else "none" for each in frequencies_hz))
-            raise PredictorError(f"parts have the frequency_hz {given}: give links of one frequency together.")
+        missing = [part.frequency_hz is None for part in parts]
+        if any(missing) and not all(missing):
+            raise PredictorError("parts have a frequency_hz, and none: give it for all of them, or for none.")
+        each_hz = np.concatenate([part.carrier_hz for part in parts])
+        frequency_hz = one_or_each(each_hz) if len(each_hz) else parts[0].frequency_hz
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
         columns = {name: np.concatenate([getattr(part, name).ravel() for part in parts]) for name in _PAPER}
-        return cls(**columns, context=context, frequency_hz=frequencies_hz.pop())
+        return cls(**columns, context=context, frequency_hz=None if any(missing) else frequency_hz)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
         """Return the features with what map networks read of the maps; `map_index` (N,) is the map of each link."""
@@ -419,6 +485,12 @@ class LinkFeatures(Shown):
 
 
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in ("context", "frequency_hz"))
+
+
+def one_or_each(frequency_hz: Floats) -> float | Floats:
+    """Return the frequency that all links (N,) have, or those of each link."""
+    same = len(frequency_hz) > 0 and bool((frequency_hz == frequency_hz[0]).all())
+    return float(frequency_hz[0]) if same else frequency_hz
 
 
 def excess_noise(wall_noise: Floats) -> Floats:
@@ -494,7 +566,8 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     if not links.valid.all():
         count = int((~links.valid).sum())
         raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")
-    paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx)
+    walls = WallLosses.of(partial, links.trace_settings, links.scene_settings)
+    paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx, walls)
     paths.add(links)
     frequency_hz = links.trace_settings.frequency_hz
     phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz)
@@ -507,22 +580,23 @@ def features_of_paths(
     tx_m: Floats,
     rx_m: Floats,
     blocks: Iterable[SolvedPaths],
-    frequency_hz: float,
+    settings: tuple[TraceSettings, SceneSettings],
     windows: NDArray[np.uint8] | None,
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
-    `blocks` are all paths between them, from `Simulation.blocks`, and `windows` those of `map_windows` around the
-    transmitter. Without windows there is no context, which the paper's predictor does not need.
+    `blocks` are all paths between them, from `Simulation.blocks`, `settings` those of the trace, and `windows` those of
+    `map_windows` around the transmitter. Without windows there is no context, which the paper's predictor does not
+    need.
     """
     sums = LinkSums(1, len(rx_m))
-    indirect = IndirectPaths(partial, tx_m[None], rx_m)
+    indirect = IndirectPaths(partial, tx_m[None], rx_m, WallLosses.of(partial, *settings))
     for paths in blocks:
         sums.add(paths)
         if windows is not None:
             indirect.add(paths)
     link_state, gain_db = sums.states_and_gains()
-    phi = _features(indirect, link_state[0], gain_db[0], frequency_hz, context=windows is not None)
+    phi = _features(indirect, link_state[0], gain_db[0], settings[0].frequency_hz, context=windows is not None)
     return phi if phi.context is None else replace(phi, context=replace(phi.context, windows=windows))
 
 

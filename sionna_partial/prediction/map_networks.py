@@ -23,7 +23,14 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkContext, LinkFeatures, excess_noise
-from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
+from sionna_partial.prediction.inputs import (
+    LINK_INPUTS,
+    WALL_INPUTS,
+    feature_values,
+    free_space_gain_db,
+    link_inputs,
+    wall_inputs,
+)
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
 from sionna_partial.settings import PredictorSettings
@@ -64,7 +71,8 @@ _LOS_MOST_DB = 10.0
 """Largest mean gain given LOS, over free space [dB]: other paths add power to the direct one, and never so much."""
 
 _LOS_OFFSET = -1.5
-_NLOS_OFFSET_DB, _NLOS_SCALE_DB = -25.0, 20.0
+_OPAQUE = (-25.0, 20.0)
+_LEAST_ANCHOR_DB, _WALL_SCALE_DB, _WALL_SCALE, _MOST_SCALED_DB = -80.0, 3.0, 0.5, 30.0
 _STATISTICS_MOMENTUM = 0.9
 _FADE_CELLS = 8.0
 """Width of the rim of a window in which its numbers fade to 0 [cells]."""
@@ -77,17 +85,19 @@ _log = logging.getLogger(__name__)
 
 
 _SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
-_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + len(CELLS_M) * MAP_FEATURES
+_MAP_INPUTS = len(CELLS_M) * MAP_FEATURES
+_MAP_SHAPES = dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES)))
 
-CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
-    {},
-    {LINK_NETWORK: ((None, len(LINK_INPUTS)), (None, LINK_OUTPUTS))},
-    {
-        LINK_NETWORK: ((None, _LINK_INPUTS_WITH_MAP), (None, LINK_OUTPUTS)),
-        **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
-    },
-)
-"""Inputs and outputs of the networks that a predictor may have beside the paper's: none, "paths", or "map"."""
+
+def _shapes_of(table: Mapping[str, Any]) -> tuple[Mapping[str, Shapes], ...]:
+    """Return inputs and outputs of the networks "paths" and "map" whose link network has the inputs of a table."""
+    alone, beside = ({LINK_NETWORK: ((None, len(table) + more), (None, LINK_OUTPUTS))} for more in (0, _MAP_INPUTS))
+    return alone, {**beside, **_MAP_SHAPES}
+
+
+CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = ({}, *_shapes_of(LINK_INPUTS), *_shapes_of(WALL_INPUTS))
+"""Inputs and outputs of the networks that a predictor may have beside the paper's: none, "paths", or "map"; the last
+two where paths go through walls."""
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:
@@ -96,10 +106,25 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     return phi.context
 
 
-def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
-    """Return the inputs of the link network of a frequency for the features of N links, which have a context."""
-    inputs: Floats = link_inputs(feature_values(phi), frequency_hz, phi.free_space_shift_db(frequency_hz))
+def scaled_inputs(phi: LinkFeatures, settings: PredictorSettings) -> NDArray[np.float32]:
+    """Return the inputs of the link network of some settings for the features of N links, which have a context."""
+    if settings.through_walls:
+        return wall_inputs(feature_values(phi)).astype(np.float32)
+    shift_db = phi.free_space_shift_db(settings.frequency_hz)
+    inputs: Floats = link_inputs(feature_values(phi), settings.frequency_hz, shift_db)
     return inputs.astype(np.float32)
+
+
+def nlos_anchors(phi: LinkFeatures, settings: PredictorSettings) -> tuple[Any, Any]:
+    """Return the gain over free space from which the one without line of sight is counted, and its scale [dB].
+
+    Through walls they are the traced gain and what grows with the loss of a wall, of each link (N,).
+    """
+    if not settings.through_walls:
+        return _OPAQUE
+    traced_db = phi.gain_db - free_space_gain_db(phi.distance_m, phi.carrier_hz)
+    scale_db = _WALL_SCALE_DB + _WALL_SCALE * np.minimum(context_of(phi).wall_loss_db, _MOST_SCALED_DB)
+    return np.maximum(traced_db, _LEAST_ANCHOR_DB), scale_db
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
@@ -108,7 +133,7 @@ def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
     return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
 
 
-def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
+def context_networks(seed: int, *, with_map: bool = True, through_walls: bool = False) -> dict[str, "keras.Model"]:
     """Build the networks, untrained, by name; the link network alone without map networks."""
     keras = import_keras()
     seeds = itertools.count(1000 * seed + 1)
@@ -116,7 +141,8 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
     def start() -> Any:
         return keras.initializers.GlorotUniform(seed=next(seeds))
 
-    networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
+    inputs = len(WALL_INPUTS if through_walls else LINK_INPUTS) + (_MAP_INPUTS if with_map else 0)
+    networks = {LINK_NETWORK: _link_network(keras, start, inputs)}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
         networks[name] = _map_network(keras, start, name, widths)
     return networks
@@ -216,31 +242,34 @@ def _interpolated(maps: Any, offsets: Any) -> Any:
     return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))
 
 
-def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
+def decode(outputs: Any, free_db: Any, anchors: tuple[Any, Any] = _OPAQUE) -> tuple[Any, Any, Any]:
     """Return log-probabilities (..., 3) of the link states, and means [dB] and log-variances (..., 2) given LOS, NLOS.
 
-    `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB]. The
-    mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
+    `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB],
+    `anchors` are from `nlos_anchors`. The mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
     """
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
-    nlos_db = _NLOS_OFFSET_DB + _NLOS_SCALE_DB * outputs[..., 4]
+    nlos_db = anchors[0] + anchors[1] * outputs[..., 4]
     means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
     low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
     return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
 
 
-def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any, Any, Any]:
+def distribution(
+    outputs: Any, free_db: Any, context: LinkContext, anchors: tuple[Any, Any] = _OPAQUE
+) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
-    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not possible have probability 0. On maps with
-    range noise, which the networks do not notice, standard deviations are larger.
+    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,), `anchors` are from `nlos_anchors`. States that are not possible
+    have probability 0. On maps with range noise, which the networks of opaque walls do not notice, standard deviations
+    are larger.
     """
-    widening = 1.0 + excess_noise(context.wall_noise) * np.where(
+    widening = 1.0 + (anchors is _OPAQUE) * excess_noise(context.wall_noise) * np.where(
         context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
     )
     states = tf.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
     outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
-    log_probabilities, gains_db, log_variances = decode(outputs, free_db)
+    log_probabilities, gains_db, log_variances = decode(outputs, free_db, anchors)
     outage = tf.fill([1, len(free_db)], tf.constant(GAIN_FLOOR_DB, tf.float64))
     means_db = tf.concat([outage, tf.transpose(tf.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
     stds_db = tf.concat([tf.zeros_like(outage), tf.transpose(tf.exp(0.5 * log_variances))], axis=0) * widening
@@ -248,20 +277,21 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
 
 
 def evaluate_context_networks(
-    networks: Networks, phi: LinkFeatures, frequency_hz: float, read: MapReader | None = None
+    networks: Networks, phi: LinkFeatures, settings: PredictorSettings, read: MapReader | None = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`.
+    """Evaluate the networks of some settings on the features of N links, which have a context: see `distribution`.
 
     `read` is the reader of these networks, where one is kept.
     """
-    inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
+    inputs, offsets_m = scaled_inputs(phi, settings), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for maps, links in _by_window(networks, context_of(phi), read):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
-    free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
-    probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi))
+    frequency_hz = settings.frequency_hz if phi.frequency_hz is None else phi.frequency_hz
+    free_db = free_space_gain_db(phi.distance_m, frequency_hz)
+    probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi), nlos_anchors(phi, settings))
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
@@ -296,7 +326,8 @@ def fit_context_networks(
 
     Windows are turned and mirrored at random. The same links and settings give the same weights.
     """
-    networks = context_networks(settings.seed, with_map=settings.networks == "map")
+    kind = {"with_map": settings.networks == "map", "through_walls": settings.through_walls}
+    networks = context_networks(settings.seed, **kind)
     examples = _Examples(phi, link_state, gain_db, settings)
     steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
     step = _gradient_step(networks, steps)
@@ -319,13 +350,17 @@ class _Examples:
         self._used, links = _links_by_window(context_of(phi))
         self._windows = context_of(phi).windows if settings.networks == "map" else None
         self._first = np.cumsum([0, *map(len, links)])
+        frequency_hz = phi.carrier_hz if settings.through_walls else settings.frequency_hz
         columns = {
-            "links": scaled_inputs(phi, settings.frequency_hz),
+            "links": scaled_inputs(phi, settings),
             "offsets_m": receiver_offsets_m(phi),
-            "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
+            "free_db": free_space_gain_db(phi.distance_m, frequency_hz).astype(np.float32),
             "link_state": link_state.astype(np.int32),
             "gain_db": gain_db.astype(np.float32),
         }
+        if settings.through_walls:
+            offset_db, scale_db = nlos_anchors(phi, settings)
+            columns |= {"offset_db": offset_db.astype(np.float32), "scale_db": scale_db.astype(np.float32)}
         order = np.concatenate(links)
         self._columns = {name: column[order] for name, column in columns.items()}
 
@@ -375,10 +410,19 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer.build(weights)  # or TensorFlow traces the step again, after the first has made variables
 
-    def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
+    def step(
+        links: Any,
+        offsets_m: Any,
+        free_db: Any,
+        link_state: Any,
+        gain_db: Any,
+        windows: Any = None,
+        offset_db: Any = _OPAQUE[0],
+        scale_db: Any = _OPAQUE[1],
+    ) -> Any:
         with tf.GradientTape() as tape:
             outputs = read_links(networks, read_maps(networks, windows, training=True), links, offsets_m)
-            log_p, means_db, log_variances = decode(outputs, free_db)
+            log_p, means_db, log_variances = decode(outputs, free_db, (offset_db, scale_db))
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             scores_db = _crps(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
             states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)

@@ -19,7 +19,14 @@ from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError, SettingsError
-from sionna_partial.prediction.features import LinkFeatures, excess_noise, link_numbers, link_states, require_each
+from sionna_partial.prediction.features import (
+    LinkFeatures,
+    excess_noise,
+    link_numbers,
+    link_states,
+    require_each,
+    shifted_gain_db,
+)
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
@@ -396,7 +403,12 @@ class Predictor(Shown):
                 _require_windows(features)
             with reporting(progress) as report:
                 context_networks = fit_context_networks(features, states, gains_db, settings, progress=report)
-        model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
+        shift_db = features.free_space_shift_db(settings.frequency_hz)
+        at_one_db, truth_db = (
+            np.maximum(shifted_gain_db(each, shift_db), GAIN_FLOOR_DB) for each in (features.gain_db, gains_db)
+        )
+        alike = replace(features, gain_db=at_one_db, frequency_hz=None)
+        model = assemble(parts(fit_networks(alike, states, truth_db, settings)) | context_networks)
         links = {
             f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
             for partial in LinkState
@@ -461,11 +473,11 @@ class Predictor(Shown):
             return LinkPrediction.of_parts(*evaluate_paper(networks, features, self.settings.frequency_hz))
         if self.reads_maps:
             _require_windows(features)
-        frequency_hz, context = self.settings.frequency_hz, context_of(features)
+        context = context_of(features)
         read = _map_reader(self.model) if self.reads_maps else None
-        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, frequency_hz, read))
-        if context.nearly_complete.any():
-            traced = LinkPrediction.of_nearly_complete(features, frequency_hz)
+        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings, read))
+        if context.nearly_complete.any() and not self.settings.through_walls:
+            traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
             trust = 1.0 - (1.0 - NOISY_TRUST) * excess_noise(context.wall_noise)
             mixed = LinkPrediction.mixture([traced, prediction], np.stack([trust, 1.0 - trust]))
             prediction = prediction.where(context.nearly_complete, mixed)

@@ -1,8 +1,9 @@
 """Prediction from a trace through walls: what walls that were not seen take from its gains.
 
 The shipped networks were trained on opaque walls at 28 GHz, and know nothing of gains behind walls. Here the gain falls
-by the loss of a wall times the number of walls that unobserved space has on a direct line, on average. The constants
-were fitted to 14 procedural homes at 5 GHz, of drywall and of brick; `benchmarks/unseen_walls.py` measures others.
+by the mean loss of the known walls times the number of walls that unobserved space has on a direct line, on average.
+The constants were fitted to 14 procedural homes at 5 GHz, of drywall and of brick; `benchmarks/unseen_walls.py`
+measures others.
 """
 
 import numpy as np
@@ -10,10 +11,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.map_networks import context_of
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.scene.scene import constants_of
-from sionna_partial.settings import Material
-from sionna_partial.tracing.slab import transmission_coefficients
 
 WALL_LOSSES = "the mean loss of unobserved walls"
 """Stands for the predictor's name in coverage maps."""
@@ -33,23 +32,13 @@ LOS_GAIN_DB, SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 1.0, 0.5, 0.4, 0.45
 """By how much unseen reflections add to a link with LOS, for the square root of a metre; standard deviations of gains
 whose direct line is observed, and of links with LOS likewise [dB]; and of all other links, in losses of a wall [1]."""
 
-_ANGLES_DEG = np.arange(0.0, 61.0, 10.0)
-"""Angles of incidence over which the loss of a wall is averaged."""
 
-
-def wall_loss_db(material: Material, frequency_hz: float) -> float:
-    """Return the mean loss of a wall [dB] for vertical antennas at angles of incidence up to 60 degrees."""
-    permittivity, conductivity_s_m = constants_of(material, frequency_hz)
-    cosine = np.cos(np.radians(_ANGLES_DEG))
-    te, _ = transmission_coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
-    return float(np.mean(-20.0 * np.log10(np.maximum(np.abs(te), 1e-8))))
-
-
-def predict_through_walls(phi: LinkFeatures, wall_loss_db: float) -> LinkPrediction:
-    """Predict links (N,) from features of a trace through walls, each of which loses `wall_loss_db` [dB].
+def predict_through_walls(phi: LinkFeatures) -> LinkPrediction:
+    """Predict links (N,) from features of a trace through walls, which have a context.
 
     A link that is traced in line of sight has LOS the rarer, the longer its direct line is unobserved.
     """
+    wall_loss_db = context_of(phi).wall_loss_db
     unseen_m, los = phi.unobserved_distance_m, phi.link_state == LinkState.LOS
     root_m = np.sqrt(unseen_m)
     p_los = np.where(los, 1.0 / (1.0 + (unseen_m / LOS_RANGE_M) ** LOS_FALL), 0.0)
