@@ -141,4 +141,4 @@ def test_a_predictor_for_walls_that_let_waves_through() -> None:
     with pytest.raises(PredictorError, match=r"frequency_hz\[0\] = 0 is not allowed: give frequencies in Hz"):
         replace(links.features, frequency_hz=np.zeros(len(links)))
     with pytest.raises(SettingsError, match="links through walls have no gradients"):
-        sp.DifferentiableScene(half_seen(), fits[0])
+        sp.DifferentiableScene(half_seen(), predictor=fits[0])
