@@ -2,8 +2,8 @@
 
 The shipped networks were trained on opaque walls at 28 GHz, and know nothing of gains behind walls. Here the gain falls
 by the mean loss of the known walls times the number of walls that unobserved space has on a direct line, on average.
-The constants were fitted to 14 procedural homes at 5 GHz, of drywall and of brick; `benchmarks/unseen_walls.py`
-measures others.
+The constants were fitted to procedural homes at 5 GHz, of drywall and of brick, and to procedural floors and halls;
+`benchmarks/unseen_walls.py` measures others.
 """
 
 import numpy as np
@@ -21,14 +21,18 @@ LOS_RANGE_M, LOS_FALL = 2.2, 2.2
 """Unobserved length at which a link that is traced in line of sight has LOS in half of all cases [m], and the exponent
 with which that falls beyond."""
 
-FIRST_WALLS, WALLS_PER_M = 0.6, 0.17
-"""Walls that a link loses which turns out to have no LOS, and those on each unobserved metre of its direct line."""
+WALLS_RANGE_M = 10.0
+"""Unobserved length from which on walls add little [m]: other paths than the direct one are the strongest there."""
 
-HIDDEN_WALLS_PER_M, HIDDEN_FROM_M = 0.16, 1.5
+FIRST_WALLS, WALLS_PER_M = 0.6, 0.19
+"""Walls that a link loses which turns out to have no LOS, and those on each of the first unobserved metres of its
+direct line."""
+
+HIDDEN_WALLS_PER_M, HIDDEN_FROM_M = 0.18, 1.5
 """Walls on each unobserved metre, beyond the first, of links that are traced without LOS: unseen reflections make up
 for part of them."""
 
-LOS_GAIN_DB, SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 1.0, 0.5, 0.4, 0.45
+LOS_GAIN_DB, SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 1.0, 0.5, 0.4, 0.5
 """By how much unseen reflections add to a link with LOS, for the square root of a metre; standard deviations of gains
 whose direct line is observed, and of links with LOS likewise [dB]; and of all other links, in losses of a wall [1]."""
 
@@ -40,10 +44,11 @@ def predict_through_walls(phi: LinkFeatures) -> LinkPrediction:
     """
     wall_loss_db = context_of(phi).wall_loss_db
     unseen_m, los = phi.unobserved_distance_m, phi.link_state == LinkState.LOS
-    root_m = np.sqrt(unseen_m)
     p_los = np.where(los, 1.0 / (1.0 + (unseen_m / LOS_RANGE_M) ** LOS_FALL), 0.0)
-    hidden = HIDDEN_WALLS_PER_M * np.maximum(unseen_m - HIDDEN_FROM_M, 0.0)
-    walls = np.where(los, FIRST_WALLS + WALLS_PER_M * unseen_m, hidden)
+    walled_m = WALLS_RANGE_M * np.log1p(unseen_m / WALLS_RANGE_M)
+    root_m = np.sqrt(walled_m)
+    hidden = HIDDEN_WALLS_PER_M * np.maximum(walled_m - HIDDEN_FROM_M, 0.0)
+    walls = np.where(los, FIRST_WALLS + WALLS_PER_M * walled_m, hidden)
     mean_db = np.maximum(phi.gain_db - wall_loss_db * walls, GAIN_FLOOR_DB)
     p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
     los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root_m, 0.0)
