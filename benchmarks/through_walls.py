@@ -11,8 +11,10 @@ import argparse
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import stock_paths, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.plan import crossings
 from sionna_partial.tracing.simulation import checked_settings
 
 REFRACTION = 4
@@ -35,13 +38,13 @@ def main() -> None:
     """Measure, and print a table for each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", type=Path, nargs="*")
-    parser.add_argument("--only", choices=["stock", "time", "wall", "mesh"])
+    parser.add_argument("--only", choices=["stock", "time", "weak", "wall", "mesh"])
     parser.add_argument("--receivers", type=int, default=20, help="of each map, for stock Sionna RT")
     parser.add_argument("--rays", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     maps = dict(_maps(arguments.maps))
-    parts = {"stock": against_stock, "time": relative_time, "wall": one_wall, "mesh": as_meshes}
+    parts = {"stock": against_stock, "time": relative_time, "weak": left_out, "wall": one_wall, "mesh": as_meshes}
     for name, part in parts.items():
         if arguments.only in (None, name):
             part(maps, arguments)
@@ -200,6 +203,26 @@ def relative_time(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace)
             print(
                 f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {len(rx_m)} | {seconds[0]:.1f} | "
                 f"{seconds[1] / seconds[0]:.1f} | {gain} |"
+            )
+
+
+def left_out(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+    """Print what links of 200 receivers lack of their gain with the limits of weak paths, against much lower ones."""
+    print("\n| map | case | paths | paths with low limits | missing [dB]: 50, 90, 99 %, most |")
+    print("|---|---|---|---|---|")
+    for name, partial in maps.items():
+        tx_m, rx_m = ends(partial, 200, arguments.seed)
+        for material, frequency_hz in (*CASES.items(), ("drywall", 2.4e9)):
+            links = []
+            for limits, tolerance_db in (({}, 0.1), ({"_WEAKEST": 1e-5, "RARER": 1.0}, 0.01)):
+                settings = sp.TraceSettings(frequency_hz, refraction=True, power_tolerance_db=tolerance_db)
+                with patch.multiple(crossings, **limits) if limits else nullcontext():
+                    simulation = sp.Simulation(partial, settings, sp.SceneSettings(material=material))
+                    links.append(simulation.links(tx_m, rx_m))
+            missing_db = np.percentile(links[1].gain_db - links[0].gain_db, [50, 90, 99, 100])
+            print(
+                f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {len(links[0].a)} | {len(links[1].a)} | "
+                f"{' / '.join(f'{each:.2f}' for each in missing_db)} |"
             )
 
 
