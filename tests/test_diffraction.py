@@ -61,7 +61,7 @@ class TestFindWedges:
     def test_both_sides_of_a_free_end_are_faces(self) -> None:
         wedges = find_wedges(extrude([[(1.0, 1.0), (2.0, 1.0)]], height_m=2.7), open_ends=False)
         assert wedges.edge_m.tolist() == [[1.0, 1.0], [2.0, 1.0]]
-        assert wedges.height_m == 2.7
+        assert wedges.height_m.tolist() == [2.7, 2.7]
         # The second triangle of a wall has the vertical edge at its first end, the first that at its second end.
         assert wedges.face.tolist() == [[1, 1], [0, 0]] * 2
         up = [0.0, 1.0]

@@ -168,7 +168,7 @@ def test_bends_count_with_so_many_walls_a_side(wedges: Wedges, walls_a_side: int
     """Floor and ceiling are no walls."""
     kinds = np.array([[8, 0, 0], [1, 8, 0], [8, 1, 0], [1, 1, 8], [1, 8, 1], [1, 8, 1]], np.uint8)
     vertices = np.full((6, 3, 3), 1.0)
-    vertices[4, [0, 2], 2] = 0.0, wedges.height_m
+    vertices[4, [0, 2], 2] = 0.0, wedges.height_m[0]
     for path, at in enumerate((kinds == 8).argmax(axis=1)):
         vertices[path, at, :2] = wedges.edge_m[0]
     assert tuple(_counted(wedges, kinds, vertices, walls_a_side)) == expected

@@ -37,9 +37,8 @@ def links_of(seed: int, stage: int, which: int = 0, offset_m: float = 0.0) -> sp
     rng = np.random.default_rng(seed)
     free = np.argwhere(partial.state == sp.CellState.FREE)[:, ::-1]
     places = free[rng.permutation(len(free))[:150]] + rng.uniform(0.2, 0.8, (150, 2))
-    places = places * partial.resolution_m + partial.origin_m
-    places = places[clear_of_walls(partial, places)]
-    points_m = np.column_stack([places, np.full(len(places), 1.5)])
+    points_m = np.column_stack([places * partial.resolution_m + partial.origin_m, np.full(150, 1.5)])
+    points_m = points_m[clear_of_walls(partial, points_m)]
     partial, points_m = transformed(partial, points_m, which, offset_m)
     far = np.linalg.norm(points_m[1:] - points_m[0], axis=1) > 0.1
     return sp.trace_links(partial, points_m[0], points_m[1:][far])
