@@ -32,7 +32,7 @@ from sionna_partial.tracing.mesh.faces import MOST_FACES, faces_between, scratch
 from sionna_partial.tracing.mesh.sequences import Sequences, Views, collect_sequences, lattice, view_sequences
 from sionna_partial.tracing.mesh.split_rays import Fixed, least_needed, split_rays
 from sionna_partial.tracing.mesh.walls import SolidMesh, is_inside, mark_walls, trail
-from sionna_partial.tracing.plan.crossing_beams import USUAL_REFLECTIONS, Limits
+from sionna_partial.tracing.plan.crossing_beams import Limits, rarer_by
 from sionna_partial.tracing.plan.crossings import MOST_REFLECTIONS, RARER, least_power, weakest_needed
 from sionna_partial.tracing.plan.legs import SHORTEST_LEG_M
 from sionna_partial.tracing.plan.slabs import COSINES
@@ -239,7 +239,7 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
     seen, stack, bounds = np.empty(len(fixed.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     for node in nodes:
-        rarer = fixed.limits.rarer ** max(0, views.depth[node] - USUAL_REFLECTIONS)
+        rarer = rarer_by(fixed.limits, views.depth[node])
         reach = REACH * sequences.reach_m[node] + REACH_M
         source = views.source_m[node]
         view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)

@@ -11,7 +11,7 @@ from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.mesh.faces import MOST_FACES, Met, faces_between, scratch
 from sionna_partial.tracing.mesh.sequences import Sequences, find_sequence, rehash
 from sionna_partial.tracing.mesh.walls import SolidMesh, cosine_at, is_one_wall
-from sionna_partial.tracing.plan.crossing_beams import USUAL_REFLECTIONS, Limits
+from sionna_partial.tracing.plan.crossing_beams import Limits, matters, rarer_by
 from sionna_partial.tracing.plan.slabs import COSINES
 
 
@@ -19,12 +19,12 @@ class Least(NamedTuple):
     """What a ray must bring to matter, from receivers (N,) sorted by their distance from the transmitter.
 
     `relative` is the smallest power that matters, relative to free space, to any receiver at least that far away,
-    `power` the smallest to any at most that far away, times (4 pi / wavelength)^2.
+    `near` the smallest to any at most that far away, times (4 pi / wavelength)^2.
     """
 
     distance_m: Floats
     relative: Floats
-    power: Floats
+    near: Floats
 
 
 class Fixed(NamedTuple):
@@ -86,8 +86,8 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
     for axis in range(3):
         end[axis] = a[axis] + far * d[axis]
     own = sequences.plane[node] if node >= 0 else -1
-    rare = limits.rarer ** max(0, depth - USUAL_REFLECTIONS)
-    rarer = limits.rarer ** max(0, depth + 1 - USUAL_REFLECTIONS)
+    rare = rarer_by(limits, depth)
+    rarer = rarer_by(limits, depth + 1)
     stop, start, steep = far, 0.0, 1.0
     for j in range(faces_between(mesh.tree, a, end, own, -1, met)):
         face, t = met.face[j], met.at[j]
@@ -98,7 +98,7 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
             continue
         material = mesh.slabs.material[face]
         after = left * mesh.slabs.most_reflected[material, int(cosine * COSINES)]
-        if depth < limits.reflections and _matters(after * rarer, near, least):
+        if depth < limits.reflections and matters(after * rarer, near, least):
             sequences, loss, child = _add_sequence(sequences, loss, node, mesh.planes.plane[face])
             _reflect(sequences, child, a, d, t * far, mesh.planes, waiting.value[top])
             loss[child] = max(loss[child], after)
@@ -107,21 +107,12 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
             top += 1
         left *= mesh.slabs.most_transmitted[material, int(cosine * COSINES)]
         crossed, start, steep = crossed + 1, t, cosine
-        if crossed > limits.walls or not _matters(left * rare, near, least):
+        if crossed > limits.walls or not matters(left * rare, near, least):
             stop = t * far
             break
     if node >= 0:
         sequences.reach_m[node] = max(sequences.reach_m[node], length + stop)
     return sequences, loss, top
-
-
-@njit(cache=True)
-def _matters(loss, near, least):  # type: ignore[no-untyped-def]
-    """Whether a ray with this loss, which has come this far at least, may matter to any receiver."""
-    at = np.searchsorted(least.distance_m, near)
-    if at < len(least.distance_m) and loss >= least.relative[at]:
-        return True
-    return at > 0 and loss >= least.power[at - 1] * near * near
 
 
 @njit(cache=True)

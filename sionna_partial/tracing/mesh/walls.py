@@ -16,6 +16,7 @@ from sionna_partial.process import njit
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree
 from sionna_partial.tracing.mesh.planes import MeshPlanes
+from sionna_partial.tracing.plan.legs import choose_face
 from sionna_partial.tracing.plan.slabs import Slabs
 
 
@@ -159,7 +160,7 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
             before = met.face[k + 1 if turned else k - 1]
             same = is_one_wall(mesh, before, face, near, far, previous, t)
         if not same:
-            _choose(entries, begin, count, opened, j, turned)
+            choose_face(entries, begin, count, opened, j, turned)
             walls, opened, start, steep = walls + 1, j, t, 1.0
         entry = begin + k
         entries.face[entry], entries.kind[entry] = face, REFRACTION
@@ -167,19 +168,5 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
         for axis in range(3):
             entries.point_m[entry, axis] = a[axis] + met.at[k] * (b[axis] - a[axis])
         previous, steep = t, min(steep, cosine)
-    _choose(entries, begin, count, opened, count, turned)
+    choose_face(entries, begin, count, opened, count, turned)
     return walls
-
-
-@njit(cache=True)
-def _choose(entries, begin, count, first, last, turned):  # type: ignore[no-untyped-def]
-    """Let one of the faces of a wall have its loss: that of the median angle."""
-    for j in range(first, last):
-        own, rank = begin + (count - 1 - j if turned else j), 0
-        for k in range(first, last):
-            other = begin + (count - 1 - k if turned else k)
-            rank += entries.cosine[other] < entries.cosine[own] or (
-                entries.cosine[other] == entries.cosine[own] and k < j
-            )
-        if rank == (last - first) // 2:
-            entries.same_wall[own] = False

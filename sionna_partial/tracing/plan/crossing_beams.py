@@ -308,7 +308,7 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
     """Put the walls between two edges into layers."""
     scratch, building, slabs = layers.clipped, task.building, task.building.slabs
     limits, depth_m, left, crossed = building.limits, building.interior.depth_m, beam.left, beam.crossed
-    rarer, next_rarer = _rarer(limits, task.order), _rarer(limits, task.order + 1)
+    rarer, next_rarer = rarer_by(limits, task.order), rarer_by(limits, task.order + 1)
     t0, t1, ray, next_ray = scratch.edge[i], scratch.edge[i + 1], layers.ray[i], layers.ray[i + 1]
     start_0 = start_1 = steep_0 = steep_1 = first = 0.0
     for j in range(min(active, FACES)):
@@ -325,12 +325,12 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
         layers.wall[i, j], layers.left[i, j], layers.crossed[i, j] = c, 0.0, crossed
         layers.depth[i] = j + 1
         total = beam.reflected * left * (most_through(slabs) if crossed == 0 else 1.0)
-        if not _matters(total * rarer, near, task.needed):
+        if not matters(total * rarer, near, task.needed):
             break
         if task.order < limits.reflections and not _is_solid(building, beam.window, piece):
             flat = near / np.hypot(near, 2.0 * building.room.height_m)
             part = slabs.most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
-            if _matters(part * total * next_rarer, near, task.needed):
+            if matters(part * total * next_rarer, near, task.needed):
                 new = t0, t1, part * beam.reflected, left, crossed
                 windows = _extend(layers, building, c, new, windows)
         low = building.plan.low[piece]
@@ -353,7 +353,7 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _rarer(limits, order):  # type: ignore[no-untyped-def]
+def rarer_by(limits, order):  # type: ignore[no-untyped-def]
     """Return what counts of the power of beams of so many reflections."""
     return limits.rarer ** max(0, order - USUAL_REFLECTIONS)
 
@@ -409,11 +409,11 @@ def _is_needed(beam, order, task):  # type: ignore[no-untyped-def]
     limits, needed = task.building.limits, task.needed
     total = beam.reflected * beam.left * (most_through(task.building.slabs) if beam.crossed == 0 else 1.0)
     near = max(_nearest(beam.window), 1e-6)
-    if not _matters(total * _rarer(limits, order), near, needed):
+    if not matters(total * rarer_by(limits, order), near, needed):
         return False
-    if order < limits.reflections and _matters(total * _rarer(limits, order + 1), near, needed):
+    if order < limits.reflections and matters(total * rarer_by(limits, order + 1), near, needed):
         return True
-    return _reaches(beam.window, near, total * _rarer(limits, order), needed)
+    return _reaches(beam.window, near, total * rarer_by(limits, order), needed)
 
 
 @njit(cache=True)
@@ -428,7 +428,7 @@ def _nearest(beam):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _matters(left, near, needed):  # type: ignore[no-untyped-def]
+def matters(left, near, needed):  # type: ignore[no-untyped-def]
     """Whether a beam that has so much left, and has come this far at least, may matter to any receiver."""
     at = np.searchsorted(needed.distance_m, near)
     if at < len(needed.distance_m) and left >= needed.relative[at]:

@@ -225,7 +225,7 @@ def _group(plan, interior, leg, n, count, trail):  # type: ignore[no-untyped-def
         if same:
             same = not _is_free_between(interior, leg, min(t, previous), max(t, previous))
         if not same:
-            _choose(trail, count, n, begin, j, backwards)
+            choose_face(trail, count, n, begin, j, backwards)
             walls, begin, start, steep = walls + 1, j, t, 1.0
         entry = count + (n - 1 - j if backwards else j)
         trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, cosine
@@ -233,12 +233,12 @@ def _group(plan, interior, leg, n, count, trail):  # type: ignore[no-untyped-def
         trail.points[entry, 0], trail.points[entry, 1] = ax + t * dx, ay + t * dy
         trail.points[entry, 2] = leg.done + t * (leg.stop - leg.done)
         previous, steep = t, min(steep, cosine)
-    _choose(trail, count, n, begin, n, backwards)
+    choose_face(trail, count, n, begin, n, backwards)
     return walls
 
 
 @njit(cache=True)
-def _choose(trail, count, n, begin, end, backwards):  # type: ignore[no-untyped-def]
+def choose_face(trail, count, n, begin, end, backwards):  # type: ignore[no-untyped-def]
     """Let one of the faces of a wall have its loss: that of the median angle, as outlines may be ragged."""
     for j in range(begin, end):
         own, rank = count + (n - 1 - j if backwards else j), 0
