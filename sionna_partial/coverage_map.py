@@ -18,6 +18,7 @@ from sionna_partial.checks import number_of, real_array, require, require_names,
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
@@ -401,7 +402,7 @@ class CoverageAccessor:
             `snr_mean_db`, an outage counting as a path gain of -150 dB, and `snr_std_db`. With interference:
             `network_map`.
         """
-        budget = later("link_budget:LinkBudget")(noise_figure_db, bandwidth_hz)
+        budget = LinkBudget(noise_figure_db, bandwidth_hz)
         return self._level("snr", "dB", self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm)
 
     def rate(
@@ -430,10 +431,10 @@ class CoverageAccessor:
         SettingsError
             For another standard, or a channel that it does not have.
         """
-        budget = later("link_budget:LinkBudget")(noise_figure_db, bandwidth_hz)
+        budget = LinkBudget(noise_figure_db, bandwidth_hz)
         offset_db = self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm
         mean, before = np.zeros(()), 0.0
-        table = later("link_budget:schemes")(standard, bandwidth_hz, float(self._coverage.attrs["frequency_hz"]))
+        table = schemes(standard, bandwidth_hz, float(self._coverage.attrs["frequency_hz"]))
         for snr_db, rate_bit_s in table:
             mean = mean + (rate_bit_s - before) * self._probability_of(snr_db - offset_db)
             before = rate_bit_s
@@ -493,7 +494,7 @@ class CoverageAccessor:
         """Return what is added to path gains, () or (T, 1, 1) [dB]."""
         maps = transmitters_of(self._coverage)
         require_number("rx_gain_db", rx_gain_db, -200.0, 200.0)
-        offset_db = later("link_budget:transmit_powers_dbm")(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
+        offset_db = transmit_powers_dbm(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
         return offset_db[:, None, None] if "tx" in self._coverage.dims else offset_db[0]
 
     def _level(self, name: str, unit: str, offset_db: Floats) -> xr.Dataset:

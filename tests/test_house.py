@@ -55,12 +55,12 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "predictor", "through_walls", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
-    "coverage": ("coverage_map", "link_model", "coverage"),
+    "coverage": ("link_budget", "coverage_map", "link_model", "coverage"),
     "channels": (
         *("responses", "beams", "files"),
         *("joint", "samples"),
     ),
-    "networks": ("link_budget", "network"),
+    "networks": ("network",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
@@ -127,9 +127,6 @@ LATER = {
     "export:save_coverage": "`coverage.radio.save`",
     **dict.fromkeys([f"channels.responses:{name}" for name in ("cir", "cfr", "taps", "spreads")], "`TracedLinks`"),
     "channels.beams:beam_gains": "`TracedLinks.beam_gains`",
-    "link_budget:LinkBudget": "`coverage.radio.snr`",
-    "link_budget:schemes": "`coverage.radio.rate`",
-    "link_budget:transmit_powers_dbm": "`coverage.radio.power`",
 }
 """What `later` imports from later rooms, besides plots, and the method that it is for."""
 
