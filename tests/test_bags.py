@@ -216,6 +216,7 @@ class TestMessages:
             ({}, {"origin_m": (0, 0)}, "resolution_m and origin_m are those of the message"),
             ({"data": [0]}, {}, "data has 1 values for 1 x 2 cells: give the whole message"),
             ({"info": None}, {}, "data is no OccupancyGrid ("),
+            ({"data": [], "width": 0}, {}, "info has 1 x 0 cells: give a map with cells"),
             ({"tilt": 1.0}, {}, "info.origin.orientation = [1.0, 0.0, 0.0, 1.0] is not level: give a yaw alone"),
             ({"tilt": math.nan}, {}, "is not level"),
         ],
@@ -223,6 +224,7 @@ class TestMessages:
     def test_refused(self, change: dict[str, Any], given: dict[str, Any], message: str) -> None:
         grid = Messages(2).grid(SIDE)
         grid.info.origin.orientation.x = change.pop("tilt", 0.0)
+        grid.info.width = change.pop("width", 2)
         for name, value in change.items():
             object.__setattr__(grid, name, value)
         with pytest.raises(MapError, match=re.escape(message)):

@@ -214,6 +214,12 @@ class TestTransmitters:
         heard.live.on_power(-60.0, 10.5)
         assert heard.step() == [(1, True)]
         assert heard[-1].coverage.attrs["measured_links"] == 1
+        heard.live.on_pose(*TX[:2], 20.0)
+        heard.live.on_power(-20.0, 20.0)  # at the transmitter itself
+        heard.live._stepped_s = -math.inf
+        assert heard.step() == [(1, True)]
+        assert heard[-1].coverage.attrs["measured_links"] == 1
+        assert "are not used" not in caplog.text
         for line in ("the robot's position is not known", "is no position", "the transmitters are tx"):
             assert line in caplog.text
 
@@ -255,6 +261,7 @@ class TestListener:
             "door": -60.0,
         }
         listener.take("/radio/request_views", Fields())
+        heard.live.on_pose(6.5, 3.9, 1.0)  # in the wall by an error of the robot's
         heard.step()
         assert isinstance(heard[0], LiveViews)
         assert [*heard[0].message()["poses"][0]] == ["position", "orientation"]

@@ -27,14 +27,14 @@ from sionna_partial.checks import (
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage_map import probability_above
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.bags import OCCUPIED_PERCENT, map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap, grid_array
-from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, grid_array
+from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 COARSER = 4
@@ -435,15 +435,17 @@ class LiveCoverage:
         self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, grid.header, grid.info, age_s))
 
     def _measured(self, name: str) -> Measurements | None:
-        """Return the powers that were measured of a transmitter where no wall is mapped now."""
+        """Return the powers that were measured of a transmitter and can be used on the map of now."""
         with self._changed:
             rows = np.array([*self._powers[name].values()]).reshape(-1, 3)
         if not len(rows):
             return None
         assert self._model is not None
         rx_m = np.column_stack([rows[:, :2], np.full(len(rows), self.settings.rx_height_m)])
-        usable = self._model.partial.radios_can_stand(rx_m)
-        tx_m = self.tx_m[name]
+        partial, tx_m = self._model.partial, self.tx_m[name]
+        usable = partial.radios_can_stand(rx_m)
+        frequency_hz = self._model.simulation.trace_settings.frequency_hz
+        usable[usable] = can_be_used(partial, tx_m[None], rx_m[usable], frequency_hz)
         return Measurements(tx_m, rx_m[usable], rows[usable, 2]) if usable.any() else None
 
     def _compute_views(self) -> None:
@@ -451,9 +453,15 @@ class LiveCoverage:
         grid = self._newest
         assert grid is not None
         tx_m = np.stack([*self.tx_m.values()])
-        start = None if self._pose is None else self._pose[:2]
+        start = None if self._pose is None else _nearest_free(self._model.partial, self._pose[:2])
         views = next_views(self._model, tx_m, start=start, threshold_db=self.settings.threshold_db)
         self._publish(LiveViews(views, grid.header))
+
+
+def _nearest_free(partial: PartialMap, at_m: tuple[float, float]) -> Floats | None:
+    """Return the middle of the nearest free cell [m]: a position in a wall is off by an error of the robot's."""
+    free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
+    return free_m[np.hypot(*(free_m - at_m).T).argmin()] if len(free_m) else None
 
 
 def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Floats]:

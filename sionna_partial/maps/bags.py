@@ -292,6 +292,8 @@ def occupancy_parts(message: Any) -> tuple[NDArray[Any], float, tuple[float, flo
         cells = np.asarray(message.data)
     except (AttributeError, TypeError, ValueError) as error:
         raise MapError(f"data is no OccupancyGrid ({error}): give one with info and data, or an array.") from error
+    if min(size) < 1:
+        raise MapError(f"info has {size[0]} x {size[1]} cells: give a map with cells.")
     if cells.ndim != 1 or len(cells) != size[0] * size[1]:
         raise MapError(f"data has {cells.size} values for {size[0]} x {size[1]} cells: give the whole message.")
     length = float(np.linalg.norm(quaternion))

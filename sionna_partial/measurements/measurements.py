@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import number_of, real_array, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.display import Shown
@@ -385,9 +386,7 @@ def _measured(
             f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
             "those that are near each other."
         )
-    usable = clear_of_walls(partial, measured.rx)
-    for each_m in tx_m:
-        usable &= np.linalg.norm(measured.rx - each_m, axis=1) >= nearest_m(frequency_hz)
+    usable = can_be_used(partial, tx_m, measured.rx, frequency_hz)
     if not usable.any():
         raise MeasurementError(
             f"all {len(measured):,} receivers of the measurements are in walls or at the transmitter: check that their "
@@ -399,6 +398,14 @@ def _measured(
     measured = measured.take(usable)
     partial.require_positions("rx of the measurements", measured.rx, least=0)
     return measured
+
+
+def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> Bools:
+    """Whether receivers (N, 3) [m] are neither in walls nor at one of the transmitters (K, 3) [m]."""
+    usable = clear_of_walls(partial, rx_m)
+    for each_m in tx_m:
+        usable &= np.linalg.norm(rx_m - each_m, axis=1) >= nearest_m(frequency_hz)
+    return usable
 
 
 def _of_transmitter(measured: Measurements, tx_m: NDArray[np.float64]) -> Measurements:
