@@ -222,7 +222,7 @@ class TestFiles:
         monkeypatch.chdir(tmp_path)
         sp.save_map(PARTIAL, "room.yaml")
         window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-        window.session.change("tx2", eirp_dbm=30.0)
+        window.session.change("tx2", eirp_dbm=30.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
         window.session.set(frequency_hz=5.2e9, through_walls=False)
         window.settle()
         names: dict[str, Any] = {}

@@ -4,6 +4,7 @@ import functools
 import html
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from sionna_partial.plots.coverage_viewer import STATES, add_layer, radio_layers
 from sionna_partial.resources import demo_homes
 
 _LAYERS = radio_layers(MOST_TRANSMITTERS)
+_ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
+_AIM = 0.06
 _WALLS = {"": "opaque from 24 GHz on", "opaque": "opaque", "through": "paths go through"}
 _COMPUTED_FOR = {"": "the partial map", "1": "the whole home (truth)"}
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
@@ -145,6 +148,7 @@ class Page:
         self._ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
         self._values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *_LAYERS, *_HOVERED)})
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
+        self._aims = ColumnDataSource({"xs": [], "ys": []})
         self._routes = ColumnDataSource({"xs": [], "ys": []})
         self._poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
         plot: Any = figure(
@@ -174,6 +178,7 @@ class Page:
         plot.multi_line("xs", "ys", source=self._routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
+        plot.multi_line("xs", "ys", source=self._aims, line_color="black", line_width=4)
         points = plot.scatter(
             "x", "y", source=self._points, marker="star", size=24, fill_color="colour", line_color="black"
         )
@@ -235,7 +240,22 @@ class Page:
                 ("x_m", "x [m]", 0.25, None, None),
                 ("y_m", "y [m]", 0.25, None, None),
                 ("z_m", "Height [m]", 0.1, 0, 100),
-                ("eirp_dbm", "EIRP [dBm]", 1, -100, 100),
+                ("eirp_dbm", "Power [dBm]", 1, -100, 100),
+            )
+        }
+        self.pattern = self._on(
+            Select(title="Antenna", name="pattern", options=list[Any](_ANTENNAS.items())),
+            lambda value: self._change_antenna("pattern", value),
+        )
+        self.aims = {
+            name: self._on(
+                Spinner(title=title, name=name, step=5, low=low, high=high, format="0.[0]"),
+                functools.partial(self._change_antenna, name),
+                "value_throttled",
+            )
+            for name, title, low, high in (
+                ("azimuth_deg", "Azimuth [\u00b0]", -360, 360),
+                ("downtilt_deg", "Downtilt [\u00b0]", -90, 90),
             )
         }
         self.walls = self._on(
@@ -292,6 +312,7 @@ class Page:
                 pair(self.chosen, self.name),
                 pair(x, y),
                 pair(z, eirp),
+                pair(self.pattern, *self.aims.values()),
                 pair(
                     self._button("Add", lambda: session.add()),
                     self._button("Remove", lambda: session.remove(session.chosen)),
@@ -354,6 +375,10 @@ class Page:
 
     def _change_field(self, name: str, value: float) -> None:
         self._change(**{name: float(value)})
+
+    def _change_antenna(self, name: str, value: Any) -> None:
+        antenna = self.session.transmitters[self.session.chosen].antenna
+        self._change(antenna=replace(antenna, **{name: value}))
 
     def _set_field(self, name: str, unit: float, value: float) -> None:
         self.session.set(**{name: float(value) * unit})
@@ -424,8 +449,14 @@ class Page:
         self.chosen.options, self.chosen.value = [*names], session.chosen
         self.name.value = session.chosen
         chosen = session.transmitters.get(session.chosen)
-        for name, field in self.fields.items():
-            field.value, field.disabled = (None, True) if chosen is None else (getattr(chosen, name), False)
+        shown = [(self.fields, chosen), (self.aims, chosen and chosen.antenna)]
+        for fields, of in shown:
+            for name, field in fields.items():
+                field.value, field.disabled = (None, True) if of is None else (getattr(of, name), False)
+        self.pattern.value, self.pattern.disabled = chosen.antenna.pattern if chosen else "iso", chosen is None
+        for field in self.aims.values():  # an isotropic antenna points nowhere
+            field.disabled |= self.pattern.value == "iso"
+        self._aims.data = self._aimed()
         self.name.disabled = chosen is None
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
         if self.which.options != options:  # of several, first what a receiver gets
@@ -438,6 +469,17 @@ class Page:
             self.radio[name].value = getattr(settings, name) / unit
         self.walls.value = {None: "", False: "opaque", True: "through"}[settings.through_walls]
         self.python.value = session.python()
+
+    def _aimed(self) -> dict[str, list[list[float]]]:
+        """Return lines from transmitters with a main direction along it [m]."""
+        partial, lines = self.session.partial, []
+        length_m = 0.0 if partial is None else _AIM * partial.resolution_m * max(partial.shape)
+        for each in self.session.transmitters.values():
+            if each.antenna.pattern == "tr38901":
+                angle = math.radians(each.antenna.azimuth_deg)
+                ends = each.x_m + length_m * math.cos(angle), each.y_m + length_m * math.sin(angle)
+                lines.append(([each.x_m, ends[0]], [each.y_m, ends[1]]))
+        return {"xs": [xs for xs, _ in lines], "ys": [ys for _, ys in lines]}
 
     def _options(self, transmitters: int) -> list[Any]:
         return [

@@ -12,7 +12,7 @@ import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
 
@@ -49,6 +49,7 @@ from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.progress import part_of
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.settings import FREQUENCIES_HZ, TraceSettings
+from sionna_partial.tracing.antennas import Antenna
 
 COARSER = 4
 """Distance between the receivers of the first picture, in those of the final one."""
@@ -91,12 +92,13 @@ class _CancelledError(Exception):
 
 @dataclass(frozen=True)
 class Transmitter(Checked):
-    """Where a transmitter stands [m], and its equivalent isotropically radiated power [dBm]."""
+    """Where a transmitter stands [m], its power [dBm], and its antenna, whose gain comes on top."""
 
     x_m: Annotated[float, Within(-1e6, 1e6)]
     y_m: Annotated[float, Within(-1e6, 1e6)]
     z_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
     eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = 20.0
+    antenna: Antenna = field(default_factory=Antenna)
 
     @property
     def position_m(self) -> tuple[float, float, float]:
@@ -270,7 +272,8 @@ class Session:
 
     def _enter(self, name: str, home: PartialMap, seed: int, tx_m: Sequence[float]) -> None:
         self.title, self.home, self.steps, self._seed = name, home, 0, seed
-        self.transmitters, self.chosen, self.measured = {"tx1": Transmitter(*tx_m)}, "tx1", None
+        x_m, y_m, z_m = tx_m
+        self.transmitters, self.chosen, self.measured = {"tx1": Transmitter(x_m, y_m, z_m)}, "tx1", None
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
@@ -343,7 +346,7 @@ class Session:
         x_m, y_m = (o + (n + 0.5) * partial.resolution_m for o, n in zip(partial.origin_m, (column, row), strict=True))
         self.put([*((name, each.x_m, each.y_m) for name, each in self.transmitters.items()), ("", x_m, y_m)])
 
-    def change(self, name: str, new_name: str | None = None, **values: float) -> None:
+    def change(self, name: str, new_name: str | None = None, **values: Any) -> None:
         """Change a transmitter, and its name."""
         require_choice("transmitter", name, self.transmitters)
         new_name = name if new_name is None else new_name.strip()
@@ -406,10 +409,14 @@ class Session:
             self._show()
             return
         tx_m, eirp_dbm = self._tx_m(), np.array([each.eirp_dbm for each in self.transmitters.values()])
+        of_all: dict[str, Any] = {
+            "tx_antenna": [each.antenna for each in self.transmitters.values()],
+            "rx_height_m": settings.rx_height_m,
+        }
 
         def coverage(of: str, where: PartialMap, spacing_m: float, report: Progress, **given: Any) -> xr.Dataset:
             model = self._model(of, where, settings)
-            return model.coverage(tx_m, rx_height_m=settings.rx_height_m, spacing_m=spacing_m, progress=report, **given)
+            return model.coverage(tx_m, spacing_m=spacing_m, progress=report, **of_all, **given)
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             coarse_m = COARSER * settings.spacing_m
@@ -587,6 +594,9 @@ class Session:
         trace += [] if settings.through_walls is None else [f"refraction={settings.through_walls}"]
         given.append(f"trace_settings=sp.TraceSettings({', '.join(trace)})")
         given += ['measurements="measured.csv"'] if self.measured is not None else []
+        antennas = [each.antenna for each in self.transmitters.values()]
+        if any(each != Antenna() for each in antennas):
+            given.append(f"tx_antenna=[{', '.join(f'sp.{each!r}' for each in antennas)}]")
         powers = [each.eirp_dbm for each in self.transmitters.values()]
         lines = ["import sionna_partial as sp", "", *self._python_map, f"tx = {self._tx_m()!r}"]
         lines += ["coverage = sp.predict_map(", "    partial,", "    tx,", *(f"    {each}," for each in given), ")"]
