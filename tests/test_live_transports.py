@@ -99,6 +99,7 @@ class TestDds:
                 robot.kill()
                 live.kill()
         assert live.returncode == 130, errors
+        assert output.startswith(f"waiting for /map of DDS domain {domain['ROS_DOMAIN_ID']}; Ctrl-C ends")
         assert "map 1, tx: coarse after" in output
 
     def test_bytes_that_are_no_message(self, domain: dict[str, str], caplog: pytest.LogCaptureFixture) -> None:

@@ -85,6 +85,7 @@ def live(
     if robot:
         with cleaned_up(getattr(robot, "close", lambda: None)):
             coverage.start()
+            typer.echo(f"waiting for {topics.map} of {robot.source}; Ctrl-C ends")
             robot.listen(coverage)
     else:
         assert bag is not None

@@ -60,7 +60,7 @@ class Dds:
         except DDSException as error:
             remedy = "check CYCLONEDDS_URI and the network interfaces."
             raise SettingsError(f"DDS domain {number} cannot be joined ({error.msg}): {remedy}") from error
-        self.topics = topics
+        self.topics, self.source = topics, f"DDS domain {number}"
         self._readers = [
             (topic, self._reader(topic, kind, latched))
             for topic, kind in topics.types().items()

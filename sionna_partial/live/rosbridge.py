@@ -51,7 +51,8 @@ class Rosbridge:
             good = False
         if not good:
             raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
-        self.url, self.topics, self._names = url, topics, names
+        self.url = self.source = url
+        self.topics, self._names = topics, names
         self._socket: Any = None
         self._last: dict[str, str] = {}
 
