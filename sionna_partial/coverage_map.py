@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from typing import Any
@@ -159,21 +160,26 @@ def link_columns(
     return columns | {"link_state": prediction.link_state, "partial_link_state": phi.link_state}
 
 
+@cache
+def _versions() -> str:
+    """Names and versions of the packages, read once: each look takes memory where a folder of `sys.path` changes."""
+    versions = {}
+    for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return ", ".join(f"{package} {number}" for package, number in versions.items())
+
+
 def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None) -> dict[str, Any]:
     """Global attributes on where the numbers come from; without a model the trace predicts.
 
     No time of day: equal input gives equal files.
     """
     partial, trace_settings = simulation.partial, simulation.trace_settings
-    versions = {}
-    for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
-    source = ", ".join(f"{package} {number}" for package, number in versions.items())
     return {
         "Conventions": "CF-1.11",
         "title": "Predicted radio coverage of a partially observed environment",
-        "source": source,
+        "source": _versions(),
         "history": "sionna_partial.predict_map",
         "references": "Yin et al., Wireless Channel Prediction in Partially Observed Environments",
         "frequency_hz": float(trace_settings.frequency_hz),
