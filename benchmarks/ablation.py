@@ -143,7 +143,7 @@ def parse_arguments() -> argparse.Namespace:
     )
     parser.add_argument("--passes", type=int, default=6, help="how many times the networks see the links")
     parser.add_argument("--homes", type=int, help="of the data set, the first; default: all")
-    parser.add_argument("--test-fraction", type=float, default=0.15, help="share of these homes that is held out")
+    parser.add_argument("--test-fraction", type=float, default=0.15, help="fraction of these homes that is held out")
     parser.add_argument(
         "--also", type=named_predictor, nargs="+", default=[], metavar="NAME=PREDICTOR", help=".keras file, or `map`"
     )

@@ -79,8 +79,8 @@ def lines_of_sight(free: NDArray[np.bool_], cell_m: float, seed: int) -> tuple[N
     rng = np.random.default_rng(seed)
     cells = np.argwhere(free)
     start, end = cells[rng.integers(len(cells), size=(2, LINKS))] + 0.5
-    turn, reach = rng.uniform(0.0, math.tau, LINKS // 2), 25.0 * np.sqrt(rng.random(LINKS // 2)) / cell_m
-    near = start[: LINKS // 2] + reach[:, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)
+    turn, apart = rng.uniform(0.0, math.tau, LINKS // 2), 25.0 * np.sqrt(rng.random(LINKS // 2)) / cell_m
+    near = start[: LINKS // 2] + apart[:, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)
     row, column = np.clip(near, 0, np.subtract(free.shape, 1)).astype(np.intp).T
     fits = free[row, column] & (near >= 0).all(axis=1) & (near < free.shape).all(axis=1)
     start = np.concatenate([start[: LINKS // 2][fits], start[LINKS // 2 :]])

@@ -92,7 +92,7 @@ def score_map(
     seen = [partial.state_at(end_m) == sp.CellState.FREE for end_m in (tx_m, rx_m)]
     both = seen[0][:, None] + 2 * seen[1][None]
     groups = np.array(["no end seen", "transmitter seen", "receiver seen", "both seen"])[both.ravel()]
-    best, heard = best_pairs(true)[0], true.link_state.ravel() != sp.LinkState.OUTAGE
+    best, received = best_pairs(true)[0], true.link_state.ravel() != sp.LinkState.OUTAGE
     clusters = indoor_office_paths(samples, standard[0], rng)
     pairs = {
         METHODS[0]: best_pairs(samples.drawn, DRAWS),
@@ -101,7 +101,7 @@ def score_map(
     }
     for method, draws in zip(METHODS, (drawn, trace[None], *standard), strict=True):
         hits = (
-            among_likeliest(pairs[method], best, heard)
+            among_likeliest(pairs[method], best, received)
             if method in pairs
             else np.full((len(truth), len(NUMBERS)), np.nan)
         )
@@ -193,10 +193,10 @@ def ranked_pairs(links: sp.TracedLinks) -> NDArray[np.intp]:
     return np.concatenate([np.repeat(order[:, [rank]].T, max(NUMBERS) - rank, axis=0) for rank in range(max(NUMBERS))])
 
 
-def among_likeliest(drawn: NDArray[np.intp], best: NDArray[np.intp], heard: NDArray[np.bool_]) -> Floats:
+def among_likeliest(drawn: NDArray[np.intp], best: NDArray[np.intp], received: NDArray[np.bool_]) -> Floats:
     """Whether the best pair of each link (L,) is among the k most frequent ones (L, 4); NaN in an outage."""
     hits = np.full((len(best), len(NUMBERS)), np.nan)
-    for link in np.flatnonzero(heard):
+    for link in np.flatnonzero(received):
         pairs, count = np.unique(drawn[drawn[:, link] >= 0, link], return_counts=True)
         likeliest = pairs[np.argsort(-count, kind="stable")]
         hits[link] = [best[link] in likeliest[:number] for number in NUMBERS]

@@ -27,7 +27,7 @@ def main() -> None:
     """Print a table for each question."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset", type=Path)
-    parser.add_argument("predictors", nargs="*", help="beside the shipped ones")
+    parser.add_argument("predictors", nargs="*", help="in addition to the shipped ones")
     arguments = parser.parse_args()
     links = sp.read_dataset(arguments.dataset)
     links = links.take(~links.anywhere)

@@ -139,15 +139,15 @@ def moved(links: DifferentiableLinks, name: str, step: float) -> NDArray[np.floa
     return getattr(links.base, field_of(name)) + step * direction
 
 
-def changes(scene: DifferentiableScene, paths: PathSet, name: str, reach: float) -> NDArray[np.bool_]:
-    """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within reach."""
+def changes(scene: DifferentiableScene, paths: PathSet, name: str, moved_m: float) -> NDArray[np.bool_]:
+    """Whether paths of more than `CHANGE` of the power to each receiver (N,) appear or vanish within a distance."""
     changed = np.zeros(len(paths.rx_m), dtype=bool)
     if name not in "xyz":
         return changed  # paths are a matter of geometry
-    for step in (-reach, reach):
-        place = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
-        there = scene.simulation.paths(place, paths.rx_m)
-        kept = paths.at(replace(paths.base, tx_m=place))[0]
+    for step in (-moved_m, moved_m):
+        moved = paths.base.tx_m + step * np.eye(3)["xyz".index(name)]
+        there = scene.simulation.paths(moved, paths.rx_m)
+        kept = paths.at(replace(paths.base, tx_m=moved))[0]
         old = np.bincount(paths.path_rx, weights=paths.power, minlength=len(changed))
         gone = np.bincount(paths.path_rx, weights=paths.power * (kept == 0.0), minlength=len(changed))
         fixed = np.bincount(paths.path_rx, weights=kept, minlength=len(changed))

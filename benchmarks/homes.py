@@ -164,7 +164,7 @@ def random_links(
     solid = replace(home, state=np.where(free, sp.CellState.FREE, sp.CellState.UNKNOWN))
     seen = sp.explore(home, (STEPS,), seed=seed)[0]
     missing_m = [
-        np.concatenate([unobserved_lengths_m(partial, place, rx) for place in tx]) for partial in (solid, seen)
+        np.concatenate([unobserved_lengths_m(partial, position, rx) for position in tx]) for partial in (solid, seen)
     ]
     return sp.trace_links(home, tx, rx), np.linalg.norm(rx - tx[:, None], axis=2).ravel(), *missing_m
 

@@ -1,4 +1,4 @@
-"""How alike the states of links are: the constants of `sionna_partial.channels.joint`, on procedural homes.
+"""Correlation of the states of links: the constants of `sionna_partial.channels.joint`, on procedural homes.
 
 A robot explores homes of `make_home`; random links indoors are predicted on what it has seen. Two links are in outage
 together, or without line of sight together, with a probability that follows from their own probabilities and the
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def links_of(seed: int) -> list[tuple[sp.PartialMap, Floats, Floats, Floats, NDArray[np.bool_]]]:
-    """Return maps of a home, ends of links (L, 3), chances of outage and of no LOS (2, L), and what is true of them."""
+    """Return maps of a home, ends of links (L, 3), probabilities of outage and of no LOS (2, L), and the truth."""
     home, found = sp.make_home(seed), []
     rng = np.random.default_rng(seed)
     for partial in sp.explore(home, STEPS, seed):
@@ -53,28 +53,35 @@ def links_of(seed: int) -> list[tuple[sp.PartialMap, Floats, Floats, Floats, NDA
         rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > 0.15]
         truth, known = (sp.trace_links(each, tx_m, rx_m, progress=False) for each in (home, partial))
         prediction = sp.Predictor.load().predict(sp.link_features(partial, known).flat())
-        chances = np.stack([prediction.p_outage, 1.0 - prediction.p_los])
+        probabilities = np.stack([prediction.p_outage, 1.0 - prediction.p_los])
         state = truth.link_state.ravel()
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
-        found.append((partial, *ends, chances, np.stack([state == sp.LinkState.OUTAGE, state != sp.LinkState.LOS])))
+        found.append(
+            (partial, *ends, probabilities, np.stack([state == sp.LinkState.OUTAGE, state != sp.LinkState.LOS]))
+        )
     return found
 
 
-def gain(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats, chances: Floats, truth: NDArray[np.bool_]) -> Floats:
+def gain(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats, probabilities: Floats, truth: NDArray[np.bool_]) -> Floats:
     """Sum of log-likelihoods above independence, and number of pairs, of each group (3, 2)."""
     correlation, sums = joint.JointLatents(partial).correlation(tx_m, rx_m), np.zeros((len(GROUPS), 2))
     rng = np.random.default_rng(0)
-    for chance, true in zip(chances, truth, strict=True):
-        uncertain = np.flatnonzero((chance > UNCERTAIN[0]) & (chance < UNCERTAIN[1]))
+    for probability, true in zip(probabilities, truth, strict=True):
+        uncertain = np.flatnonzero((probability > UNCERTAIN[0]) & (probability < UNCERTAIN[1]))
         pairs = np.array([*itertools.combinations(uncertain, 2)], dtype=np.intp).reshape(-1, 2)
         same = [(each[pairs[:, 0]] == each[pairs[:, 1]]).all(axis=1) for each in (tx_m, rx_m)]
         for group, members in enumerate((same[0], same[1], ~same[0] & ~same[1])):
             a, b = rng.permutation(pairs[members])[:PAIRS].T
-            both = together(chance[a], chance[b], correlation[a, b])
-            options = [(~true[a] & ~true[b], 1 - chance[a] - chance[b] + both), (true[a] & ~true[b], chance[a] - both)]
-            options += [(~true[a] & true[b], chance[b] - both), (true[a] & true[b], both)]
+            both = together(probability[a], probability[b], correlation[a, b])
+            options = [
+                (~true[a] & ~true[b], 1 - probability[a] - probability[b] + both),
+                (true[a] & ~true[b], probability[a] - both),
+            ]
+            options += [(~true[a] & true[b], probability[b] - both), (true[a] & true[b], both)]
             likelihood = np.select(*map(list, zip(*options, strict=True)))
-            alone = np.where(true[a], chance[a], 1 - chance[a]) * np.where(true[b], chance[b], 1 - chance[b])
+            alone = np.where(true[a], probability[a], 1 - probability[a]) * np.where(
+                true[b], probability[b], 1 - probability[b]
+            )
             sums[group] += np.log(np.maximum(likelihood, 1e-4) / alone).sum(), len(a)
     return sums
 

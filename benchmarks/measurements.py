@@ -1,8 +1,8 @@
-"""What measured gains on a robot's way add to predictions on a half-explored home.
+"""What measured gains on a robot's trajectory add to predictions on a half-explored home.
 
-In every home a robot with a camera explores; transmitters and receivers are drawn indoors. Gains at N points on the
-robot's way, equally spaced, or at N random points indoors, are those of the complete home with 2 dB of noise, and at
-most -120 dB is heard. Changes of accuracy and RMSE against the prediction without measurements are means over homes,
+In every home a robot with a camera explores; transmitters and receivers are drawn indoors. Gains at N points on its
+trajectory, equally spaced, or at N random points indoors, are those of the complete home with 2 dB of noise, and at
+most -120 dB is received. Changes of accuracy and RMSE against the prediction without measurements are means over homes,
 with the standard error over homes; homes with fewer than 30 links in a group are left out of it. The calibration error
 of the link state, and the fraction of gains in the 90 % interval, are over all links. Opponents, from the same
 measurements: path loss fitted to them, and the same process with distance alone in place of map and trace. Run it with
@@ -46,8 +46,8 @@ ON_THE_WAY, SPACING_M = 20, 0.6
 
 
 @dataclass(frozen=True)
-class Places:
-    """Links from one transmitter to N places: truth, and what is predicted without measurements."""
+class Linked:
+    """Links from one transmitter to N positions: truth, and what is predicted without measurements."""
 
     rx_m: NDArray[np.float64]
     link_state: NDArray[np.uint8]
@@ -88,7 +88,7 @@ def home_links(home: sp.PartialMap, step: int, count: int, seed: int) -> dict[tu
     links: dict[tuple[str, ...], list[Links]] = defaultdict(list)
     anywhere_m, rx_m = (points(home, partial, number, rng) for number in (max(WAY["anywhere indoors"]), 200))
     for tx_m in points(home, partial, count, rng):
-        receivers, *measured = places(home, partial, tx_m, (rx_m, way_m, anywhere_m))
+        receivers, *measured = linked(home, partial, tx_m, (rx_m, way_m, anywhere_m))
         where = dict(zip(WAY, measured, strict=True))
         seen = bool(partial.state_at(tx_m[None])[0] == sp.CellState.FREE)
         rx_seen = partial.state_at(receivers.rx_m) == sp.CellState.FREE
@@ -119,9 +119,9 @@ def points(home: sp.PartialMap, partial: sp.PartialMap, count: int, rng: np.rand
     return points_m[clear_of_walls(home, points_m) & clear_of_walls(partial, points_m)][:count]
 
 
-def places(
+def linked(
     home: sp.PartialMap, partial: sp.PartialMap, tx_m: NDArray[np.float64], parts: Sequence[NDArray[np.float64]]
-) -> list[Places]:
+) -> list[Linked]:
     """Trace the links of a transmitter to groups of receivers on the home and on the partial map, and predict them."""
     parts = [rx_m[np.linalg.norm(rx_m - tx_m, axis=1) > NEAREST_M] for rx_m in parts]
     rx_m = np.concatenate(parts)
@@ -135,15 +135,15 @@ def places(
         mask[last : last + len(part)] = True
         last += len(part)
         found.append(
-            Places(part, truth.link_state[mask], truth.gain_db[mask], *(each.take(mask) for each in predicted))
+            Linked(part, truth.link_state[mask], truth.gain_db[mask], *(each.take(mask) for each in predicted))
         )
     return found
 
 
 def predictions(
-    partial: sp.PartialMap, tx_m: NDArray[np.float64], where: dict[str, Places], at: Places, rng: np.random.Generator
+    partial: sp.PartialMap, tx_m: NDArray[np.float64], where: dict[str, Linked], at: Linked, rng: np.random.Generator
 ) -> Iterator[tuple[tuple[str, str, str], sp.LinkPrediction]]:
-    """Predictions at some places, by where was measured, how often, and method."""
+    """Predictions at some positions, by where was measured, how often, and method."""
     yield ("nowhere", "0", "prediction"), at.prior
     for name, numbers in WAY.items():
         known = where[name]
@@ -162,11 +162,11 @@ def predictions(
             slope, start = np.polyfit(log_m[0], heard_db, 1)
             fitted = np.clip(start + slope * log_m[1], -150.0, 0.0)
             ones = np.ones(len(fitted))
-            heard = fitted > SENSITIVITY_DB
+            received = fitted > SENSITIVITY_DB
             yield (
                 (name, str(number), "path-loss fit"),
                 sp.LinkPrediction.of_parts(
-                    np.stack([~heard, 0 * ones, heard]),
+                    np.stack([~received, 0 * ones, received]),
                     np.stack([-150 * ones, fitted, fitted]),
                     np.zeros((3, len(ones))),
                 ),
@@ -216,11 +216,11 @@ def unknown_transmitters(homes: list[tuple[str, sp.PartialMap]], step: int, coun
         gains_db = sp.trace_links(home, tx_m, places_m, progress=False).gain_db
         gains_db = np.maximum(gains_db + NOISE_DB * rng.standard_normal(gains_db.shape), SENSITIVITY_DB)
         predict = prediction_from(partial)
-        heard = [sp.Measurements(None, places_m, each, sensitivity_db=SENSITIVITY_DB) for each in gains_db]
-        for truth_m, measured in zip(tx_m, heard, strict=True):
+        measured = [sp.Measurements(None, places_m, each, sensitivity_db=SENSITIVITY_DB) for each in gains_db]
+        for truth_m, known in zip(tx_m, measured, strict=True):
             seen = partial.state_at(truth_m[None])[0] == sp.CellState.FREE
-            found.append([seen, *position_errors(partial, measured, truth_m, predict)])
-        coverages.append(coverage_errors(home, partial, tx_m[0], heard[0]))
+            found.append([seen, *position_errors(partial, known, truth_m, predict)])
+        coverages.append(coverage_errors(home, partial, tx_m[0], measured[0]))
         print(f"{name} done: {np.mean(found, axis=0).round(2)} {np.mean(coverages, axis=0).round(3)}", flush=True)
     print(
         "| transmitter | posterior | strongest | path-loss fit | in the 90 % region | its area |\n" + "|---" * 6 + "|"
@@ -238,7 +238,7 @@ def unknown_transmitters(homes: list[tuple[str, sp.PartialMap]], step: int, coun
 
 
 def prediction_from(partial: sp.PartialMap) -> Predict:
-    """Links from a place, predicted once for all transmitters."""
+    """Links from a position, predicted once for all transmitters."""
     model, kept = sp.Predictor.load(), {}
 
     def predict(place_m, points_m):

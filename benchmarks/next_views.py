@@ -135,11 +135,11 @@ def uncertainty_shown(home: Home, robot: Robot, frontiers: list[Frontier], lines
             values.append((entropy * shown[at[:, 1], at[:, 0]]).sum())
             continue
         only = sp.PartialMap(np.where(shown, 2, 0).astype(np.uint8), cell_m, partial.origin_m, partial.wall_height_m)
-        told = 0.0
+        gained = 0.0
         for tx_m, of_tx, unobserved_m in zip(home.tx_m, entropy, phi.unobserved_distance_m, strict=True):
             revealed = np.minimum(unobserved_lengths_m(only, np.broadcast_to(tx_m, rx_m.shape), rx_m), unobserved_m)
-            told += (of_tx * revealed / np.maximum(unobserved_m, 1e-3)).sum()
-        values.append(told)
+            gained += (of_tx * revealed / np.maximum(unobserved_m, 1e-3)).sum()
+        values.append(gained)
     return np.array(values)
 
 

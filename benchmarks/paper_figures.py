@@ -358,8 +358,8 @@ def ends_table(ends: list[Ends]) -> str:
 def require_both_ends(ends: list[Ends]) -> None:
     """Fail unless the predictions interpolate."""
     for each in ends:
-        alike = max(each.spread_of_probabilities, each.spread_of_gains_db) <= ROUNDING
-        if not alike or each.accuracy != 1.0 or each.rmse_db != 0.0:
+        equal = max(each.spread_of_probabilities, each.spread_of_gains_db) <= ROUNDING
+        if not equal or each.accuracy != 1.0 or each.rmse_db != 0.0:
             raise SystemExit(f"{each.home}: the prediction does not interpolate, {each}")
     print("both ends hold in all test homes")
 

@@ -1,7 +1,7 @@
-"""Trace of what a robot knows beside the trace of the whole home, for the shipped homes at every stage of exploration.
+"""Trace of a robot's map against the trace of the whole home, for the shipped homes at every stage of exploration.
 
 Links run from each home's transmitter to a grid of receivers inside it. Per home and stage: how far the two traces
-agree in link state and gain, what the features say, and how long each trace takes (the best of three after a warm-up).
+agree in link state and gain, the features, and how long each trace takes (the best of three after a warm-up).
 Run it with
 
     python benchmarks/partial_vs_full.py --out benchmark-output

@@ -1,6 +1,6 @@
 """Analogues against a learned generator of the paths that a partial map does not show.
 
-`sample_channels` takes such paths from links of procedural homes that are alike (`PathModel.analogues`). Here a
+`sample_channels` takes such paths from similar links of procedural homes (`PathModel.analogues`). Here a
 recurrent network learns to write them from the same homes: path after path in order of power, each a mixture of
 Gaussians of power, delay and angles given the link and the paths before it. Both serve the same draws, scored as in
 `channel_samples.py`. Run
@@ -85,7 +85,7 @@ class Generator(PathModel):
 
 
 def condition(state: sp.LinkState, keys: Floats) -> Floats:
-    """Return what the network knows of links (L, 8)."""
+    """Return the inputs (L, 8) of the network."""
     flags = np.tile([float(state == each) for each in STATES], (len(keys), 1))
     return np.hstack([keys / [3.0, 3.0, 3.0, 1.0, 1.0, 1.0], flags])
 

@@ -159,7 +159,7 @@ class Floor:
         offset_db: float,
         others: Sequence[Assimilation],
     ) -> dict[str, float]:
-        """Return the error of each method, and what the prediction says of its own, with some points given."""
+        """Return the error of each method, and the predicted one of the prediction, with some points given."""
         known, rest = order[:number], order[number:]
         rows, free_db = self.links[tx], self.free_db[tx]
         power, rx_m = rows[:, 6], rows[:, 3:6]

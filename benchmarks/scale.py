@@ -66,11 +66,11 @@ def buildings(maps: Iterable[Path]) -> None:
     print(HEAD)
     for name in ("hall", "half hall", *maps):
         isolated(measure, str(name), RECEIVERS)
-    row = isolated(place)
+    row = isolated(placement)
     print(f"\nplace_transmitter on half the hall: {row['seconds']:.1f} s, {row['memory_gb']:.2f} GB")
 
 
-def place() -> dict:
+def placement() -> dict:
     """Time the placement of a transmitter on half the hall."""
     start = time.perf_counter()
     sp.place_transmitter(hall(half=True))
@@ -89,9 +89,9 @@ def measure(name: str, count: int) -> dict:
     """Predict one map with about so many receivers, warm, and print a row."""
     partial = named_map(name)
     free = np.argwhere(partial.state == CellState.FREE)
-    place = free[len(free) // 2]
+    middle = free[len(free) // 2]
     distance = ndimage.distance_transform_edt(partial.state == CellState.FREE)
-    near = np.abs(free - place).sum(axis=1) < 3.0 / partial.resolution_m
+    near = np.abs(free - middle).sum(axis=1) < 3.0 / partial.resolution_m
     row, column = max(free[near], key=lambda cell: distance[tuple(cell)])
     tx = np.array(partial.origin_m) + (np.array([column, row]) + 0.5) * partial.resolution_m
     known = (partial.state != CellState.WALL).sum() * partial.resolution_m**2

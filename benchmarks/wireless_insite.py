@@ -80,7 +80,7 @@ def main() -> None:
     parser.add_argument("--receivers", type=int, default=100, help="for each transmitter (default: %(default)s)")
     parser.add_argument("--transmitters", type=int, default=10, help="of each home, at most (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="of the receivers that are drawn (default: %(default)s)")
-    parser.add_argument("--orders", action="store_true", help="tell instead which kinds of paths it has")
+    parser.add_argument("--orders", action="store_true", help="print instead which kinds of paths it has")
     arguments = parser.parse_args()
     folders = sorted(path.parent for path in arguments.homes.glob("*/links.csv.gz"))
     if not folders:

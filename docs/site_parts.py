@@ -1,4 +1,4 @@
-"""What the site needs beside Sphinx: its contents, the list of public names, equations without a network, figures."""
+"""Parts of the site besides Sphinx: its contents, the list of public names, equations without a network, figures."""
 
 import ast
 import shutil

@@ -2,7 +2,7 @@
 What are the walls made of?
 ===========================
 
-The walls of a home are of a material that nobody told us; measured path gains of some links determine how they reflect.
+The walls of a home are of an unknown material; measured path gains of some links determine how they reflect.
 Here the measurements are made up: the gains that a hidden material gives, with 3 dB of noise. `calibrate_materials`
 gets the map and the noisy gains alone.
 """

@@ -2,7 +2,7 @@
 Coverage at 2.4, 5, 28 and 60 GHz
 =================================
 
-Below 24 GHz paths go through walls, from there on walls are opaque, unless the settings say otherwise. Here one
+Below 24 GHz paths go through walls, from there on walls are opaque, unless set otherwise. Here one
 transmitter covers the shipped apartment, whose walls are of drywall, at four bands. The map is complete, so the trace
 is the prediction.
 """
@@ -16,7 +16,7 @@ apartment = sp.load_map(scenes_folder() / "apartment" / "complete")
 TX_M = (7.0, 9.8, 2.0)
 
 # %%
-# All that differs is the frequency; `refraction` would say it outright.
+# All that differs is the frequency; `refraction` sets it explicitly.
 
 coverages = {
     f"{band_ghz:g} GHz": sp.predict_map(

@@ -20,7 +20,7 @@ for i, (state, gain_db) in enumerate(zip(links.link_state, links.gain_db, strict
 assert links.link_state.tolist() == [sp.LinkState.LOS, sp.LinkState.NLOS]
 
 # %%
-# The power of each path against its delay. Sionna RT's codes tell what happens on the path: 1 is a reflection, 8 a
+# The power of each path against its delay. Sionna RT's codes give the interactions of the path: 1 is a reflection, 8 a
 # diffraction.
 
 DIFFRACTION = 8

@@ -48,7 +48,7 @@ _OF_ALL = ("observed", "cell_state", "wall_parts")
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
-"""Attributes that are needed beside the position of the transmitter, and what they are above."""
+"""Attributes that are needed with the position of the transmitter, and what they are above."""
 
 _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
 """Values of probabilities, gains, standard deviations and lengths; reflections may take near links past 0 dB."""

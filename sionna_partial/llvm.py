@@ -58,7 +58,7 @@ def choose_llvm() -> None:
 def load_llvm() -> LlvmLibrary:
     """Return the LLVM library that `DRJIT_LIBLLVM_PATH` names, or pip's, which Dr.Jit is to be started with.
 
-    Call it before importing mitsuba, drjit or sionna. Raises a BackendError that says what to do if there is no
+    Call it before importing mitsuba, drjit or sionna. Raises a BackendError with the remedy if there is no
     library, or none that works; if the process is a fork of one that called it; or if its working directory was
     deleted, on which native libraries abort.
     """

@@ -115,7 +115,7 @@ def network_map(
     require_whole("seed", seed, 0, 2**63)
     valid: Bools = np.all(coverage["valid"].to_numpy(), axis=0)
     if not valid.any():
-        raise SettingsError("coverage has no place where a receiver of every transmitter can stand.")
+        raise SettingsError("coverage has no position at which receivers of all transmitters can stand.")
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
     rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
     tx_m = np.stack([coverage[name].to_numpy() for name in TX_COORDINATES], axis=1)
@@ -160,7 +160,7 @@ def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[A
     """Variables of receivers from their draws (n, T, N)."""
     power_mw = 10.0 ** (received_dbm / 10.0)
     best_mw, best = power_mw.max(axis=1), power_mw.argmax(axis=1)
-    heard = best_mw > 0.0
+    received = best_mw > 0.0
     noise_mw = 10.0 ** (budget.noise_dbm / 10.0)
     sinr = best_mw / (noise_mw + budget.load * (power_mw.sum(axis=1) - best_mw))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -168,16 +168,16 @@ def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[A
         next_mw = np.sort(power_mw, axis=1)[:, -2] if power_mw.shape[1] > 1 else np.zeros_like(best_mw)
         margin_db = 10.0 * np.log10(best_mw / np.maximum(next_mw, noise_mw))
     count = power_mw.shape[1]
-    p_best = np.stack([((best == number) & heard).mean(axis=0) for number in range(count)])
+    p_best = np.stack([((best == number) & received).mean(axis=0) for number in range(count)])
     return {
-        "best_server": np.where(heard.any(axis=0), p_best.argmax(axis=0), -1).astype(np.int16),
+        "best_server": np.where(received.any(axis=0), p_best.argmax(axis=0), -1).astype(np.int16),
         "p_best": p_best,
-        "p_all_outage": (~heard).mean(axis=0),
+        "p_all_outage": (~received).mean(axis=0),
         "sinr_mean_db": sinr_db.mean(axis=0),
         "sinr_p10_db": np.percentile(sinr_db, 10.0, axis=0),
         "p_sinr_above": (sinr_db > budget.sinr_threshold_db).mean(axis=0),
         "rate_bit_s": budget.bandwidth_hz * np.log2(1.0 + sinr).mean(axis=0),
-        "handover_margin_db": np.where(heard, np.maximum(margin_db, 0.0), 0.0).mean(axis=0),
+        "handover_margin_db": np.where(received, np.maximum(margin_db, 0.0), 0.0).mean(axis=0),
     }
 
 

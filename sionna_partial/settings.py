@@ -41,7 +41,7 @@ FREQUENCIES_HZ = (1e6, 1e12)
 """Lowest and highest carrier frequency [Hz]."""
 
 OPAQUE_FROM_HZ = 24e9
-"""Frequency from which on walls are opaque unless settings say otherwise [Hz]."""
+"""Frequency from which on walls are opaque unless set otherwise [Hz]."""
 
 HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
 """Kinds of procedural homes; the last three are large."""

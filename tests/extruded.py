@@ -55,7 +55,7 @@ def extrude(
     """Extrude walls (S, 2, 2), which meet where their ends are equal, over rectangles of floor."""
     ends = np.reshape(np.asarray(walls_m, dtype=float), (-1, 2))
     vertices_m, index = np.unique(ends, axis=0, return_inverse=True)
-    is_open = [any(np.allclose(vertex, place) for place in open_ends_m) for vertex in vertices_m]
+    is_open = [any(np.allclose(vertex, end) for end in open_ends_m) for vertex in vertices_m]
     return SceneGeometry(
         vertices_m=vertices_m,
         segments=index.reshape(-1, 2).astype(np.int64),
@@ -147,27 +147,24 @@ def specular_lengths_m(
     for chain in chains_between(geometry.walls_m, tx_m[:2], rx_m[:2], max_depth, margin_m):
         points = points_of(geometry.walls_m, chain, tx_m[:2], rx_m[:2], margin_m)
         way = np.cumsum([0.0, *(np.hypot(*(b - a)) for a, b in itertools.pairwise(points))])
-        for climb, flats in climbs_m(geometry, tx_m[2], rx_m[2], max_depth - len(chain)):
-            length = np.hypot(way[-1], climb)
+        for rise, flats in heights_m(geometry, tx_m[2], rx_m[2], max_depth - len(chain)):
+            length = np.hypot(way[-1], rise)
             if np.diff(np.sort([*(way / way[-1]), *flats])).min() * length >= shortest_m:
                 lengths.append(length)
     return np.sort(lengths)
 
 
-def climbs_m(geometry: SceneGeometry, low_m: float, high_m: float, bounces: int) -> list[tuple[float, Floats]]:
-    """Unfolded differences in height [m] with at most `bounces` off floor and ceiling, and where those are on the way.
-
-    Where: shares (B,) of the way.
-    """
+def heights_m(geometry: SceneGeometry, low_m: float, high_m: float, bounces: int) -> list[tuple[float, Floats]]:
+    """Unfolded differences in height [m] with at most `bounces` off floor and ceiling; fractions (B,) of the path."""
     height_m = geometry.height_m
-    climbs = [(abs(high_m - low_m), np.zeros(0))]
-    mirrors = [0.0] * (geometry.floor_face >= 0) + [height_m] * (geometry.ceiling_face >= 0)
-    for first in mirrors:
-        for count in range(1, min(bounces, 1 if len(mirrors) == 1 else bounces) + 1):
+    heights = [(abs(high_m - low_m), np.zeros(0))]
+    planes = [0.0] * (geometry.floor_face >= 0) + [height_m] * (geometry.ceiling_face >= 0)
+    for first in planes:
+        for count in range(1, min(bounces, 1 if len(planes) == 1 else bounces) + 1):
             last = first if count % 2 else height_m - first
             legs = [abs(low_m - first), *[height_m] * (count - 1), abs(high_m - last)]
-            climbs.append((sum(legs), np.cumsum(legs)[:-1] / sum(legs)))
-    return climbs
+            heights.append((sum(legs), np.cumsum(legs)[:-1] / sum(legs)))
+    return heights
 
 
 def everything(receivers: int) -> Strengths:

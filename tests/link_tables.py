@@ -74,5 +74,5 @@ def assert_same(first, second):
 
 
 def fitted_baselines():
-    """Return baselines that say something, without training."""
+    """Return baselines with plausible values, without training."""
     return Baselines(Majority((0.3, 0.3, 0.4), (-150.0, -65.0, -85.0), (0.0, 6.0, 10.0)), quick_predictor())

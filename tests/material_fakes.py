@@ -29,7 +29,9 @@ class FakePaths:
         self, permittivity: NDArray[np.float64], conductivity_s_m: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         at = np.concatenate([permittivity, conductivity_s_m])
-        ends = [[self.power(place[:1], place[1:]) for place in (at + move, at - move)] for move in np.eye(2) * 1e-6]
+        ends = [
+            [self.power(position[:1], position[1:]) for position in (at + move, at - move)] for move in np.eye(2) * 1e-6
+        ]
         slopes = np.stack([(high - low) / 2e-6 for high, low in ends], axis=1)
         return self.power(permittivity, conductivity_s_m), slopes
 

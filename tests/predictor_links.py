@@ -23,7 +23,7 @@ OUTAGE, LOS, NLOS = LinkState.OUTAGE, LinkState.LOS, LinkState.NLOS
 
 
 def make_links(count, seed=0):
-    """Return features, and truth from a known model: links are as the partial trace says where all was seen."""
+    """Return features, and truth from a known model: links are as in the partial trace where all was seen."""
     rng = np.random.default_rng(seed)
     distance_m = rng.uniform(0.5, 15.0, count)
     unobserved_m = distance_m * rng.uniform(0.0, 1.0, count)
@@ -69,7 +69,7 @@ def make_context(phi):
     count = len(phi)
     tx_m = np.tile([0.0, 0.0, 1.5], (count, 1))
     linked, crossed_m = phi.link_state != OUTAGE, phi.unobserved_distance_m
-    kept = np.stack([np.exp(-crossed_m / reach) if reach else crossed_m < 1e-3 for reach in ATTENUATION_LENGTHS_M]).T
+    kept = np.stack([np.exp(-crossed_m / length) if length else crossed_m < 1e-3 for length in ATTENUATION_LENGTHS_M]).T
     power = 10.0 ** ((phi.gain_db - 6.0 * (phi.link_state == LOS)) / 10.0) * linked
     return LinkContext.on_maps(
         corridors(),

@@ -1,4 +1,4 @@
-"""Measured gains change predictions where they tell something, and nothing else."""
+"""Measured gains change correlated predictions, and no others."""
 
 import functools
 import logging
@@ -122,7 +122,7 @@ def test_priors_are_of_the_measured_links():
 
 
 def test_what_measurements_have_in_common_is_an_offset():
-    """Powers in dBm, with transmit power and antenna gains, tell as much as path gains do."""
+    """Powers in dBm, with transmit power and antenna gains, give the same as path gains."""
     gains_db = np.where(LEFT[:, 0] > 2.5, -90.0, -98.0)
     truth, shifted = fitted(LEFT, gains_db, p_outage=0.0), fitted(LEFT, gains_db + 60.0, p_outage=0.0)
     assert abs(truth.offset_db) < 1.0

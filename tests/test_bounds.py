@@ -51,7 +51,7 @@ def _diffracted(arrival: float, departure: float, exterior: float = 1.5 * np.pi,
 
 class TestDiffraction:
     def test_at_its_shadow_boundary_a_term_is_half_the_incident_field(self) -> None:
-        """That is n sqrt(2 pi kL) / 2 n in either direction, and terms change little beside it."""
+        """That is n sqrt(2 pi kL) / 2 n in either direction, and terms change little next to it."""
         half, step = 0.5 * np.sqrt(np.pi) * 20.0, 1e-6
         for side in (step, -step):
             assert abs(_diffracted(0.7, 0.7 + np.pi + side)) == pytest.approx(half, rel=0.05)
@@ -125,7 +125,7 @@ def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance
         "############ #..........# #.##..#....# #....#.....# #.#....##..# #..#...#...# #..........# ############", 0.6
     )
     tx, rx = (1.3, 1.2, 1.5), [[x, y, 1.4] for x in (0.9, 2.3, 3.8, 5.2, 6.3) for y in (0.8, 2.1, 3.5, 4.0)]
-    rx = [place for place in rx if plan.state_at(np.array([place]))[0] == 0]
+    rx = [each for each in rx if plan.state_at(np.array([each]))[0] == 0]
     every, some = (
         sp.trace_links(plan, tx, rx, trace_settings=sp.TraceSettings(power_tolerance_db=each))
         for each in (0.0, tolerance_db)

@@ -39,7 +39,7 @@ FLAT = flat()
 TX = np.array([[1.03, 1.02, 1.4], [6.91, 0.93, 1.6]])
 
 
-def places(count: int = 60) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def positions(count: int = 60) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     rng = np.random.default_rng(3)
     rx = rng.uniform([0.3, 0.3, 1.0], [7.7, 4.7, 2.0], (count, 3))
     rx[np.abs(rx[:, 0] - 4.05) < 0.15, 0] += 0.4
@@ -47,7 +47,7 @@ def places(count: int = 60) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def measured(scene: sp.PartialMap = FLAT, hidden: sp.Material | None = HIDDEN, noise_db: float = 1.0) -> dict:
-    tx, rx = places()
+    tx, rx = positions()
     settings = None if hidden is None else sp.SceneSettings(material=hidden)
     links = sp.trace_links(scene, TX, rx, trace_settings=SETTINGS, scene_settings=settings)
     gain_db = links.gain_db[np.arange(len(rx)) % 2, np.arange(len(rx))]
@@ -113,7 +113,7 @@ class TestHiddenMaterial:
     def test_scene_predicts_with_it(self, result: sp.MaterialCalibration) -> None:
         assert result.scene == replace(FLAT, material=result.materials[0])
         assert result.materials[0] == sp.Material(result.permittivity, result.conductivity_s_m, THIN_M)
-        links = sp.trace_links(result.scene, TX[0], places()[1][::2], trace_settings=SETTINGS)
+        links = sp.trace_links(result.scene, TX[0], positions()[1][::2], trace_settings=SETTINGS)
         np.testing.assert_allclose(links.gain_db, result.gain_after_db[::2], atol=0.3)
 
     def test_record_is_plain(self, result: sp.MaterialCalibration) -> None:
@@ -160,7 +160,7 @@ class TestWhatCannotBeDetermined:
     )
     def test_nothing_reflects(self, cell: int, message: str) -> None:
         field = sp.PartialMap(np.full((50, 80), cell, dtype=np.uint8), 0.1)
-        tx, rx = places(20)
+        tx, rx = positions(20)
         with pytest.raises(MeasurementError, match=message):
             sp.calibrate_materials(
                 field, {"tx": tx, "rx": rx, "gain_db": np.full(20, -70.0)}, trace_settings=sp.TraceSettings(max_depth=0)
@@ -225,7 +225,7 @@ class TestWrongArguments:
         ],
     )
     def test_positions_that_are_impossible(self, changes: dict[str, object], message: str) -> None:
-        tx, rx = places()
+        tx, rx = positions()
         arrays = {"tx": tx, "rx": rx, "gain_db": np.full(60, -80.0)}
         for name, value in changes.items():
             arrays[name] = arrays[name].copy()
@@ -234,7 +234,7 @@ class TestWrongArguments:
             calibrate(arrays)
 
     def test_links_without_length(self) -> None:
-        tx, _ = places()
+        tx, _ = positions()
         message = r"rx\[0\] = \(1.03, 1.02, 1.4\) is 0 m from its transmitter, where .* links shorter than 0.011 m"
         with pytest.raises(MeasurementError, match=message):
             calibrate({"tx": tx, "rx": tx, "gain_db": np.full(60, -80.0)})

@@ -40,7 +40,7 @@ def corridor(length=30, wall_at=20):
     st.integers(0, 35),
 )
 def test_rays_pass_no_corner_where_two_walls_meet(state, cell, part, tens):
-    """All free cells that are seen hang together by their edges, and everything seen is true."""
+    """All free cells that are seen are connected by their edges, and everything seen is true."""
     truth = surrounded(state)
     truth[cell] = CellState.FREE
     eye = camera(truth)
@@ -77,10 +77,10 @@ def test_cells_are_seen_just_as_far_and_wide_as_the_camera_reaches(heading_deg, 
     bearing = np.degrees(np.arctan2(rows - middle, columns - middle)) - heading_deg
     off_axis_deg = np.abs((bearing + 180) % 360 - 180)
     slack_deg = np.where(distance < 0.75, 180.0, np.degrees(np.arcsin(0.75 / np.maximum(distance, 0.75))))
-    reach, half_deg = sensor.range_m / 0.1, sensor.field_of_view_deg / 2
+    range_cells, half_deg = sensor.range_m / 0.1, sensor.field_of_view_deg / 2
     seen = eye.seen == CellState.FREE
-    assert seen[(distance < reach - 1) & (off_axis_deg < half_deg - slack_deg)].all()
-    assert not seen[(distance > reach + 1) | (off_axis_deg > half_deg + slack_deg)].any()
+    assert seen[(distance < range_cells - 1) & (off_axis_deg < half_deg - slack_deg)].all()
+    assert not seen[(distance > range_cells + 1) | (off_axis_deg > half_deg + slack_deg)].any()
 
 
 def test_belief_shifts_the_map_by_as_many_cells():

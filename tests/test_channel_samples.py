@@ -1,4 +1,4 @@
-"""Draws of channels: exact where all is known, as predicted where not, and alike in space."""
+"""Draws of channels: exact where all is known, as predicted elsewhere, and correlated in space."""
 
 from typing import Any
 
@@ -56,9 +56,9 @@ def test_draws_agree_with_the_prediction_and_with_themselves(
     for draw in range(0, 100, 20):
         links = samples.links(draw)
         power = np.bincount(links.path_rx, np.abs(links.a) ** 2, len(receivers))
-        heard = links.link_state != sp.LinkState.OUTAGE
-        np.testing.assert_allclose(10 * np.log10(power[heard]), links.gain_db[heard], atol=1e-6)
-        assert (power[~heard] == 0.0).all()
+        received = links.link_state != sp.LinkState.OUTAGE
+        np.testing.assert_allclose(10 * np.log10(power[received]), links.gain_db[received], atol=1e-6)
+        assert (power[~received] == 0.0).all()
         direct = np.bincount(links.path_rx[(links.interactions == 0).all(axis=1)], minlength=len(receivers))
         np.testing.assert_array_equal(direct > 0, links.link_state == sp.LinkState.LOS)
     assert np.ptp(samples.gain_db, axis=0).max() > 20.0

@@ -1,4 +1,4 @@
-"""The command line: what it passes on, what it says, and how it fails."""
+"""The command line: what it passes on, what it prints, and how it fails."""
 
 import os
 import shutil

@@ -191,7 +191,7 @@ def test_turned_and_mirrored() -> None:
 
 
 def test_opaque_paths_stay() -> None:
-    """Those without walls are the same, to the byte, and those with walls say so."""
+    """Those without walls are the same, to the byte, and those with walls have refractions."""
     opaque, leaky = (
         sp.trace_links(rooms(), TX, RX, trace_settings=replace(EVERY, refraction=on, diffraction=None))
         for on in (False, True)

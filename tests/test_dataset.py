@@ -143,9 +143,9 @@ class TestKilled:
             run.kill()
         wait_until(lambda: not any(map(is_running, processes(notes))))
         assert 3 <= shards(folder) < len(SEEDS)
-        for place in (folder, folder / "shards"):
-            (place / ".tmp-0123456789abcdef").mkdir()
-            (place / ".tmp-0123456789abcdef" / "half a file").touch()
+        for parent in (folder, folder / "shards"):
+            (parent / ".tmp-0123456789abcdef").mkdir()
+            (parent / ".tmp-0123456789abcdef" / "half a file").touch()
         there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
         report = build_dataset(folder, SEEDS, SETTINGS, workers=2)
         assert len(report.skipped) == len(there)

@@ -48,7 +48,7 @@ class TestOpenLinks:
         table = make_table(homes=1)
         ((name, home),) = table.complete_maps.items()
         other = replace(table, complete_maps={name: replace(home, origin_m=(1.0, 2.0))})
-        folders = [make_dataset(tmp_path / place, each) for place, each in (("one", table), ("two", other))]
+        folders = [make_dataset(tmp_path / name, each) for name, each in (("one", table), ("two", other))]
         message = f"'{folders[1]}' has another home {name!r} than those before: give one of the two."
         with pytest.raises(PredictorError, match=re.escape(message)):
             open_links(folders)

@@ -1,4 +1,4 @@
-"""Edges drawn as small plans, and ways over them against brute force in the plan and their geometry in space."""
+"""Edges drawn as small plans, and paths over them against brute force in the plan and their geometry in space."""
 
 import itertools
 
@@ -50,10 +50,10 @@ def _star(*degrees: float) -> NDArray[np.float64]:
     return np.stack([np.zeros((len(angle), 2)), np.column_stack([np.cos(angle), np.sin(angle)])], axis=1)
 
 
-def _sectors(walls: NDArray[np.float64], place: tuple[float, float] = (0.0, 0.0)) -> list[tuple[int, int]]:
-    """Walls that bound the sectors in which the edge at one place diffracts, counterclockwise."""
+def _sectors(walls: NDArray[np.float64], position: tuple[float, float] = (0.0, 0.0)) -> list[tuple[int, int]]:
+    """Walls that bound the sectors in which the edge at one position diffracts, counterclockwise."""
     wedges = find_wedges(extrude(walls), open_ends=False)
-    at = np.flatnonzero(np.linalg.norm(wedges.edge_m - place, axis=1) < 1e-9)
+    at = np.flatnonzero(np.linalg.norm(wedges.edge_m - position, axis=1) < 1e-9)
     return [tuple((wedges.face[each] // 2).tolist()) for each in at]
 
 
@@ -171,21 +171,21 @@ class TestDiffractionCandidates:
         ids=["below lights the level wall", "left lights the upright wall", "both are lit"],
     )
     def test_the_face_that_the_transmitter_lights_comes_first(self, tx: tuple[float, ...], wall: int) -> None:
-        geometry, place = extrude(CORNER), np.array(tx)
-        found = _join(geometry, np.array([[2.5, 0.5, 1.0]]), place, 1)
+        geometry, position = extrude(CORNER), np.array(tx)
+        found = _join(geometry, np.array([[2.5, 0.5, 1.0]]), position, 1)
         row = int(np.flatnonzero((found.vertices_m[:, 0, :2] == [3.0, 2.0]).all(axis=1))[0])
         normal = found.wedges.normal[found.wedge[row]]
-        assert normal[0] @ (place[:2] - [3.0, 2.0]) > 0
+        assert normal[0] @ (position[:2] - [3.0, 2.0]) > 0
         assert found.wedges.face[found.wedge[row], 0] // 2 == wall
 
     def test_at_a_bent_junction_nothing_joins_two_sectors(self) -> None:
         """Walls at 0, 45 and 90 degrees: only the sector of 270 degrees diffracts, and within itself."""
         geometry, radius = extrude(_star(0, 45, 90)), 0.5
-        places = {
+        positions = {
             degrees: np.array([radius * np.cos(np.radians(degrees)), radius * np.sin(np.radians(degrees)), 1.0])
             for degrees in (20, 70, 100, 200, 350)
         }
-        for (a, tx), (b, rx) in itertools.permutations(places.items(), 2):
+        for (a, tx), (b, rx) in itertools.permutations(positions.items(), 2):
             wedges = find_wedges(geometry, open_ends=False)
             blocks = diffracted_blocks(geometry, wedges, tx, rx[None], 1)
             at = [(block.vertices_m[:, 0, :2] == 0.0).all(axis=1).sum() for block, _ in blocks]

@@ -51,8 +51,8 @@ class TestVerify:
         home = sp.make_home(9)
         geometry = build_scene(home)
         free = (np.argwhere(home.state == CellState.FREE)[::40, ::-1] + 0.5) * home.resolution_m
-        places = np.column_stack([free, np.full(len(free), 1.5)])
-        tx, rx = places[len(places) // 2], np.delete(places, len(places) // 2, axis=0)
+        positions = np.column_stack([free, np.full(len(free), 1.5)])
+        tx, rx = positions[len(positions) // 2], np.delete(positions, len(positions) // 2, axis=0)
         candidates = _specular(geometry, tx, rx, 6)
         solver = _solver(geometry, tmp_path)
         order = np.random.default_rng(0).permutation(len(candidates.rx))

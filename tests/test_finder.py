@@ -128,9 +128,9 @@ def test_the_public_way_finds_no_other_kinds_of_paths(monkeypatch: pytest.Monkey
     monkeypatch.setattr(simulation, "engine_fault", lambda: "broken")
     public = sp.trace_links(_plan(), TX, RX[:2], trace_settings=settings)
     np.testing.assert_array_equal(public.link_state, exact.link_state)
-    bent = (public.interactions == 8).any(axis=1)
-    assert bent.any()
-    assert ((public.interactions == 1)[bent].sum(axis=1) <= 2).all()
+    diffracted = (public.interactions == 8).any(axis=1)
+    assert diffracted.any()
+    assert ((public.interactions == 1)[diffracted].sum(axis=1) <= 2).all()
     pairs = zip(public.path_rx, public.delay_s, strict=True)
     found = [np.abs(_delays(exact, rx) - delay).min() < 1e-11 for rx, delay in pairs]
     assert len(found) > 50

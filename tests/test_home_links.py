@@ -1,4 +1,4 @@
-"""Links of one home: places, truth, features, and what does not depend on what."""
+"""Links of one home: positions, truth, features, and what does not depend on what."""
 
 import itertools
 from dataclasses import replace

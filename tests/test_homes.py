@@ -205,7 +205,7 @@ def test_floors_have_corridors_and_rooms_and_halls_have_few():
 
 
 def test_doors_of_some_floors_are_closed_and_those_of_none_without_locked_rooms():
-    """Of twelve floors some are one part within reach, and some are many parts, each enclosed by walls."""
+    """Of twelve floors some are one connected part, and some are many parts, each enclosed by walls."""
     floors = [made(seed, "floor") for seed in range(12)]
     parts = [ndimage.label(floor.state == CellState.FREE)[1] for floor in floors]
     assert sum(count < 6 for count in parts) >= 3

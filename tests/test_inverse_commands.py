@@ -18,7 +18,7 @@ HIDDEN = sp.Material(5.0, 2.0, 0.01)
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map of a room with a wall, and measurements of 24 links in it."""
     folder = tmp_path_factory.mktemp("room")
     state = np.zeros((40, 50), dtype=np.uint8)
@@ -32,7 +32,8 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         room, tx, rx, trace_settings=sp.TraceSettings(max_depth=2), scene_settings=sp.SceneSettings(material=HIDDEN)
     )
     rows = [
-        ",".join(f"{value:.6f}" for value in (*tx, *place, gain)) for place, gain in zip(rx, links.gain_db, strict=True)
+        ",".join(f"{value:.6f}" for value in (*tx, *position, gain))
+        for position, gain in zip(rx, links.gain_db, strict=True)
     ]
     (folder / "measured.csv").write_text("\n".join([HEADER, *rows, ""]))
     return folder
@@ -48,10 +49,10 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
 
 
-def test_calibrate(place: Path, tmp_path: Path) -> None:
+def test_calibrate(measured: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = run(
-        *(place / "room.yaml", "--measurements", place / "measured.csv", "--out", out),
+        *(measured / "room.yaml", "--measurements", measured / "measured.csv", "--out", out),
         *("--material", "2.94,0.1226,0.01", "--max-depth", 2),
     )
     assert result.exit_code == 0, result.output
@@ -76,19 +77,19 @@ def test_calibrate(place: Path, tmp_path: Path) -> None:
     assert f"wrote {out / 'calibrated.npz'}" in result.output
 
 
-def test_unusable_measurements_are_one_line(place: Path, tmp_path: Path) -> None:
+def test_unusable_measurements_are_one_line(measured: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text(f"{HEADER}\n1,1,1.5,3,3,1.5,loud\n")
-    result = run(place / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
+    result = run(measured / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "error: measurements = " in result.output
     assert "line 2: gain_db = 'loud' is not a number: correct the line" in result.output
     assert not (tmp_path / "out").exists()
 
 
-def test_too_few_measurements(place: Path, tmp_path: Path) -> None:
-    few = (place / "measured.csv").read_text().splitlines()[:6]
+def test_too_few_measurements(measured: Path, tmp_path: Path) -> None:
+    few = (measured / "measured.csv").read_text().splitlines()[:6]
     (tmp_path / "few.csv").write_text("\n".join(few) + "\n")
-    result = run(place / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
+    result = run(measured / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "has 5 usable links of 5, fewer than 10" in result.output
     assert "Traceback" not in result.output

@@ -62,11 +62,11 @@ def of_paths(*paths, partial=HALF, rx=FAR):
 
 
 def gains_db(power, crossed_m):
-    """Return the gain at each reach of paths that cross so much unobserved space."""
+    """Return the gain at each attenuation length of paths that cross so much unobserved space."""
     power, crossed_m = np.array(power), np.array(crossed_m)
     totals = []
-    for reach in ATTENUATION_LENGTHS_M:
-        kept = (crossed_m == 0.0) if reach == 0.0 else np.exp(-crossed_m / reach)
+    for length_m in ATTENUATION_LENGTHS_M:
+        kept = (crossed_m == 0.0) if length_m == 0.0 else np.exp(-crossed_m / length_m)
         totals.append((power * kept).sum())
     return [max(10 * math.log10(total), -150.0) if total else -150.0 for total in totals]
 

@@ -84,8 +84,8 @@ class TestLinkInputs:
     def test_a_few_units_whatever_the_link(self, state, distance_m, fraction, gain_db):
         """In a building of any size."""
         floor = PartialMap(np.zeros((1, 100), dtype=np.uint8), 10.0, (-5.0, -5.0))
-        place = (distance_m, 0.0, 1.5)
-        phi = features(floor, place, unobserved_m=fraction * distance_m, state=state, gain_db=gain_db)
+        position = (distance_m, 0.0, 1.5)
+        phi = features(floor, position, unobserved_m=fraction * distance_m, state=state, gain_db=gain_db)
         found = inputs(phi)
         assert all(np.isfinite(column).all() for column in found.values())
         assert max(abs(column[0]) for column in found.values()) < 7.0
@@ -127,8 +127,8 @@ class TestLinkInputs:
         for name, gain_db in (
             *(("gain", -76.0), ("free_gain", free_db)),
             *(
-                (f"indirect_{reach:g}", gain_db)
-                for reach, gain_db in zip(ATTENUATION_LENGTHS_M, indirect_db, strict=True)
+                (f"indirect_{length_m:g}", gain_db)
+                for length_m, gain_db in zip(ATTENUATION_LENGTHS_M, indirect_db, strict=True)
             ),
         ):
             assert found[name] == pytest.approx((gain_db + 150.0) / 100.0), name
@@ -296,10 +296,10 @@ class TestEvaluateContextNetworks:
 
     def test_on_a_map_the_place_counts(self, networks, home):
         """The links are equal in all but where the receivers are: only the map network sees a difference."""
-        place = np.array([[2.5, 0.5, 1.5], [0.5, 2.5, 1.5]])
+        position = np.array([[2.5, 0.5, 1.5], [0.5, 2.5, 1.5]])
         state = home.state.copy()
         state[8:12, 8:12] = FREE
-        phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), place, tx_m=(0.5, 0.5, 1.5), unobserved_m=1.0)
+        phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), position, tx_m=(0.5, 0.5, 1.5), unobserved_m=1.0)
         one, other = scaled_inputs(phi, PredictorSettings())
         np.testing.assert_array_equal(one, other)
         probabilities, *_ = evaluate_context_networks(networks, phi, PredictorSettings())

@@ -60,8 +60,8 @@ def test_nodes_are_placed_by_their_transforms(tmp_path: Path) -> None:
     scene = trimesh.Scene()
     turn = trimesh.transformations.rotation_matrix(np.pi / 2, (0, 0, 1))
     for shift in (0.0, 10.0):
-        place = trimesh.transformations.translation_matrix((shift, 0, 0)) @ turn
-        scene.add_geometry(trimesh.creation.box((2, 6, 3)), geom_name="box", transform=place)
+        moved = trimesh.transformations.translation_matrix((shift, 0, 0)) @ turn
+        scene.add_geometry(trimesh.creation.box((2, 6, 3)), geom_name="box", transform=moved)
     mesh = read_mesh(written(tmp_path, "glb", scene))
     assert len(mesh.triangles) == 24
     np.testing.assert_allclose(mesh.bounds_m, [[-3, -1, -1.5], [13, 1, 1.5]], atol=1e-6)

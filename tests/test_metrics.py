@@ -40,7 +40,7 @@ def drawn(count, seed=0, narrow=1.0):
 
 
 def the_model():
-    """Links of the tests' model, and the prediction that knows it."""
+    """Links of the tests' model, and its true distribution as the prediction."""
     phi, state, gain_db = make_links(40_000, seed=3)
     kept, partial = p_kept(phi), phi.link_state
     other = np.where(partial == OUTAGE, NLOS, OUTAGE)

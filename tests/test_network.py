@@ -128,7 +128,7 @@ def test_bad_settings_of_a_network(coverage: xr.Dataset, options: dict[str, Any]
 def test_maps_that_are_no_network(coverage: xr.Dataset) -> None:
     with pytest.raises(SettingsError, match="give each a name"):
         sp.network_map(coverage.isel(tx=[]))
-    with pytest.raises(SettingsError, match="no place where a receiver"):
+    with pytest.raises(SettingsError, match="no position at which receivers"):
         sp.network_map(coverage.assign(valid=coverage.valid & False))
     turned = sp.network_map(coverage.transpose("y", "x", "tx"), n=10)
     xr.testing.assert_equal(turned, sp.network_map(coverage, n=10))

@@ -141,9 +141,9 @@ class TestTrace:
     def test_an_edge_of_a_table_diffracts_below_its_top(self) -> None:
         partial, settings = low(), sp.TraceSettings(max_depth=1)
         links = sp.trace_links(partial, (2.5, 1.5, 0.4), [(4.8, 0.5, 0.4), (4.8, 0.5, 1.2)], trace_settings=settings)
-        bent = links.interactions[:, 0] == 8
-        assert (links.path_rx[bent] == 0).any()
-        assert links.vertices_m[bent, 0, 2].max() < 0.75
+        diffracted = links.interactions[:, 0] == 8
+        assert (links.path_rx[diffracted] == 0).any()
+        assert links.vertices_m[diffracted, 0, 2].max() < 0.75
         assert links.link_state.tolist() == [sp.LinkState.NLOS, sp.LinkState.LOS]
 
     def test_links_above_obstacles_are_in_sight(self) -> None:

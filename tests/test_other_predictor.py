@@ -1,4 +1,4 @@
-"""A model of the user's in the place of a predictor."""
+"""A model of the user in place of a predictor."""
 
 import numpy as np
 import pytest

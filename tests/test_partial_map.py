@@ -1,4 +1,4 @@
-"""PartialMap: what a robot knows of a floor plan."""
+"""PartialMap: free, wall and unknown cells of a floor plan."""
 
 import re
 from collections.abc import Callable

@@ -315,17 +315,17 @@ class TestSlopes:
         tx, rx = np.array([1.03, 1.92, 1.4]), np.array([3.2, 2.1, 1.1])
         metal = replace(FLOOR, material=sp.Material(1.0, 1e7, 0.1))
         paths = sp.Simulation(FIELD, scene_settings=metal).paths(tx, rx[None])
-        bent, share = int(np.flatnonzero(~paths.is_direct)[0]), tx[2] / (tx[2] + rx[2])
-        np.testing.assert_allclose(paths.vertices_m[bent, 0], [*(tx + share * (rx - tx))[:2], 0.0], atol=1e-5)
+        reflected, fraction = int(np.flatnonzero(~paths.is_direct)[0]), tx[2] / (tx[2] + rx[2])
+        np.testing.assert_allclose(paths.vertices_m[reflected, 0], [*(tx + fraction * (rx - tx))[:2], 0.0], atol=1e-5)
         power, vertices_m = paths.transmitter_slopes(paths.base)
         per_z = rx[2] / (tx[2] + rx[2]) ** 2 * (rx - tx)[:2]
-        expected = [[1 - share, 0, per_z[0]], [0, 1 - share, per_z[1]], [0, 0, 0]]
-        np.testing.assert_allclose(vertices_m[bent, 0], expected, atol=1e-5)
+        expected = [[1 - fraction, 0, per_z[0]], [0, 1 - fraction, per_z[1]], [0, 0, 0]]
+        np.testing.assert_allclose(vertices_m[reflected, 0], expected, atol=1e-5)
         away = tx - rx * [1, 1, -1]
         length_m = np.linalg.norm(away)
         free = (SPEED_OF_LIGHT_M_S / 28e9 / (4 * np.pi * length_m)) ** 2
-        np.testing.assert_allclose(paths.power[bent], free, rtol=2e-3)
-        np.testing.assert_allclose(power[bent], -2 * free / length_m**2 * away, rtol=4e-3)
+        np.testing.assert_allclose(paths.power[reflected], free, rtol=2e-3)
+        np.testing.assert_allclose(power[reflected], -2 * free / length_m**2 * away, rtol=4e-3)
 
     def test_away_from_where_they_were_found(self, paths: PathSet) -> None:
         there = changed(paths, tx_m=[5e-3, 5e-3, 5e-3], relative_permittivity=[2.0])
@@ -434,8 +434,8 @@ class TestNothingThere:
 
     def test_progress(self, room: sp.Simulation) -> None:
         calls: list[tuple[float, str]] = []
-        room.paths(TX_M, RX_M, progress=lambda share, message: calls.append((share, message)))
-        fractions = [share for share, _ in calls]
+        room.paths(TX_M, RX_M, progress=lambda fraction, message: calls.append((fraction, message)))
+        fractions = [fraction for fraction, _ in calls]
         assert fractions == sorted(fractions)
         assert fractions[-1] == pytest.approx(1.0)
         assert {message for _, message in calls} == {"verifying reflections", "verifying diffractions", "traced"}

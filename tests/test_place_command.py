@@ -1,4 +1,4 @@
-"""The command place: what it passes on, what it writes and says, and how it fails."""
+"""The command place: what it passes on, what it writes and prints, and how it fails."""
 
 import json
 from pathlib import Path

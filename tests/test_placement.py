@@ -1,4 +1,4 @@
-"""Positions of transmitters: found again, as good as the trace says, and to the same bytes."""
+"""Positions of transmitters: found again, as good as in the trace, and to the same bytes."""
 
 import json
 from pathlib import Path

@@ -32,8 +32,10 @@ def two_rooms() -> PlacementArea:
 class TestRoom:
     def test_free_and_away_from_walls(self) -> None:
         area = two_rooms()
-        places = np.array([[1.0, 1.0, 1.5], [0.55, 1.0, 1.5], [0.65, 1.0, 1.5], [0.25, 1.0, 1.5], [2.75, 1.0, 1.5]])
-        assert area.stands(places).tolist() == [True, False, True, False, False]
+        positions_m = np.array(
+            [[1.0, 1.0, 1.5], [0.55, 1.0, 1.5], [0.65, 1.0, 1.5], [0.25, 1.0, 1.5], [2.75, 1.0, 1.5]]
+        )
+        assert area.stands(positions_m).tolist() == [True, False, True, False, False]
 
     def test_unknown_cells_are_no_place_but_keep_no_distance(self) -> None:
         area = placement_area(map_of("...??\n...??\n...??", 0.5, (0.0, 0.0)), 1.5, 1.5, None)
@@ -64,12 +66,12 @@ class TestRoom:
 class TestPositions:
     def test_all_over_the_area_by_seed(self) -> None:
         area = two_rooms()
-        places = area.positions(3)
-        assert area.stands(places).all()
-        assert (places[:, 2] == 1.5).all()
-        assert len(places) == pytest.approx(area.size_m2 / 0.25**2, rel=0.25)
-        np.testing.assert_array_equal(area.positions(3), places)
-        assert not np.isin(area.positions(4)[:, 0], places[:, 0]).any()
+        positions_m = area.positions(3)
+        assert area.stands(positions_m).all()
+        assert (positions_m[:, 2] == 1.5).all()
+        assert len(positions_m) == pytest.approx(area.size_m2 / 0.25**2, rel=0.25)
+        np.testing.assert_array_equal(area.positions(3), positions_m)
+        assert not np.isin(area.positions(4)[:, 0], positions_m[:, 0]).any()
 
     def test_no_more_than_wanted_on_a_large_map(self) -> None:
         area = placement_area(PartialMap(np.zeros((200, 300), dtype=np.uint8), 0.2), 1.5, 1.5, None)

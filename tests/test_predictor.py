@@ -166,7 +166,7 @@ class TestNetworksOfMapsAndPaths:
         assert answer.gain_std_db[~sure].min(initial=1.0) > 0.1
 
     def test_without_a_context_the_papers_networks_answer(self, seeing):
-        """They are fitted to the same links, and know nothing of the networks beside them."""
+        """They are fitted to the same links, whatever other networks there are."""
         phi, state, gain_db = make_seen_links(300)
         settings = dataclasses.replace(seeing.settings, networks="paper")
         paper = Predictor.fit(phi, state, gain_db, settings=settings)

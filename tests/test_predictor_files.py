@@ -165,8 +165,8 @@ def test_foreign_code_beside_the_papers_networks_is_refused(saved, old):
 
 def _dense(inputs, outputs, name=LINK_NETWORK):
     keras = import_keras()
-    place = keras.Input((inputs,), name="link")
-    return keras.Model(place, keras.layers.Dense(outputs, name="outputs")(place), name=name)
+    values = keras.Input((inputs,), name="link")
+    return keras.Model(values, keras.layers.Dense(outputs, name="outputs")(values), name=name)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def _dense(inputs, outputs, name=LINK_NETWORK):
         {MAP_NETWORKS[1]: None},
         {"third_network": lambda: _dense(len(LINK_INPUTS), LINK_OUTPUTS, "third_network")},
     ],
-    ids=["link network without what the map says", "map alone", "reader of a map alone", "one too many"],
+    ids=["link network without inputs from the map", "map alone", "reader of a map alone", "one too many"],
 )
 def test_foreign_networks_are_refused(saved, change):
     networks = parts(context_predictor("map").model)
@@ -217,8 +217,8 @@ def test_huge_file_is_refused(saved):
 
 def test_other_keras_model(saved):
     keras = import_keras()
-    place = keras.Input((1,), name="distance_m")
-    keras.Model({"distance_m": place}, {"gain": keras.layers.Dense(1)(place)}).save(saved)
+    distance = keras.Input((1,), name="distance_m")
+    keras.Model({"distance_m": distance}, {"gain": keras.layers.Dense(1)(distance)}).save(saved)
     _forge(saved, saved.read_bytes())
     with pytest.raises(PredictorError, match=r"has inputs \['distance_m'\] and outputs"):
         Predictor.load(saved)
@@ -231,7 +231,7 @@ def test_other_keras_model(saved):
         ({"features": ["unobserved_distance_m", "distance_m", "gain_db"]}, "features = ['unobserved_distance_m'"),
         ({"link_states": {"LOS": 0}}, "link_states = {'LOS': 0}"),
         ({"outputs": {}}, "outputs = {}"),
-        ({"sha256": "0" * 64}, f"but its card says '{'0' * 64}'"),
+        ({"sha256": "0" * 64}, f"but its card has '{'0' * 64}'"),
         ({"sha256": None}, "names no sha256"),
         ({"settings": {"steps": 0}}, "is damaged (SettingsError"),
         ({"settings": {"tricks": 1}}, "is damaged (TypeError"),

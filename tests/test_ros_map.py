@@ -168,7 +168,7 @@ def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
 
 
 def test_205_is_free_where_more_is_unknown_otherwise(tmp_path: Path) -> None:
-    """A map that says unknown in another way may mean what it says by 205."""
+    """In a map with another value for unknown, 205 may be free."""
     assert load_state(tmp_path, [[0, 128, 205, 254]], free_thresh=0.25) == [[WALL, UNKNOWN, FREE, FREE]]
 
 
@@ -494,8 +494,8 @@ def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -
 def test_diagonal_walls_stay_closed() -> None:
     """A diamond of cells that touch at corners alone, free inside."""
     y, x = np.mgrid[-12:13, -12:13]
-    reach = np.abs(x) + np.abs(y)
-    state = np.where(reach < 10, FREE, np.where(reach == 10, WALL, UNKNOWN)).astype(np.uint8)
+    distance = np.abs(x) + np.abs(y)
+    state = np.where(distance < 10, FREE, np.where(distance == 10, WALL, UNKNOWN)).astype(np.uint8)
     assert PartialMap(state, 0.1).is_complete
     for yaw in np.linspace(-3, 3, 41):
         new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))

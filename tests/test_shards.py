@@ -1,4 +1,4 @@
-"""Links through Parquet files: nothing is lost, equal links give equal bytes, and damage is told from emptiness."""
+"""Links through Parquet files: nothing is lost, equal links give equal bytes, and damage is no empty file."""
 
 import base64
 import json
@@ -61,10 +61,10 @@ class TestShard:
         names = set(pq.read_schema(shard).names)
         positions = {f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"}
         phi = {"partial_link_state", "partial_gain_db", "unobserved_distance_m", "distance_m"}
-        reaches = {f"indirect_gain_reach_{reach}_m_db" for reach in ("inf", "4", "1", "0.25", "0")}
+        indirect = {f"indirect_gain_reach_{reach}_m_db" for reach in ("inf", "4", "1", "0.25", "0")}
         straight = {"straight_gain_db", "straight_walls", "wall_loss_db", "wall_reflection_db", "carrier_hz"}
         others = {"strongest_unobserved_m", "map_index"}
-        assert names == {*COLUMNS} | positions | phi | reaches | straight | others
+        assert names == {*COLUMNS} | positions | phi | indirect | straight | others
 
     def test_columns_hold_what_they_say(self, links: LinkTable, shard: Path) -> None:
         columns = pq.read_table(shard)

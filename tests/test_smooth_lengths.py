@@ -1,4 +1,4 @@
-"""Smooth lengths of segments in cells: by hand, beside quadrature and finite differences, and by their properties."""
+"""Smooth lengths of segments in cells: by hand, against quadrature and finite differences, and by their properties."""
 
 import numpy as np
 import pytest

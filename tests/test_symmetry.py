@@ -36,8 +36,8 @@ def links_of(seed: int, stage: int, which: int = 0, offset_m: float = 0.0) -> sp
     partial = home if stage == 0 else sp.explore(home, steps=(stage,), seed=seed)[0]
     rng = np.random.default_rng(seed)
     free = np.argwhere(partial.state == sp.CellState.FREE)[:, ::-1]
-    places = free[rng.permutation(len(free))[:150]] + rng.uniform(0.2, 0.8, (150, 2))
-    points_m = np.column_stack([places * partial.resolution_m + partial.origin_m, np.full(150, 1.5)])
+    cells_in = free[rng.permutation(len(free))[:150]] + rng.uniform(0.2, 0.8, (150, 2))
+    points_m = np.column_stack([cells_in * partial.resolution_m + partial.origin_m, np.full(150, 1.5)])
     points_m = points_m[clear_of_walls(partial, points_m)]
     partial, points_m = transformed(partial, points_m, which, offset_m)
     far = np.linalg.norm(points_m[1:] - points_m[0], axis=1) > 0.1

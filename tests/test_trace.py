@@ -290,14 +290,14 @@ def test_settings_of_another_kind_are_named(name: str) -> None:
 
 def test_material_of_the_map_comes_before_that_of_the_settings() -> None:
     concrete = Material(itu="concrete")
-    place, receivers = (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]]
-    asked = trace_links(_room(), place, receivers, scene_settings=SceneSettings(concrete))
-    own = trace_links(replace(_room(), material=concrete), place, receivers)
+    tx, receivers = (1.0, 1.0, 1.5), [[2.0, 1.0, 1.5]]
+    asked = trace_links(_room(), tx, receivers, scene_settings=SceneSettings(concrete))
+    own = trace_links(replace(_room(), material=concrete), tx, receivers)
     assert own.scene_settings == asked.scene_settings
     assert own.a.tobytes() == asked.a.tobytes()
-    assert own.a.tobytes() != trace_links(_room(), place, receivers).a.tobytes()
+    assert own.a.tobytes() != trace_links(_room(), tx, receivers).a.tobytes()
     with pytest.raises(SettingsError, match="'wet_ground' is defined for 1-10 GHz"):
-        trace_links(replace(_room(), material=Material(itu="wet_ground")), place, receivers)
+        trace_links(replace(_room(), material=Material(itu="wet_ground")), tx, receivers)
 
 
 def test_links_shorter_than_friis_allows_are_refused() -> None:
@@ -355,11 +355,11 @@ def test_finds_every_vertical_diffraction_that_stock_sionna_finds(partial: Parti
         scene, max_depth=3, refraction=False, diffraction=True, edge_diffraction=True, samples_per_src=100_000
     )
     kind = np.moveaxis(paths.interactions.numpy().reshape(3, len(rx), -1), 0, 2)
-    place = np.moveaxis(paths.vertices.numpy().reshape(3, len(rx), -1, 3), 0, 2)
-    upright = ((kind == 8) & (place[..., 2] > 1e-3) & (place[..., 2] < 3.0 - 1e-3)).any(axis=2)
+    vertices = np.moveaxis(paths.vertices.numpy().reshape(3, len(rx), -1, 3), 0, 2)
+    upright = ((kind == 8) & (vertices[..., 2] > 1e-3) & (vertices[..., 2] < 3.0 - 1e-3)).any(axis=2)
     # Where the wall between the rooms meets the others, Sionna RT diffracts as if only two of three walls were there,
     # and so leaks from room to room: (3.05, 0.05) and (3.05, 4.15).
-    junction = ((kind == 8) & np.isclose(place[..., 0], 3.05) & (np.abs(place[..., 1] - 2.1) > 2.0)).any(axis=2)
+    junction = ((kind == 8) & np.isclose(vertices[..., 0], 3.05) & (np.abs(vertices[..., 1] - 2.1) > 2.0)).any(axis=2)
     valid = paths.valid.numpy().reshape(len(rx), -1) & upright & ~junction
     delay = paths.tau.numpy().reshape(len(rx), -1)
     power = sum(part.numpy().reshape(len(rx), -1).astype(float) ** 2 for part in paths.a)

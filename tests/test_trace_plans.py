@@ -217,9 +217,9 @@ def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:
     walls = drawn("............. .###########. .#....#....#. .#....#....#. .#.........#. .###########. .............")
     tx, rx = np.array([1.3, 1.7, 1.2]), np.array([[4.4, 2.2, 1.5], [3.9, 1.4, 1.9]])
     shallow, deep = (trace_links(walls, tx, rx, trace_settings=all_paths(max_depth=depth)) for depth in (2, 3))
-    bent = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
-    assert len(bent) > 3
-    for path in bent:
+    diffracted = np.flatnonzero((shallow.interactions[:, 0] == 8) & (shallow.interactions[:, 1] == 1))
+    assert len(diffracted) > 3
+    for path in diffracted:
         positions = np.abs(deep.vertices_m[:, :2] - shallow.vertices_m[path]).max(axis=(1, 2))
         same = (deep.path_rx == shallow.path_rx[path]) & (deep.interactions[:, 2] == 0) & (positions < 1e-4)
         assert abs(deep.a[same]) == pytest.approx(abs(shallow.a[path]), rel=1e-3)

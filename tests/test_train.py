@@ -18,7 +18,7 @@ from sionna_partial.training import split_homes, train
 pytestmark = QUIET
 
 UNTRAINED = PredictorSettings(minimum_links=1_000_000)
-"""Every network says mean and spread of its links: quick, and as deterministic as the links."""
+"""Every network gives mean and spread of its links: quick, and as deterministic as the links."""
 
 HOMES = [f"home {index}" for index in range(10)]
 

@@ -82,7 +82,7 @@ class TestFiles:
         ("value", "message"),
         [
             (["brick"], "has shades up to 2 for 1 materials"),
-            (["brick", None], "names none of its materials at place 2"),
+            (["brick", None], "names none of its materials at entry 2"),
             (["brick", "cheese"], "wall_material = 'cheese' is not allowed"),
             ("brick", "give an image and a list of materials"),
         ],

@@ -50,8 +50,8 @@ def test_package_is_whole(names: list[str]) -> None:
 
 @pytest.mark.parametrize("folder", ["predictors", "scenes"])
 def test_data_is_whole(names: list[str], folder: str) -> None:
-    place = ROOT / ("scenes" if folder == "scenes" else "sionna_partial/predictors")
-    files = {path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()}
+    parent = ROOT / ("scenes" if folder == "scenes" else "sionna_partial/predictors")
+    files = {path.relative_to(parent).as_posix() for path in parent.rglob("*") if path.is_file()}
     files = {file for file in files if "__pycache__" not in file}
     assert files
     assert {f"sionna_partial/{folder}/{file}" for file in files} <= set(names)

@@ -53,7 +53,7 @@ _STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
 class ChannelSamples(Shown):
     """n draws of the channels of links, from `sample_channels`.
 
-    Every draw is one building as it may be: links through the same unseen space are alike in it. Powers, delays and
+    Every draw is one building as it may be: links through the same unseen space are correlated. Powers, delays and
     angles are drawn; the phase of whatever crosses the unseen is uniform, as 1 mm is 34 degrees at 28 GHz. Paths are
     made when they are asked for, and are the same each time.
 

@@ -23,7 +23,7 @@ from sionna_partial.settings import (
 )
 
 DEFAULT_HOMES = 100
-"""Number of homes that are made where no map is given."""
+"""Number of procedural homes where no map is given."""
 
 FIRST_SEED = 20_000
 """Seed of the first of them: not one of those that the shipped predictor was trained on (`make predictor`)."""
@@ -119,7 +119,7 @@ def train(
     test_fraction: Annotated[float, typer.Option(help="Fraction of the homes that is kept for testing.")] = 0.3,
     networks: Annotated[NetworkKind, typer.Option(help=_NETWORKS_HELP)] = "map",
     passes: Annotated[
-        int, typer.Option(help="Passes of the networks beside the paper's over the links.")
+        int, typer.Option(help="Passes of all networks but the paper's over the links.")
     ] = PredictorSettings.passes,
     seed: Annotated[int, typer.Option(help="Seed of the split and of the training.")] = PredictorSettings.seed,
 ) -> None:

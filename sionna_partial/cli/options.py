@@ -133,7 +133,7 @@ def parse_material(text: str) -> Material:
 def read_measurements(path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None) -> Any:
     """Read the CSV of --measurements, with headers as --column has them; None if there is none.
 
-    `tx` is where the transmitter is of a CSV that does not say so.
+    `tx` is the transmitter's position for a CSV without it.
     """
     pairs = [text.partition("=") for text in column or ()]
     wrong = next((name for name, _, header in pairs if not name or not header), None)
@@ -213,7 +213,7 @@ def _sensor(
 Settings = Annotated[dict[str, Any], settings_of]
 PartialMap = Annotated[Any, _read_map]
 Sensor = Annotated[SensorSettings, _sensor]
-"""Parameters of commands that are made of options, see `with_options`."""
+"""Parameters of commands that combine options, see `with_options`."""
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:

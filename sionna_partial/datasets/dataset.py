@@ -75,7 +75,7 @@ def build_dataset(
     in whatever way, is continued by the same call, which gives the bytes that an unbroken run would have given. Homes
     may be added later. A map file that changes is not noticed: build from it in a new folder.
 
-    Every home is made in a process beside its worker, so that a home that raises, crashes or hangs is the only one to
+    Every home is made in a process of its own, so that a home that raises, crashes or hangs is the only one to
     fail. It is tried again where its process or worker died, which may be no fault of the home.
 
     Parameters

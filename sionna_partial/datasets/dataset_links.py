@@ -38,9 +38,9 @@ class LinkTraces:
 
     def is_like(self, other: "LinkTraces") -> bool:
         """Whether frequency (within 1e-6) and diffraction are the same."""
-        alike = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
+        same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
         same = self.diffraction == other.diffraction and self.through_walls == other.through_walls
-        return same and (alike or self.through_walls)
+        return same and (same_frequency or self.through_walls)
 
 
 Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]

@@ -1,4 +1,4 @@
-"""Homes of a data set, each made in a process beside the worker: one that crashes or hangs costs itself alone.
+"""Homes of a data set, each made in a process of its own: one that crashes or hangs costs itself alone.
 
 A process serves one home after the other, so that libraries load and compile once. It ends when the worker does, or
 when it has had nothing to do for a while. Pools of concurrent.futures and pebble would do if they did not spawn: that
@@ -70,7 +70,7 @@ class HomeTask:
 
     @property
     def metadata(self) -> dict[str, object]:
-        """What the shard notes beside its links."""
+        """Metadata of the shard."""
         sensor, settings = asdict(home_sensor(self.source.name, self.settings)), settings_record(self.settings)
         return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
 

@@ -105,4 +105,4 @@ def stage_name(stage: float) -> str:
 
 
 COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
-"""Names of the columns beside the features."""
+"""Names of the columns other than the features."""

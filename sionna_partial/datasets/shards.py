@@ -109,7 +109,7 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
 
 
 def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
-    """Read what `write_shard` noted beside the links, without the links."""
+    """Read the metadata of a shard, without its links."""
     with open_regular(path, "path", PredictorError, _MAX_BYTES):
         pass
     try:

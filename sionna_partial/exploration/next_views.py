@@ -221,7 +221,7 @@ def next_views(
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
-        One or several transmitters [m]. By default those of the measurements; where these do not say, one that is
+        One or several transmitters [m]. By default those of the measurements; where these have none, one that is
         located by them; without measurements any position, the mean over some free cells.
     measurements : Measurements, mapping, data frame or path, optional
         Gains that were measured of the transmitters, as for `predict_map`.

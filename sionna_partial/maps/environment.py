@@ -1,6 +1,6 @@
 """What stands in a map: walls extruded from its cells (`FloorPlan`), or the triangles of a mesh (`Mesh`).
 
-`PartialMap.environment` is the one place that asks which of the two a map has. Another kind, such as voxels, takes a
+`PartialMap.environment` alone decides which of the two a map has. Another kind, such as voxels, takes a
 class like these, a way to write it in `scene.write_map`, and a way to find its paths in `tracing/finder.py`.
 """
 

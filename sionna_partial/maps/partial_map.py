@@ -307,9 +307,9 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return wall_cells(self.state, self.resolution_m).noise
 
     @cached_property
-    def alike_cells(self) -> NDArray[np.int32]:
+    def uniform_cells(self) -> NDArray[np.int32]:
         """How many cells in every direction, corners included, are in the state of each cell (ny, nx)."""
-        return alike_cells(self.state)
+        return uniform_cells(self.state)
 
     @property
     def observed_fraction(self) -> float:
@@ -480,14 +480,14 @@ def frontier_cells(state: States) -> Bools:
     return np.asarray(touches & (state == CellState.FREE))
 
 
-def alike_cells(state: States) -> NDArray[np.int32]:
+def uniform_cells(state: States) -> NDArray[np.int32]:
     """How many cells in every direction, corners included, are in the state of each cell."""
-    alike = np.full(state.shape, max(state.shape), dtype=np.int32)
+    uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
         cells = state == kind
         if cells.any() and not cells.all():
-            alike[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
-    return alike
+            uniform[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
+    return uniform
 
 
 def warn_of_odd_states(what: str, partial: PartialMap) -> None:

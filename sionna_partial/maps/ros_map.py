@@ -158,7 +158,7 @@ def _layer(
         raise MapError(f"{path}: the image of {name} is of another size or kind: give {what}")
     cells, (listed, values) = np.flipud(np.asarray(image)), counted
     if None in values:
-        raise MapError(f"{path}: {name} names none of its {listed} at place {values.index(None) + 1}: give each one.")
+        raise MapError(f"{path}: {name} names none of its {listed} at entry {values.index(None) + 1}: give each one.")
     if cells.max(initial=0) > len(values):
         what = f"has shades up to {cells.max()} for {len(values)} {listed}"
         raise MapError(f"{path}: {name} {what}: list one for each shade from 1 on.")

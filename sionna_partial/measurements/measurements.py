@@ -367,11 +367,11 @@ def measurements_of_others(
         usable &= partial.radios_can_stand(ends_m)
         usable[usable] = clear_of_walls(partial, ends_m[usable])
     measured = measured.take(usable)
-    places_m, of_place = np.unique(measured.tx, axis=0, return_inverse=True)
+    places_m, of_position = np.unique(measured.tx, axis=0, return_inverse=True)
     apart_m = np.min([np.linalg.norm(places_m - tx_m, axis=1) for tx_m in sources_m], axis=0)
     others = []
-    for place in np.argsort(apart_m, kind="stable")[:MOST_OTHERS]:
-        links = np.flatnonzero(of_place.ravel() == place)
+    for position in np.argsort(apart_m, kind="stable")[:MOST_OTHERS]:
+        links = np.flatnonzero(of_position.ravel() == position)
         others.append(measured.take(links[np.unique(np.linspace(0, len(links) - 1, MOST_OF_OTHER).astype(int))]))
     return others
 

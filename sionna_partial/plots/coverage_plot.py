@@ -208,7 +208,7 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
     """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque.
 
-    Of a partial map it says that gains are those of receivers indoors, unless they are of receivers anywhere.
+    For a partial map it states that gains are those of receivers indoors, unless they are of receivers anywhere.
     """
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:

@@ -96,7 +96,7 @@ standard deviation of the path gain, an outage counts &minus;150 dB. {several} P
 
 
 def coverage_page(coverage: xr.Dataset) -> bytes:
-    """Return the HTML page of a coverage map, which needs nothing beside it. Equal maps give equal pages."""
+    """Return the HTML page of a coverage map, which needs no other file. Equal maps give equal pages."""
     from bokeh.embed import json_item
     from bokeh.resources import Resources
 

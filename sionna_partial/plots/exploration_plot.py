@@ -54,7 +54,7 @@ _VIEW_OPACITY = 0.35
 _WIDTH_IN, _DPI, _VIEWS_DPI = 8.0, 165, 130
 _AROUND_M, _VIEW_M, _VIEW_DEG = 1.5, 0.9, 60.0
 _FRAME_IN, _FRAME_DPI = 5.6, 90
-_MIXED_COLOURS, _ALIKE = 128, 16
+_MIXED_COLOURS, _NEAR = 128, 16
 _MAX_COVERAGE = Image.Quantize.MAXCOVERAGE
 _SPACING_M, _PALEST = 0.3, 0.35
 _PREDICTED = {
@@ -197,7 +197,7 @@ def _palette(frame: Image.Image) -> Image.Image:
     drawn = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
     exact = np.rint(255 * drawn).astype(int)
     mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
-    apart = np.abs(mixed[:, None] - exact).max(axis=2).min(axis=1) > _ALIKE
+    apart = np.abs(mixed[:, None] - exact).max(axis=2).min(axis=1) > _NEAR
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate([exact, mixed[apart]]).ravel().tolist())
     return palette

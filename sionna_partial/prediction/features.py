@@ -367,7 +367,7 @@ def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats
 
 @dataclass(frozen=True, eq=False)
 class LinkFeatures(Shown):
-    """Features of N links, or T N: those of the paper (eq. 8), and what the other predictors need beside them.
+    """Features of N links, or T N: those of the paper (eq. 8), and what the other predictors need in addition.
 
     Parameters
     ----------

@@ -57,7 +57,7 @@ LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 """Of AdamW; the rate falls to 0 along a cosine."""
 
 GAIN_WEIGHT = 0.05
-"""Weight of the score of the gain beside the log-likelihood of the link state [1/dB]."""
+"""Weight of the score of the gain against the log-likelihood of the link state [1/dB]."""
 
 WIDENING, SEEN_WIDENING = 0.15, 0.5
 """By how much standard deviations are larger on maps of full noise, and where both ends are observed.
@@ -96,8 +96,8 @@ def _shapes_of(table: Mapping[str, Any]) -> tuple[Mapping[str, Shapes], ...]:
 
 
 CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = ({}, *_shapes_of(LINK_INPUTS), *_shapes_of(WALL_INPUTS))
-"""Inputs and outputs of the networks that a predictor may have beside the paper's: none, "paths", or "map"; the last
-two where paths go through walls."""
+"""Inputs and outputs of the networks that a predictor may have in addition to the paper's: none, "paths", or "map";
+the last two where paths go through walls."""
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:

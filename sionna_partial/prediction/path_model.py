@@ -1,7 +1,7 @@
 """Paths where nothing was seen: which traced paths survive, and which others there are.
 
 A small network gives the probability that a path traced on a partial map exists in the building. What the trace lacks
-is taken from links of homes of `make_home` that are alike, among those of the same link state: their paths that a
+is taken from similar links of the same link state in homes of `make_home`: their paths that a
 partial map did not show, turned to the direct line of the link (the method of analogues; Lorenz, Atmospheric
 Predictability as Revealed by Naturally Occurring Analogues, 1969). `path_training` makes both.
 """
@@ -35,7 +35,7 @@ from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
 
 STATES = (LinkState.LOS, LinkState.NLOS)
 
-ALIKE = 8
+ANALOGUES = 8
 """Number of analogues from which one is drawn."""
 
 _SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0]])
@@ -43,7 +43,7 @@ _SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0
 unobserved length, gain of the surviving paths above that of the link [dB], whether each end is in an observed cell."""
 
 _NEARLY = 0.3
-"""How much less alike than the most alike, as a fraction, an analogue may be."""
+"""How much farther than the nearest link, as a fraction, an analogue may be."""
 
 _TURN_DEG = (6, 3)
 """Steps of zenith and azimuth in which directions of departure are counted [degree]."""
@@ -161,11 +161,11 @@ class PathModel:
         return np.asarray(expit((values @ self.weights[4] + self.weights[5])[:, 0]))
 
     def analogues(self, state: LinkState, keys: Floats, quantile: Floats) -> Indices:
-        """Numbers (L,) of analogues of links of one state: of those alike, that of a quantile (L,) of delay spread."""
+        """Numbers (L,) of analogues of links of one state: the similar link at a quantile (L,) of delay spread."""
         tree, start = self._trees[STATES.index(state)]
-        ranks = np.arange(1, min(ALIKE, tree.n) + 1)
-        alike = tree.query(keys, k=ranks, eps=_NEARLY, workers=core_count())[1] + start
-        order = np.take_along_axis(alike, np.argsort(self.spread_ns[alike], axis=1), axis=1)
+        ranks = np.arange(1, min(ANALOGUES, tree.n) + 1)
+        similar = tree.query(keys, k=ranks, eps=_NEARLY, workers=core_count())[1] + start
+        order = np.take_along_axis(similar, np.argsort(self.spread_ns[similar], axis=1), axis=1)
         chosen = (quantile * order.shape[1]).astype(np.intp)
         return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]
 

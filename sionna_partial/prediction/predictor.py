@@ -100,7 +100,7 @@ NOISY = TraceErrors(0.35, 25.0, 16.0, 0.02, -12.0, 7.0, 0.75, 0.16, 0.5, 3.5, 0.
 MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
 
 NOISY_TRUST = 0.5
-"""Weight of the trace beside the networks on nearly complete maps of full noise; it is 1 on exact ones."""
+"""Weight of the trace against the networks on nearly complete maps of full noise; it is 1 on exact ones."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +295,7 @@ class Predictor(Shown):
     and log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved
     distance for each partial link state; it is 1 until `fit_indoor`, as the paper has every receiver indoors.
 
-    With settings other than "paper", networks beside these read what each path crosses, and the map around the
+    With settings other than "paper", further networks read what each path crosses, and the map around the
     transmitter (`map_networks`). They predict links whose features have a context; where the map is complete, the trace
     itself is the prediction. For features without a context the paper's networks predict, fitted to the same links.
 
@@ -360,7 +360,7 @@ class Predictor(Shown):
         """Train on links of known truth; the same links and settings give the same weights.
 
         Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, and by the
-        continuous ranked probability score (CRPS) in those beside them.
+        continuous ranked probability score (CRPS) in the others.
 
         Parameters
         ----------
@@ -561,7 +561,7 @@ class Predictor(Shown):
 
 
 class OtherPredictor:
-    """A model of the user's in the place of a `Predictor`: any object with `predict(phi)`.
+    """A model of the user in place of a `Predictor`: any object with `predict(phi)`.
 
     It gets the `LinkFeatures` of N links that are not certain, and returns a `LinkPrediction`, or a mapping with arrays
     (N,) `p_los`, `p_nlos`, `p_outage`, and means and standard deviations of the gain [dB]: `gain_mean_db` and

@@ -93,7 +93,7 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
     card = _read_card(path.with_suffix(".json"))
     if card["sha256"] != digest(archive):
         raise PredictorError(
-            f"path = '{path}' has SHA-256 {digest(archive)}, but its card says {card['sha256']!r}: the file is "
+            f"path = '{path}' has SHA-256 {digest(archive)}, but its card has {card['sha256']!r}: the file is "
             "truncated, was changed, or belongs to another card; copy both files again, or train anew."
         )
     _require_our_kind(path, archive)

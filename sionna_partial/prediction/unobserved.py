@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap, alike_cells
+from sionna_partial.maps.partial_map import PartialMap, uniform_cells
 from sionna_partial.process import core_count, in_order, njit
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
@@ -94,20 +94,20 @@ def in_cells(partial: PartialMap, points_m: Floats) -> Floats:
 
 def map_line_fractions(partial: PartialMap, starts: Floats, ends: Floats) -> Floats:
     """Return `line_fractions` on the cells of a map."""
-    return line_fractions(partial.state, starts, ends, partial.alike_cells)
+    return line_fractions(partial.state, starts, ends, partial.uniform_cells)
 
 
-def line_fractions(state: States, starts: Floats, ends: Floats, alike: NDArray[np.int32] | None = None) -> Floats:
+def line_fractions(state: States, starts: Floats, ends: Floats, uniform: NDArray[np.int32] | None = None) -> Floats:
     """Return the fractions (N, 3), in [0, 1], of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
 
-    All cells outside the grid are unknown. `alike` is what `alike_cells` returns of `state`, where it is at hand.
+    All cells outside the grid are unknown. `uniform` is what `uniform_cells` returns of `state`, where it is at hand.
     """
-    alike = alike_cells(state) if alike is None else alike
+    uniform = uniform_cells(state) if uniform is None else uniform
     fractions = np.zeros((len(ends), len(CellState)))
     bounds = np.linspace(0, len(ends), 1 + min(core_count(), 1 + len(ends) // _SEGMENTS_PER_CORE)).astype(int)
 
     def fill(block: slice) -> None:
-        _fill_fractions(state, alike, starts[block], ends[block], fractions[block])
+        _fill_fractions(state, uniform, starts[block], ends[block], fractions[block])
 
     blocks = itertools.starmap(slice, itertools.pairwise(bounds))
     for _ in map(fill, blocks) if len(bounds) == 2 else in_order(fill, blocks):
@@ -171,7 +171,7 @@ def leave_cells(
 
 
 @njit(cache=True, nogil=True)
-def _fill_fractions(state: States, alike: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats) -> None:
+def _fill_fractions(state: States, uniform: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats) -> None:
     """Add the fractions of segments in cells of each state to `fractions` (N, 3), over cells of one state at once."""
     ny, nx = state.shape
     for i in range(len(ends)):
@@ -183,7 +183,7 @@ def _fill_fractions(state: States, alike: NDArray[np.int32], starts: Floats, end
             column = line_x - 1 if segment.step_x > 0.0 else line_x
             row = line_y - 1 if segment.step_y > 0.0 else line_y
             within = 0 <= row < ny and 0 <= column < nx
-            skip = alike[row, column] if within and not along else 0
+            skip = uniform[row, column] if within and not along else 0
             there, line_x, line_y = leave_cells(segment, line_x, line_y, skip, here, leave)
             if along:
                 middle = 0.5 * (here + there)

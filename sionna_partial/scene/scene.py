@@ -33,7 +33,7 @@ from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSetti
 _log = logging.getLogger(__name__)
 
 FLAT_SHAPES = ("floor", "ceiling")
-"""Shapes of an exported floor plan beside its walls."""
+"""Shapes of an exported floor plan other than its walls."""
 
 
 SIONNA_LOAD_GHZ = 3.5

@@ -35,7 +35,7 @@ class Camera:
         rows, columns = ((np.arange(size) * resolution_m // MISSED_PATCH_M).astype(np.intp) for size in truth.shape)
         missed = rng.random((rows[-1] + 1, columns[-1] + 1)) < sensor.missed_wall_fraction
         self._missed = missed[np.ix_(rows, columns)]
-        self._reach = sensor.range_m / resolution_m
+        self._range_cells = sensor.range_m / resolution_m
         self._view_deg = sensor.field_of_view_deg
         self._noise = sensor.range_noise_m / resolution_m
         self._rng = rng
@@ -47,16 +47,16 @@ class Camera:
 
         The cells `under` the robot (N, 2), rows and columns where it believes to be, are free.
         """
-        angles = _ray_angles(heading_deg, self._view_deg, self._reach)
+        angles = _ray_angles(heading_deg, self._view_deg, self._range_cells)
         noise = self._noise * self._rng.standard_normal(len(angles))
         middle = np.array([y + shift[1], x + shift[0]])
-        reach = max(self._reach, float(np.abs(under - middle).max(initial=0.0)))
-        corner = np.clip(middle - reach - 1, 0, self.seen.shape).astype(np.intp)
-        end = np.clip(middle + reach + 2, 0, self.seen.shape).astype(np.intp)
+        range_cells = max(self._range_cells, float(np.abs(under - middle).max(initial=0.0)))
+        corner = np.clip(middle - range_cells - 1, 0, self.seen.shape).astype(np.intp)
+        end = np.clip(middle + range_cells + 2, 0, self.seen.shape).astype(np.intp)
         part = slice(corner[0], end[0]), slice(corner[1], end[1])
         log_odds, seen = self._log_odds[part], self.seen[part]
         view = np.full_like(seen, _UNKNOWN)
-        rays = _Rays((x, y), shift, angles, noise, self._reach)
+        rays = _Rays((x, y), shift, angles, noise, self._range_cells)
         _cast_rays(self._truth, self._missed, view, (int(corner[0]), int(corner[1])), rays)
         rows, columns = (under - corner).T
         view[rows, columns] = _FREE
@@ -71,17 +71,19 @@ def unknown_in_view(
     state: States, cell: Indices, headings_deg: Floats, cell_m: float, sensor: SensorSettings
 ) -> list[Indices]:
     """Unknown cells (N, 2) that a picture taken in a cell would show if none of them were walls, for each heading."""
-    reach = sensor.range_m / cell_m
-    low = np.maximum(cell - math.ceil(reach) - 2, 0)
-    window = state[tuple(slice(start, end + math.ceil(reach) + 3) for start, end in zip(low, cell, strict=True))]
+    range_cells = sensor.range_m / cell_m
+    low = np.maximum(cell - math.ceil(range_cells) - 2, 0)
+    window = state[tuple(slice(start, end + math.ceil(range_cells) + 3) for start, end in zip(low, cell, strict=True))]
     window = np.pad(window, 1, constant_values=_WALL)
     bright, missed = np.where(window == _WALL, window, np.uint8(_FREE)), np.zeros(window.shape, dtype=np.bool_)
     row, column = cell - low + 1.5
     shown = []
     for heading_deg in headings_deg:
         view = np.full_like(window, _UNKNOWN)
-        angles = _ray_angles(heading_deg, sensor.field_of_view_deg, reach)
-        _cast_rays(bright, missed, view, (0, 0), _Rays((column, row), (0.0, 0.0), angles, np.zeros_like(angles), reach))
+        angles = _ray_angles(heading_deg, sensor.field_of_view_deg, range_cells)
+        _cast_rays(
+            bright, missed, view, (0, 0), _Rays((column, row), (0.0, 0.0), angles, np.zeros_like(angles), range_cells)
+        )
         shown.append(np.argwhere((view == _FREE) & (window == _UNKNOWN)) + low - 1)
     return shown
 
@@ -89,17 +91,17 @@ def unknown_in_view(
 def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Floats:
     """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
-    reach = sensor.range_m / home.resolution_m
+    range_cells = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
-    angles = _ray_angles(float(pose[2]), sensor.field_of_view_deg, reach)
-    ranges_m = _ranges(truth, float(x), float(y), angles, reach) * home.resolution_m
+    angles = _ray_angles(float(pose[2]), sensor.field_of_view_deg, range_cells)
+    ranges_m = _ranges(truth, float(x), float(y), angles, range_cells) * home.resolution_m
     ends = pose[:2] + ranges_m[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return np.concatenate([pose[None, :2], ends])
 
 
-def _ray_angles(heading_deg: float, view_deg: float, reach: float) -> Floats:
+def _ray_angles(heading_deg: float, view_deg: float, range_cells: float) -> Floats:
     """Directions of the rays [radian], at most half a cell apart where they end."""
-    rays = int(2 * math.radians(view_deg) * reach) + 2
+    rays = int(2 * math.radians(view_deg) * range_cells) + 2
     return math.radians(heading_deg) + math.radians(view_deg) * (np.arange(rays) / (rays - 1) - 0.5)
 
 
@@ -110,7 +112,7 @@ class _Rays(NamedTuple):
     shift: tuple[float, float]
     angles: Floats
     noise: Floats
-    reach: float
+    range_cells: float
 
 
 class _Walk(NamedTuple):
@@ -138,9 +140,9 @@ def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-de
 
     Where rays disagree about a cell, a wall counts (as in OctoMap).
     """
-    (x, y), shift, angles, noise, reach = rays
+    (x, y), shift, angles, noise, range_cells = rays
     for ray in range(len(angles)):
-        echo, reading = _read(truth, missed, x, y, angles[ray], reach)
+        echo, reading = _read(truth, missed, x, y, angles[ray], range_cells)
         reading += noise[ray]
         walk = _start(x + shift[0], y + shift[1], angles[ray])
         row, column = walk.row - corner[0], walk.column - corner[1]
@@ -149,7 +151,7 @@ def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-de
                 if echo == _WALL_ECHO:
                     view[row, column] = _WALL
                 break
-            if walk.enters > reach:
+            if walk.enters > range_cells:
                 break
             if view[row, column] == _UNKNOWN:
                 view[row, column] = _FREE
@@ -158,24 +160,24 @@ def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _ranges(truth, x, y, angles, reach):  # type: ignore[no-untyped-def]
+def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
     """Length of each ray [cells]."""
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
-        ranges[ray] = _read(truth, missed, x, y, angles[ray], reach)[1]
+        ranges[ray] = _read(truth, missed, x, y, angles[ray], range_cells)[1]
     return ranges
 
 
 @njit(cache=True)
-def _read(truth, missed, x, y, angle, reach):  # type: ignore[no-untyped-def]
+def _read(truth, missed, x, y, angle, range_cells):  # type: ignore[no-untyped-def]
     """Return what ends a ray (a wall that is noticed, one that is not, or nothing), and a distance within that cell."""
     walk = _start(x, y, angle)
-    while walk.enters <= reach:
+    while walk.enters <= range_cells:
         if truth[walk.row, walk.column] != _FREE:
             noticed = truth[walk.row, walk.column] == _WALL and not missed[walk.row, walk.column]
             return (_WALL_ECHO if noticed else _NO_ECHO), (walk.enters + walk.leaves) / 2
         walk = _next(walk)
-    return _FAR, reach
+    return _FAR, range_cells
 
 
 @njit(cache=True)

@@ -50,10 +50,10 @@ LOCKED_FRACTION = 0.25
 """Fraction of the rooms at dead ends that stay locked, on average."""
 
 SHUT_FRACTION = 0.9
-"""Fraction of the homes in which locked rooms are free all the same, out of reach, as on scans of real homes."""
+"""Fraction of the homes in which locked rooms are free all the same, without a door, as on scans of real homes."""
 
 SHUT_AREA = 0.2
-"""Largest area of all such rooms of a home, as a fraction of the area within reach."""
+"""Largest area of all such rooms of a home, as a fraction of the area that can be reached."""
 
 LEAF_FRACTION = 0.2
 """Fraction of the doors whose leaf stands open into a room."""
@@ -130,7 +130,7 @@ def make_home(
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
     locked_rooms : bool
-        Whether the home may have free rooms that are out of reach, behind closed doors too; the rest of it does not
+        Whether the home may have free rooms that cannot be reached, behind closed doors too; the rest of it does not
         depend on it.
 
     Returns
@@ -289,9 +289,9 @@ def _rooms(rng: Rng, outline: Polygon, style: _Style) -> Iterator[Polygon]:
         x0, y0, x1, y1 = outline.bounds
         x, y = np.array([x0, y0]) + rng.uniform(0.35, 0.65, 2) * (x1 - x0, y1 - y0)
         half = (rng.uniform(*style.corridor_width) + style.wall) / 2
-        reach = rng.choice([1.0, rng.uniform(0.5, 0.9)])
-        along_x = box(x0, y - half, x0 + reach * (x1 - x0), y + half)
-        along_y = box(x - half, y0, x + half, y0 + reach * (y1 - y0))
+        fraction = rng.choice([1.0, rng.uniform(0.5, 0.9)])
+        along_x = box(x0, y - half, x0 + fraction * (x1 - x0), y + half)
+        along_y = box(x - half, y0, x + half, y0 + fraction * (y1 - y0))
         strip, other = (along_y, along_x) if y1 - y0 > x1 - x0 else (along_x, along_y)
         corridor = strip.union(other) if rng.random() < 0.3 else strip
         yield from parts_of(outline.intersection(corridor))

@@ -207,21 +207,21 @@ class Robot:
 
     def _bump(self, goal: Indices) -> None:
         """Avoid what stopped the robot; take no frontier any more at a goal that is too near to be approached."""
-        reach = _BUMP_M / self._cell_m
+        apart = _BUMP_M / self._cell_m
         angle, (x, y) = math.radians(self.heading_deg), self.believed_position
-        x, y = x + math.cos(angle) * reach / 2, y + math.sin(angle) * reach / 2
-        rows, columns = self._cells_around(y, x, reach)
-        self._bumps[rows, columns] |= np.hypot(rows + 0.5 - y, columns + 0.5 - x) < reach / 2
-        if self._distances_to(goal) < 2 * reach:
-            rows, columns = self._cells_around(int(goal[0]), int(goal[1]), reach)
-            self._given_up[rows, columns] |= np.hypot(rows - goal[0], columns - goal[1]) <= reach
+        x, y = x + math.cos(angle) * apart / 2, y + math.sin(angle) * apart / 2
+        rows, columns = self._cells_around(y, x, apart)
+        self._bumps[rows, columns] |= np.hypot(rows + 0.5 - y, columns + 0.5 - x) < apart / 2
+        if self._distances_to(goal) < 2 * apart:
+            rows, columns = self._cells_around(int(goal[0]), int(goal[1]), apart)
+            self._given_up[rows, columns] |= np.hypot(rows - goal[0], columns - goal[1]) <= apart
         self._route = None
 
-    def _cells_around(self, row: float, column: float, reach: float) -> tuple[Indices, Indices]:
+    def _cells_around(self, row: float, column: float, apart: float) -> tuple[Indices, Indices]:
         """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
         ny, nx = self.seen.shape
-        rows = np.arange(max(0, int(row - reach)), max(0, min(ny, int(row + reach) + 2)))
-        columns = np.arange(max(0, int(column - reach)), max(0, min(nx, int(column + reach) + 2)))
+        rows = np.arange(max(0, int(row - apart)), max(0, min(ny, int(row + apart) + 2)))
+        columns = np.arange(max(0, int(column - apart)), max(0, min(nx, int(column + apart) + 2)))
         return rows[:, None], columns[None]
 
 

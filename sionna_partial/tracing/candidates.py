@@ -36,8 +36,8 @@ class Candidates:
     the transmitter, 0 where there is none. `face` (C, D) is the face of the scene there, counted through its shapes:
     any of the faces in one plane stands for all, the 0-face for an edge, and -1 for none. `vertices_m` (C, D, 3) are
     the points of interaction [m]. If all candidates are diffracted, `wedge` (C,) is the one of `wedges` where each is.
-    If any candidate goes through walls, `same_wall` (C, D) marks refractions at further faces of a wall that has been
-    crossed: they cost nothing.
+    If any candidate goes through walls, `same_wall` (C, D) is True for refractions at further faces of a wall that
+    has been crossed: they cost nothing.
     """
 
     rx: NDArray[np.int32]

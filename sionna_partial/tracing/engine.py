@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 
 def load_sionna() -> ModuleType:
-    """Import Sionna RT on the CPU, with a working LLVM; raise a BackendError that says what to do if that fails."""
+    """Import Sionna RT on the CPU, with a working LLVM; raise a BackendError with the remedy if that fails."""
     load_llvm()
     with signals_held():
         import mitsuba as mi

@@ -152,7 +152,7 @@ KINDS = (
 )
 
 STOPPED = COMMANDS | {"dataset": "OUT --homes 2", "train": "LINKS --out OUT --networks paper --test-fraction 0"}
-"""Subcommands that are told to end in the middle of what they do, and then called again."""
+"""Subcommands that get a signal in the middle of what they do, and are then called again."""
 
 STOPPED_AFTER_S = (0.1, 10.0)
 """When, in processor time; before, Python itself starts, and answers Ctrl-C with a traceback."""
@@ -237,7 +237,7 @@ def _signals(seed: int) -> Iterator[Case]:
     rng = random.Random(seed)
     for name, usual in STOPPED.items():
         words, number, after_s = [name, *usual.split()], rng.choice(SIGNALS), rng.uniform(*STOPPED_AFTER_S)
-        stop = f"words = [{_arguments_of(words)}]\nmust_end_when_told(words, signal.{number}, {after_s})\n"
+        stop = f"words = [{_arguments_of(words)}]\nmust_end_at_signal(words, signal.{number}, {after_s})\n"
         again = "try:\n    command(*words)\nexcept Exception as error:\n    raise Wrong(str(error)) from error\n"
         yield Case("signals", f"{name}: {number} after {after_s:.2f} s", _INPUTS + stop + again, is_random=True)
 

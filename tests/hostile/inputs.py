@@ -60,8 +60,8 @@ def must_end_in_one_line(result: subprocess.CompletedProcess[str], *codes: int) 
         raise Wrong(f"exit {result.returncode}: {result.stderr[-1500:]}")
 
 
-def must_end_when_told(words: Sequence[object], number: signal.Signals, after_s: float) -> None:
-    """Start a command, send it a signal, and raise `Wrong` if it is late, says more than a line, or leaves something.
+def must_end_at_signal(words: Sequence[object], number: signal.Signals, after_s: float) -> None:
+    """Start a command, send it a signal, and raise `Wrong` if it is late, prints more than a line, or leaves something.
 
     Times are those of the processor, which other programs do not change. A process that was killed may leave hidden
     folders, which the next start removes.

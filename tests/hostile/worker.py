@@ -65,9 +65,9 @@ def run(code: str, folder: Path) -> tuple[str, str]:
 
 def left_behind(folder: Path) -> list[Path]:
     """Return the hidden and temporary folders that no living process holds."""
-    places = ((folder.rglob, ".tmp-*"), (Path(tempfile.gettempdir()).glob, "sionna_partial_*"))
+    leftovers = ((folder.rglob, ".tmp-*"), (Path(tempfile.gettempdir()).glob, "sionna_partial_*"))
     left = []
-    for path in sorted(each for find, pattern in places for each in find(pattern)):
+    for path in sorted(each for find, pattern in leftovers for each in find(pattern)):
         with contextlib.suppress(OSError):  # it is locked, or was removed meanwhile
             descriptor = os.open(path, os.O_RDONLY)
             try:
