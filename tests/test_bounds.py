@@ -69,7 +69,7 @@ class TestDiffraction:
             utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
             for boundary in (1.0, 10.0, 100.0):
                 level = 1.0, 0.0, (1.0, 0.0, 1.0)
-                exact = at_edge(table.faces, 0, table.transition, terms, boundary, -1.0, -1.0, *level)
+                exact = at_edge((table.faces, table.transition), 0, terms, boundary, (-1.0, -1.0), *level)
                 assert exact[0] <= 1.03 * most_at_edge(terms, boundary, 1.0, 1.0)
 
 

@@ -29,7 +29,6 @@ def test_the_numbers_are_those_of_sionna_rt() -> None:
 def test_each_kind_is_complete(kind: Interaction) -> None:
     assert {*kind.arguments} < {*signature(load_sionna().PathSolver.__call__).parameters}
     assert not kind.setting or hasattr(sp.TraceSettings(), kind.setting)
-    assert not kind.exact_on or (kind.coefficients is not None and kind.bound is not None)
 
 
 def test_by_default_candidates_alone_find_the_paths() -> None:

@@ -155,11 +155,13 @@ def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def at_edge(faces, material, transition, terms, boundary, cosine_0, cosine_n, sine, slope, field):  # type: ignore[no-untyped-def]
+def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):  # type: ignore[no-untyped-def]
     """Bounds of a field after a diffraction likewise, but for the spread of the wave.
 
-    `boundary` is sqrt(2 k L); `cosine_0` and `cosine_n` are those of the angles of incidence at both faces.
+    `tables` are `faces` and `transition` of `Strengths`, `boundary` is sqrt(2 k L), and `cosines` are those of the
+    angles of incidence at both faces.
     """
+    (faces, transition), (cosine_0, cosine_n) = tables, cosines
     by_0 = utd_term(transition, terms, 0, boundary) - utd_term(transition, terms, 3, boundary)
     by_n = utd_term(transition, terms, 1, boundary) - utd_term(transition, terms, 2, boundary)
     size_0, size_n = _size(by_0), _size(by_n)

@@ -1,19 +1,17 @@
-"""The kinds of interactions of paths: who finds them, whether they can be differentiated, what they leave of a field.
+"""The kinds of interactions of paths: who finds them, and which setting switches them on.
 
 What depends on the kind of an interaction is decided by this table. One more kind is one more row. Sionna RT's rays
 then find its paths. To find every one, on a plan or a mesh, it takes candidates as well: a class with `blocks` in
 `tracing/plan` or `tracing/mesh`, which writes the number of the kind into `Candidates.kind`, leaves out what is weak by
-the bound of its power, and is listed by the scene in `finder.py`. Sionna RT verifies candidates of any kind.
+a bound of its power (`bounds.py`), and is listed by the scene in `finder.py`. Sionna RT verifies candidates of any
+kind.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 from sionna_partial.maps.environment import EnvironmentKind
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.bounds import at_edge, reflected_power, transmitted_power
-from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
 
 
 @dataclass(frozen=True)
@@ -30,9 +28,6 @@ class Interaction:
         Arguments of Sionna RT's path solver that switch it on where rays find its paths.
     exact_on : tuple
         Kinds of maps on which candidates find every path. These paths can be differentiated; those of rays cannot.
-    coefficients, bound : callable or None
-        Its coefficients TE and TM (`slab.py`), and the bound of what it leaves of a field or its power (`bounds.py`).
-        The coefficients of an edge follow from those of its faces.
     default : callable
         Whether paths have it where the setting is None and candidates find it.
     """
@@ -41,8 +36,6 @@ class Interaction:
     setting: str
     arguments: tuple[str, ...]
     exact_on: tuple[EnvironmentKind, ...]
-    coefficients: Callable[..., Any] | None = None
-    bound: Callable[..., Any] | None = None
     default: Callable[[TraceSettings], bool] = lambda _: True
 
     def is_on(self, settings: TraceSettings) -> bool:
@@ -51,13 +44,10 @@ class Interaction:
 
 
 INTERACTIONS = (
-    Interaction(1, "", ("specular_reflection",), ("plan", "mesh"), reflection_coefficients, reflected_power),
+    Interaction(1, "", ("specular_reflection",), ("plan", "mesh")),
     Interaction(2, "diffuse_reflection", ("diffuse_reflection",), ()),
-    Interaction(
-        *(4, "refraction", ("refraction",), ("plan", "mesh"), transmission_coefficients, transmitted_power),
-        default=lambda settings: settings.through_walls,
-    ),
-    Interaction(8, "diffraction", ("diffraction", "edge_diffraction"), ("plan",), reflection_coefficients, at_edge),
+    Interaction(4, "refraction", ("refraction",), ("plan", "mesh"), lambda settings: settings.through_walls),
+    Interaction(8, "diffraction", ("diffraction", "edge_diffraction"), ("plan",)),
 )
 """All kinds of interactions."""
 

@@ -17,7 +17,7 @@ from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFLECTION
 from sionna_partial.tracing.mesh.planes import MeshPlanes, face_at
-from sionna_partial.tracing.mesh.sequences import Rays, collect_sequences, view_sequences
+from sionna_partial.tracing.mesh.sequences import Rays, Sequences, Views, collect_sequences, view_sequences
 
 REACH, REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
@@ -51,6 +51,15 @@ class View(NamedTuple):
     reach: float
 
 
+class Images(NamedTuple):
+    """Images of a transmitter: sequences of planes, their views, the planes, and the material of each face (F,)."""
+
+    sequences: Sequences
+    views: Views
+    planes: MeshPlanes
+    material: NDArray[np.int64]
+
+
 class _Found(NamedTuple):
     """Columns of candidates, as in `Candidates`."""
 
@@ -75,12 +84,12 @@ class MeshCandidates:
         rx_m: NDArray[np.float64],
         max_depth: int,
     ) -> None:
-        self._material, self._size, self._planes = material, max(1, max_depth), planes
-        self._sequences = collect_sequences(rays, self._planes)
-        self._views = view_sequences(self._sequences, self._planes, np.asarray(tx_m, np.float64))
+        sequences, self._size = collect_sequences(rays, planes), max(1, max_depth)
+        views = view_sequences(sequences, planes, np.asarray(tx_m, np.float64))
+        self._images = Images(sequences, views, planes, material)
         self._rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
         self._boxes = divide(self._rx_m)
-        self._best = np.zeros(self._sequences.size, np.uint8)  # level of the strongest candidate of each sequence
+        self._best = np.zeros(sequences.size, np.uint8)  # level of the strongest candidate of each sequence
 
     def blocks(
         self, strengths: Strengths, *, receivers_per_block: int = 1_000_000
@@ -96,7 +105,8 @@ class MeshCandidates:
         while done < count:
             rx, face, points, done = _next_block(
                 done,
-                (self._sequences, self._views, self._planes, self._boxes, self._material),
+                self._images,
+                self._boxes,
                 self._rx_m,
                 self._size,
                 strengths,
@@ -133,12 +143,12 @@ def divide(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_block(first, mesh, rx_m, depth, strengths, best, block):  # type: ignore[no-untyped-def]
+def _next_block(first, images, boxes, rx_m, depth, strengths, best, block):  # type: ignore[no-untyped-def]
     """Candidates of the sequences from number `first` in the order on, and where to go on.
 
     A block ends once the sequences in it have been in view of `block` receivers in sum.
     """
-    sequences, views, planes, boxes, material = mesh
+    sequences, views, planes, _ = images
     out = _Found(np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3)))
     seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     count, in_view, done, weakest = 0, 0, first, strengths.last.max()
@@ -156,7 +166,7 @@ def _next_block(first, mesh, rx_m, depth, strengths, best, block):  # type: igno
             size = count + number
             out = _Found(grow(out.rx, size), grow(out.face, size), grow(out.points, size))
             ends = seen[:number]
-            count = _fold(node, ends, sequences, views, planes, material, rx_m, strengths, best, out, count)
+            count = _fold(node, ends, images, rx_m, strengths, best, out, count)
             in_view += number
     return out.rx[:count].copy(), out.face[:count].copy(), out.points[:count].copy(), done
 
@@ -243,13 +253,13 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best, out, count):  # type: ignore[no-untyped-def]
+def _fold(node, found, images, rx_m, strengths, best, out, count):  # type: ignore[no-untyped-def]
     """Append the candidates among the receivers found for a sequence, and return the new number of candidates."""
     rx, face, points = out
-    mesh, depth = (sequences, views, planes, material), views.depth[node]
+    depth = images.views.depth[node]
     for target in found:
         power = fold_line(
-            node, rx_m[target], mesh, strengths.largest, strengths.wavelength_m, face[count], points[count]
+            node, rx_m[target], images, strengths.largest, strengths.wavelength_m, face[count], points[count]
         )
         if power >= 0.0:
             level = level_of(power)
@@ -266,12 +276,12 @@ def _fold(node, found, sequences, views, planes, material, rx_m, strengths, best
 
 
 @njit(cache=True)
-def fold_line(node, target, mesh, largest, wavelength, face, points):  # type: ignore[no-untyped-def]
+def fold_line(node, target, images, largest, wavelength, face, points):  # type: ignore[no-untyped-def]
     """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
 
     Returns a bound on the power of the path, or -1 where the line, folded back, misses a plane of the sequence.
     """
-    sequences, views, planes, material = mesh
+    sequences, views, planes, material = images
     parent, plane, sources, depth = sequences.parent, sequences.plane, views.source_m, views.depth[node]
     normals, offsets, bins = planes.normal, planes.offset_m, planes.bins
     x, y, z = target[0], target[1], target[2]

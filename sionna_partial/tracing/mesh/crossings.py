@@ -17,10 +17,11 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.candidates import Candidates
-from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+from sionna_partial.tracing.interactions import REFLECTION
 from sionna_partial.tracing.mesh.candidates import (
     REACH,
     REACH_M,
+    Images,
     View,
     bound_view,
     divide,
@@ -35,7 +36,7 @@ from sionna_partial.tracing.mesh.walls import SolidMesh, is_inside, mark_walls, 
 from sionna_partial.tracing.plan.crossing_beams import Limits, rarer_by
 from sionna_partial.tracing.plan.crossings import MOST_REFLECTIONS, RARER, least_power, weakest_needed
 from sionna_partial.tracing.plan.legs import SHORTEST_LEG_M
-from sionna_partial.tracing.plan.slabs import COSINES
+from sionna_partial.tracing.plan.slabs import at_slab, received_power, vertical_field
 
 _RAYS = 20_000
 """Number of rays that are split at faces; fewer where fewer are asked for."""
@@ -181,39 +182,17 @@ def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
     first = entries.point_m[0] if count else target
     kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
     total = np.sqrt(kx * kx + ky * ky + kz * kz)
-    kx, ky, kz = kx / total, ky / total, kz / total
-    norm = max(np.hypot(kx, ky), 1e-12)
-    ex, ey, ez = complex(kx * kz / norm), complex(ky * kz / norm), complex(-norm)
+    k = kx / total, ky / total, kz / total
+    e = vertical_field(k)
     for j in range(count):
         here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
         total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)
-        if entries.same_wall[j]:
-            continue
-        face = entries.face[j]
-        p, material = planes.plane[face], slabs.material[face]
-        nx, ny, nz = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
-        along = kx * nx + ky * ny + kz * nz
-        at = min(abs(along), 1.0) * COSINES
-        low = min(int(at), COSINES - 1)
-        part = at - low
-        sx, sy, sz = ky * nz - kz * ny, kz * nx - kx * nz, kx * ny - ky * nx
-        norm = np.sqrt(sx * sx + sy * sy + sz * sz)
-        if norm < 1e-9:
-            sx, sy, sz, norm = (-nz, 0.0, nx, np.hypot(nx, nz)) if abs(ny) < 0.5 else (0.0, nz, -ny, np.hypot(ny, nz))
-        sx, sy, sz = sx / norm, sy / norm, sz / norm
-        te = ex * sx + ey * sy + ez * sz
-        px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
-        tm = ex * px + ey * py + ez * pz
-        table = slabs.transmission if entries.kind[j] == REFRACTION else slabs.reflection
-        te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
-        tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
-        if entries.kind[j] == REFLECTION:
-            kx, ky, kz = kx - 2.0 * along * nx, ky - 2.0 * along * ny, kz - 2.0 * along * nz
-            px, py, pz = sy * kz - sz * ky, sz * kx - sx * kz, sx * ky - sy * kx
-        ex, ey, ez = te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz
-    norm = max(np.hypot(kx, ky), 1e-12)
-    field = ex * (kx * kz / norm) + ey * (ky * kz / norm) - ez * norm
-    return (fixed.wavelength_m / (4.0 * np.pi * total)) ** 2 * (field.real**2 + field.imag**2)
+        if not entries.same_wall[j]:
+            face = entries.face[j]
+            p = planes.plane[face]
+            normal = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
+            k, e = at_slab(k, e, normal, slabs, slabs.material[face], entries.kind[j])
+    return (fixed.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e)
 
 
 @njit(cache=True, nogil=True)
@@ -233,7 +212,7 @@ def _straight(traced, fixed):  # type: ignore[no-untyped-def]
 def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
     """Paths through walls by some sequences that matter to receivers in their view."""
     sequences, views, mesh = traced.sequences, traced.views, fixed.mesh
-    folded = sequences, views, mesh.planes, mesh.slabs.material
+    images = Images(sequences, views, mesh.planes, mesh.slabs.material)
     met, entries, count = scratch(), trail(_ENTRIES), 0
     all_node, all_rx, all_power = np.empty(1024, np.int64), np.empty(1024, np.int64), np.empty(1024)
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
@@ -250,7 +229,7 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
             least = needed[seen[k]] / rarer
             if traced.loss[node] * (fixed.wavelength_m / (4.0 * np.pi)) ** 2 < _PART * least * square:
                 continue
-            if fold_line(node, target, folded, fixed.largest, fixed.wavelength_m, faces, points) < least:
+            if fold_line(node, target, images, fixed.largest, fixed.wavelength_m, faces, points) < least:
                 continue
             number = _follow(node, target, traced, fixed, met, entries, faces, points)
             if number < 0:
@@ -267,7 +246,7 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _written(nodes, rx, traced, fixed):  # type: ignore[no-untyped-def]
     """Faces and kinds (C, D) of chosen paths, vertices (C, D, 3), and whether each is of a wall that is crossed."""
-    folded = traced.sequences, traced.views, fixed.mesh.planes, fixed.mesh.slabs.material
+    images = Images(traced.sequences, traced.views, fixed.mesh.planes, fixed.mesh.slabs.material)
     met, entries, shape = scratch(), trail(_ENTRIES), (len(nodes), _ENTRIES)
     face, kind, same_wall = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     vertices = np.zeros((len(nodes), _ENTRIES, 3))
@@ -275,7 +254,7 @@ def _written(nodes, rx, traced, fixed):  # type: ignore[no-untyped-def]
     for c in range(len(nodes)):
         target = fixed.rx_m[rx[c]]
         if nodes[c] >= 0:
-            fold_line(nodes[c], target, folded, fixed.largest, fixed.wavelength_m, faces, points)
+            fold_line(nodes[c], target, images, fixed.largest, fixed.wavelength_m, faces, points)
         number = _follow(nodes[c], target, traced, fixed, met, entries, faces, points)
         face[c, :number], kind[c, :number] = entries.face[:number], entries.kind[:number]
         vertices[c, :number], same_wall[c, :number] = entries.point_m[:number], entries.same_wall[:number]

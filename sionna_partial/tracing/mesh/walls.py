@@ -16,7 +16,7 @@ from sionna_partial.process import njit
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree
 from sionna_partial.tracing.mesh.planes import MeshPlanes
-from sionna_partial.tracing.plan.legs import choose_face
+from sionna_partial.tracing.plan.legs import choose_face, is_free_between
 from sionna_partial.tracing.plan.slabs import Slabs
 
 
@@ -111,15 +111,7 @@ def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyp
         left = outward[second, 0] * dx + outward[second, 1] * dy + outward[second, 2] * dz > 0.0
         if entered and left:
             return True
-    free, cell = mesh.cells.free, mesh.cells.cell_m
-    length = np.hypot(dx, dy)
-    along, last = begin * length + cell, end * length - cell  # cells that the faces themselves cut do not count
-    while along <= last:
-        column, row = int((a[0] + along / length * dx) / cell), int((a[1] + along / length * dy) / cell)
-        if 0 <= row < free.shape[0] and 0 <= column < free.shape[1] and free[row, column]:
-            return False
-        along += 0.5 * cell
-    return True
+    return not is_free_between(mesh.cells, a, b, begin, end)
 
 
 @njit(cache=True)
@@ -150,6 +142,7 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     turned = dx < 0.0 or (dx == 0.0 and (dy < 0.0 or (dy == 0.0 and dz < 0.0)))
     near, far = (b, a) if turned else (a, b)
+    cosines, same_wall = entries.cosine[begin : begin + count], entries.same_wall[begin : begin + count]
     walls, opened, start, previous, steep = 0, 0, 0.0, 0.0, 1.0
     for j in range(count):
         k = count - 1 - j if turned else j
@@ -160,13 +153,13 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
             before = met.face[k + 1 if turned else k - 1]
             same = is_one_wall(mesh, before, face, near, far, previous, t)
         if not same:
-            choose_face(entries, begin, count, opened, j, turned)
+            choose_face(cosines, same_wall, opened, j, turned)
             walls, opened, start, steep = walls + 1, j, t, 1.0
         entry = begin + k
         entries.face[entry], entries.kind[entry] = face, REFRACTION
-        entries.same_wall[entry], entries.cosine[entry] = True, cosine
+        entries.cosine[entry] = cosine
         for axis in range(3):
             entries.point_m[entry, axis] = a[axis] + met.at[k] * (b[axis] - a[axis])
         previous, steep = t, min(steep, cosine)
-    choose_face(entries, begin, count, opened, count, turned)
+    choose_face(cosines, same_wall, opened, count, turned)
     return walls

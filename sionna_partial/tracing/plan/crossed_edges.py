@@ -152,14 +152,14 @@ def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type
     room = building.room
     out, power, used = np.empty((1024, 3), np.int64), np.empty(1024), 0
     terms, wavelength = np.empty((4, 3)), strengths.wavelength_m
-    largest, coefficients, transition = strengths.largest, strengths.faces, strengths.transition
+    largest, tables = strengths.largest, (strengths.faces, strengths.transition)
     for e in group:
         if not arrivals.good[e]:
             continue
         origin, before, through = edges.position_m[e], arrivals.length_m[e], arrivals.power[e]
         constants = edges.utd[e, 0], edges.utd[e, 1], edges.utd[e, 2], edges.utd[e, 3], edges.utd[e, 4]
         arrival = arrivals.angle[e, 0], arrivals.angle[e, 1], arrivals.angle[e, 2], arrivals.angle[e, 3]
-        lit_0, lit_n = arrivals.faces[e, 0], arrivals.faces[e, 1]
+        lit = arrivals.faces[e, 0], arrivals.faces[e, 1]
         material = edges.material[e, 0] if arrivals.lit[e] else edges.material[e, 1]
         for rx in range(len(room.rx_m)):
             target = room.rx_m[rx]
@@ -174,9 +174,7 @@ def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type
             utd_terms(constants, arrival, departure, terms)
             spread = through * wavelength**3 / (64.0 * np.pi**4 * before * onward)
             boundary = np.sqrt(4.0 * np.pi / wavelength * before * onward / total)
-            level = at_edge(
-                coefficients, material, transition, terms, boundary, lit_0, lit_n, 1.0, 0.0, (1.0, 0.0, 1.0)
-            )
+            level = at_edge(tables, material, terms, boundary, lit, 1.0, 0.0, (1.0, 0.0, 1.0))
             if level[0] ** 2 * spread / total < needed[rx]:
                 continue
             count, crossed = _from_edge(building, origin, target, onward, total, 0, trail)
@@ -191,18 +189,8 @@ def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type
                 height = unfolded_height(room, target, bounces, first)
                 length = np.hypot(total, height)
                 sine, slope = total / length, height / length
-                field = at_edge(
-                    coefficients,
-                    material,
-                    transition,
-                    terms,
-                    boundary * np.sqrt(sine),
-                    lit_0,
-                    lit_n,
-                    sine,
-                    slope,
-                    (1.0, 0.0, 1.0),
-                )
+                edge = boundary * np.sqrt(sine)
+                field = at_edge(tables, material, terms, edge, lit, sine, slope, (1.0, 0.0, 1.0))
                 strength = at_flats(largest, room.flat_material, slope, bounces, field) ** 2 * spread * behind / length
                 if strength >= needed[rx]:
                     out, power = grow(out, used + 1), grow(power, used + 1)

@@ -13,7 +13,7 @@ from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.plan.legs import Leg, cross_leg, empty_paths, has_long_legs, write_kinds
-from sionna_partial.tracing.plan.slabs import COSINES, reflected_part
+from sionna_partial.tracing.plan.slabs import at_slab, received_power, reflected_part, vertical_field
 from sionna_partial.tracing.plan.specular import (
     CEILING,
     FLOOR,
@@ -157,7 +157,7 @@ def _path_power(trail, count, length, variant, building, target):  # type: ignor
     ax, ay, done = room.tx_m[0], room.tx_m[1], 0.0
     size = max(np.hypot(end[0] - ax, end[1] - ay), 1e-12) * total / length
     k = (end[0] - ax) / size, (end[1] - ay) / size, rise.up * rise.height / total
-    e = _vertical(k)
+    e = vertical_field(k)
     item = turn = 0
     while item < count or turn < rise.bounces:
         fraction = (rise.to_first + turn * room.height_m) / rise.height if turn < rise.bounces else 2.0
@@ -168,7 +168,8 @@ def _path_power(trail, count, length, variant, building, target):  # type: ignor
             if above:
                 above = _is_above(piece, done, variant, building, target)
             if not (trail.same_wall[item] or above):
-                k, e = _at_slab(k, e, _normal(building.plan, piece), building.slabs, piece, trail.kind[item])
+                normal, material = _normal(building.plan, piece), building.slabs.material[piece]
+                k, e = at_slab(k, e, normal, building.slabs, material, trail.kind[item])
             item += 1
             continue
         bx, by, stop = target[0], target[1], 1.0
@@ -177,11 +178,9 @@ def _path_power(trail, count, length, variant, building, target):  # type: ignor
         part = (fraction - done) / (stop - done) if stop > done else 0.0
         if not _has_floor(building.interior, ax + part * (bx - ax), ay + part * (by - ay)):
             return 0.0
-        k, e = _at_slab(k, e, (0.0, 0.0, 1.0), building.slabs, -1, REFLECTION)
+        k, e = at_slab(k, e, (0.0, 0.0, 1.0), building.slabs, 0, REFLECTION)
         turn += 1
-    vertical = _vertical(k)
-    field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
-    return (building.wavelength_m / (4.0 * np.pi * total)) ** 2 * (field.real**2 + field.imag**2)
+    return (building.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e)
 
 
 @njit(cache=True)
@@ -208,13 +207,6 @@ def _rise_of(variant, room, target):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _vertical(k):  # type: ignore[no-untyped-def]
-    """Field of a vertical antenna in a direction: the unit vector along theta of spherical coordinates."""
-    flat = max(np.hypot(k[0], k[1]), 1e-12)
-    return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
-
-
-@njit(cache=True)
 def _normal(plan, piece):  # type: ignore[no-untyped-def]
     """Give the unit vector across a piece of a wall."""
     wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
@@ -228,31 +220,6 @@ def _has_floor(interior, x, y):  # type: ignore[no-untyped-def]
     """Whether there is floor at a point, and ceiling."""
     column, row = int(x / interior.cell_m), int(y / interior.cell_m)
     return 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1] and interior.floor[row, column]
-
-
-@njit(cache=True)
-def _at_slab(k, e, n, slabs, piece, kind):  # type: ignore[no-untyped-def]
-    """Direction and field of a path after it has crossed a piece of a wall, or been reflected there; -1 for flats."""
-    material = slabs.material[piece] if piece >= 0 else 0
-    along = k[0] * n[0] + k[1] * n[1] + k[2] * n[2]
-    at = abs(along) * COSINES
-    low = min(int(at), COSINES - 1)
-    part = at - low
-    sx, sy, sz = k[1] * n[2] - k[2] * n[1], k[2] * n[0] - k[0] * n[2], k[0] * n[1] - k[1] * n[0]
-    norm = np.sqrt(sx * sx + sy * sy + sz * sz)
-    if norm < 1e-9:
-        sx, sy, sz, norm = -n[1] if n[2] == 0.0 else 1.0, n[0], 0.0, 1.0
-    sx, sy, sz = sx / norm, sy / norm, sz / norm
-    te = e[0] * sx + e[1] * sy + e[2] * sz
-    px, py, pz = sy * k[2] - sz * k[1], sz * k[0] - sx * k[2], sx * k[1] - sy * k[0]
-    tm = e[0] * px + e[1] * py + e[2] * pz
-    table = slabs.transmission if kind == REFRACTION else slabs.reflection
-    te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
-    tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
-    if kind == REFLECTION:
-        k = k[0] - 2.0 * along * n[0], k[1] - 2.0 * along * n[1], k[2] - 2.0 * along * n[2]
-        px, py, pz = sy * k[2] - sz * k[1], sz * k[0] - sx * k[2], sx * k[1] - sy * k[0]
-    return k, (te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz)
 
 
 @njit(cache=True, nogil=True)

@@ -114,6 +114,27 @@ class _Leg(NamedTuple):
     material: NDArray[np.int64]
 
 
+class _Pair(NamedTuple):
+    """A receiver and a way to it from an edge, which the arrivals `start` to `stop` there may have before it.
+
+    `left` is how many more reflections a path may have, `onward_m` the length of the leg, `departure` its direction as
+    `wedge_angle` gives it. `material` and `cosine` are those of a `_Leg`, `utd` (5,) and `at_faces` (2,) those of the
+    edge, `heights_m` as `_heights` gives them.
+    """
+
+    rx: np.int32
+    start: np.int64
+    stop: np.int64
+    left: np.int64
+    onward_m: float
+    departure: tuple[float, float, float, float]
+    material: NDArray[np.int64]
+    cosine: Floats
+    utd: Floats
+    at_faces: NDArray[np.int64]
+    heights_m: Floats
+
+
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
     """Find the vertical edges of the walls that diffract, with or without those where observation ended."""
     vertex = geometry.segments.ravel()
@@ -286,10 +307,10 @@ def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):
         after, onward, departure = _depart(beams, pair_node[i], edges, edge, room, target, leg)
         if after < 0:
             continue
-        pair = here, start[edge], start[edge + 1], reflections - after, onward
-        materials = leg.material, edges.material[edge]
-        own = departure, leg.cosine[:after], heights[here]
-        best[i] = _bound(strengths, arrivals, most, pair, edges.utd[edge], materials, *own, level, terms)
+        arrived, beyond = (start[edge], start[edge + 1]), (leg.material, leg.cosine[:after])
+        of_edge = edges.utd[edge], edges.material[edge], heights[here]
+        pair = _Pair(here, *arrived, reflections - after, onward, departure, *beyond, *of_edge)
+        best[i] = _bound(strengths, arrivals, most, pair, level, terms)
         if not first[here] < last[here] or best[i] >= last[here]:
             continue
         for j in range(start[edge], start[edge + 1]):
@@ -342,19 +363,12 @@ def _heights(room, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _bound(strengths, arrivals, most, pair, wedge, materials, departure, cosine, heights, level, terms):  # type: ignore[no-untyped-def]
+def _bound(strengths, arrivals, most, pair, level, terms):  # type: ignore[no-untyped-def]
     """Write the levels of all paths of a pair, one for each arrival, number of bounces and first flat; the lowest.
 
-    Paths that are negligible by a rough bound count with it, in the last level; `most` is what that takes. A pair is
-    (receiver, first arrival, end of the arrivals, reflections that remain, length onward [m]); materials are those of
-    the walls after the edge, with that of floor and ceiling at their end, and those of the edge.
+    Paths that are negligible by a rough bound count with it, in the last level; `most` is what that takes.
     """
-    largest, faces, transition, (material, at_faces) = (
-        strengths.largest,
-        strengths.faces,
-        strengths.transition,
-        materials,
-    )
+    largest, tables = strengths.largest, (strengths.faces, strengths.transition)
     power, reflected, wavelength = strengths.power, strengths.reflected, strengths.wavelength_m
     earlier, is_lit, lengths, reflections, angle, lit, before = (
         arrivals.material,
@@ -365,8 +379,8 @@ def _bound(strengths, arrivals, most, pair, wedge, materials, departure, cosine,
         arrivals.faces,
         arrivals.cosine,
     )
-    here, start, stop, remain, onward = pair
-    constants = wedge[0], wedge[1], wedge[2], wedge[3], wedge[4]
+    here, start, stop, remain, onward, departure, material, cosine, utd, at_faces, heights = pair
+    constants = utd[0], utd[1], utd[2], utd[3], utd[4]
     most_after = _most_at_walls(largest, material, cosine, len(cosine), onward, heights.max())
     lowest, adds = LEVELS, len(power) > 0
     rough = NEGLIGIBLE * reflected[here] if strengths.last[here] < LEVELS else 0.0
@@ -395,7 +409,7 @@ def _bound(strengths, arrivals, most, pair, wedge, materials, departure, cosine,
                     field = at_wall(largest, earlier[j, k], before[j, k], sine, slope, field)
                 edge = np.sqrt(boundary * sine)
                 own = at_faces[0] if is_lit[j] else at_faces[1]
-                field = at_edge(faces, own, transition, terms, edge, lit[j, 0], lit[j, 1], sine, slope, field)
+                field = at_edge(tables, own, terms, edge, (lit[j, 0], lit[j, 1]), sine, slope, field)
                 for k in range(len(cosine)):
                     field = at_wall(largest, material[k], cosine[k], sine, slope, field)
                 strength = at_flats(largest, material[-1], slope, bounces, field) ** 2 * spread / total

@@ -125,7 +125,13 @@ def cross_leg(plan, interior, leg, count, trail):  # type: ignore[no-untyped-def
         return -1, 0
     if n > 0 and interior.depth_m > 0.0 and _is_reflected_inside(plan, interior, leg, n, trail):
         return -1, 0
-    return count + n, _group(plan, interior, leg, n, count, trail)
+    for j in range(n):
+        t, i, entry = trail.found[j], trail.wall[j], count + j
+        trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, _cosine(plan, i, dx, dy, length)
+        trail.points[entry, 0], trail.points[entry, 1] = leg.start[0] + t * dx, leg.start[1] + t * dy
+        trail.points[entry, 2] = leg.done + t * (leg.stop - leg.done)
+    cosine, same_wall = trail.cosine[count : count + n], trail.same_wall[count : count + n]
+    return count + n, group_faces(interior, leg.start, leg.end, trail.found[:n], cosine, same_wall)
 
 
 @njit(cache=True)
@@ -202,65 +208,63 @@ def _is_reflected_inside(plan, interior, leg, n, trail):  # type: ignore[no-unty
             continue
         first, last = min(t, trail.found[face]), max(t, trail.found[face])
         cosine = min(_cosine(plan, wall, dx, dy, length), _cosine(plan, trail.wall[face], dx, dy, length))
-        if (last - first) * length * cosine <= interior.depth_m and not _is_free_between(interior, leg, first, last):
+        if (last - first) * length * cosine <= interior.depth_m and not is_free_between(
+            interior, leg.start, leg.end, first, last
+        ):
             return True
     return False
 
 
 @njit(cache=True)
-def _group(plan, interior, leg, n, count, trail):  # type: ignore[no-untyped-def]
-    """Write the faces that a leg crosses as entries, and which of them are one wall; return the number of walls.
+def group_faces(interior, start, end, found, cosine, same_wall):  # type: ignore[no-untyped-def]
+    """Write which faces on a leg are further faces of a wall (n,); return the number of walls.
 
-    Walls are counted from the end whose coordinates are smaller, so that a link is the same in both directions.
+    `found` (n,) are the fractions of the leg at which it meets them, in order, `cosine` (n,) those of the angles of
+    incidence. Walls are counted from the end whose coordinates are smaller, so that a link is the same in both
+    directions.
     """
-    ax, ay = leg.start
-    dx, dy = leg.end[0] - ax, leg.end[1] - ay
+    dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
     backwards = dx < 0.0 or (dx == 0.0 and dy < 0.0)
-    walls, begin, start, previous, steep = 0, 0, 0.0, 0.0, 1.0
+    n, walls, begin, first, previous, steep = len(found), 0, 0, 0.0, 0.0, 1.0
     for j in range(n):
-        t, i = trail.found[n - 1 - j if backwards else j], trail.wall[n - 1 - j if backwards else j]
-        cosine = _cosine(plan, i, dx, dy, length)
-        same = j > 0 and abs(t - start) * length * min(cosine, steep) <= interior.depth_m
-        if same:
-            same = not _is_free_between(interior, leg, min(t, previous), max(t, previous))
-        if not same:
-            choose_face(trail, count, n, begin, j, backwards)
-            walls, begin, start, steep = walls + 1, j, t, 1.0
-        entry = count + (n - 1 - j if backwards else j)
-        trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, cosine
-        trail.same_wall[entry] = True
-        trail.points[entry, 0], trail.points[entry, 1] = ax + t * dx, ay + t * dy
-        trail.points[entry, 2] = leg.done + t * (leg.stop - leg.done)
-        previous, steep = t, min(steep, cosine)
-    choose_face(trail, count, n, begin, n, backwards)
+        i = n - 1 - j if backwards else j
+        t, depth_m = found[i], abs(found[i] - first) * length * min(cosine[i], steep)
+        joined = j > 0 and interior.depth_m > 0.0 and depth_m <= interior.depth_m
+        if not joined or is_free_between(interior, start, end, min(t, previous), max(t, previous)):
+            choose_face(cosine, same_wall, begin, j, backwards)
+            walls, begin, first, steep = walls + 1, j, t, 1.0
+        previous, steep = t, min(steep, cosine[i])
+    choose_face(cosine, same_wall, begin, n, backwards)
     return walls
 
 
 @njit(cache=True)
-def choose_face(trail, count, n, begin, end, backwards):  # type: ignore[no-untyped-def]
-    """Let one of the faces of a wall have its loss: that of the median angle, as outlines may be ragged."""
+def choose_face(cosine, same_wall, begin, end, backwards):  # type: ignore[no-untyped-def]
+    """Let one of the faces of a wall have its loss: that of the median angle, as outlines may be ragged.
+
+    The wall has the faces from `begin` to `end`, which are counted from the last one if `backwards`.
+    """
+    last = len(cosine) - 1
     for j in range(begin, end):
-        own, rank = count + (n - 1 - j if backwards else j), 0
+        own, rank = last - j if backwards else j, 0
         for k in range(begin, end):
-            other = count + (n - 1 - k if backwards else k)
-            rank += trail.cosine[other] < trail.cosine[own] or (trail.cosine[other] == trail.cosine[own] and k < j)
-        if rank == (end - begin) // 2:
-            trail.same_wall[own] = False
+            other = last - k if backwards else k
+            rank += cosine[other] < cosine[own] or (cosine[other] == cosine[own] and k < j)
+        same_wall[own] = rank != (end - begin) // 2
 
 
 @njit(cache=True)
-def _is_free_between(interior, leg, first, last):  # type: ignore[no-untyped-def]
-    """Whether a leg meets a free cell between two faces; cells that the faces themselves cut do not count."""
-    ax, ay = leg.start
-    dx, dy = leg.end[0] - ax, leg.end[1] - ay
+def is_free_between(cells, start, end, first, last):  # type: ignore[no-untyped-def]
+    """Whether a leg meets a free cell between two fractions of it; cells that the faces there cut do not count."""
+    dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
-    s, high = first * length + interior.cell_m, last * length - interior.cell_m
+    s, high = first * length + cells.cell_m, last * length - cells.cell_m
     while s <= high:
-        column, row = int((ax + s / length * dx) / interior.cell_m), int((ay + s / length * dy) / interior.cell_m)
-        if 0 <= row < interior.free.shape[0] and 0 <= column < interior.free.shape[1] and interior.free[row, column]:
+        column, row = int((start[0] + s / length * dx) / cells.cell_m), int((start[1] + s / length * dy) / cells.cell_m)
+        if 0 <= row < cells.free.shape[0] and 0 <= column < cells.free.shape[1] and cells.free[row, column]:
             return True
-        s += 0.5 * interior.cell_m
+        s += 0.5 * cells.cell_m
     return False
 
 

@@ -9,7 +9,7 @@ from sionna_partial.process import njit
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFRACTION
-from sionna_partial.tracing.plan.legs import Interior
+from sionna_partial.tracing.plan.legs import Interior, group_faces
 from sionna_partial.tracing.plan.specular import Room
 
 _MOST_LIDS = 8
@@ -117,47 +117,15 @@ def _add_lids(here, there, lids, kind, face, vertices, count):  # type: ignore[n
 
 @njit(cache=True)
 def _group(face, vertices, same, span, ends, walls_m, interior):  # type: ignore[no-untyped-def]
-    """Mark the faces that a leg crosses which are one wall with others, as `cross_leg` does; return the walls."""
+    """Write which of the faces that a leg crosses are further faces of a wall; return the number of walls."""
     (begin, end), (here, there) = span, ends
     dx, dy = there[0] - here[0], there[1] - here[1]
-    length, cosines = max(np.hypot(dx, dy), 1e-9), np.ones(end - begin)
-    backwards = dx < 0.0 or (dx == 0.0 and dy < 0.0)
-    walls, first, at_first, before, steep = 0, 0, 0.0, 0.0, 1.0
+    length, cosine, found = max(np.hypot(dx, dy), 1e-9), np.ones(end - begin), np.empty(end - begin)
     for j in range(end - begin):
-        entry = end - 1 - j if backwards else begin + j
-        at = np.hypot(vertices[entry, 0] - here[0], vertices[entry, 1] - here[1])
-        if face[entry] < 2 * len(walls_m):
-            wall = walls_m[face[entry] // 2]
+        vertex = vertices[begin + j]
+        found[j] = np.hypot(vertex[0] - here[0], vertex[1] - here[1]) / length
+        if face[begin + j] < 2 * len(walls_m):
+            wall = walls_m[face[begin + j] // 2]
             wx, wy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
-            cosines[j] = abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
-        deep = abs(at - at_first) * min(cosines[j], steep)
-        joined = j > 0 and interior.depth_m > 0.0 and deep <= interior.depth_m
-        leg = here[0], here[1], dx / length, dy / length
-        if not joined or _is_free_between(interior, leg, min(at, before), max(at, before)):
-            _choose(same, cosines, span, first, j, backwards)
-            walls, first, at_first, steep = walls + 1, j, at, 1.0
-        before, steep = at, min(steep, cosines[j])
-    _choose(same, cosines, span, first, end - begin, backwards)
-    return walls
-
-
-@njit(cache=True)
-def _choose(same, cosines, span, first, last, backwards):  # type: ignore[no-untyped-def]
-    """Let one of the faces of a wall have its loss: that of the median angle."""
-    for j in range(first, last):
-        rank = 0
-        for k in range(first, last):
-            rank += cosines[k] < cosines[j] or (cosines[k] == cosines[j] and k < j)
-        same[span[1] - 1 - j if backwards else span[0] + j] = rank != (last - first) // 2
-
-
-@njit(cache=True)
-def _is_free_between(interior, leg, first, last):  # type: ignore[no-untyped-def]
-    """Whether a leg meets a free cell between two distances along it [m]; cells of the faces do not count."""
-    s = first + interior.cell_m
-    while s <= last - interior.cell_m:
-        column, row = int((leg[0] + s * leg[2]) / interior.cell_m), int((leg[1] + s * leg[3]) / interior.cell_m)
-        if 0 <= row < interior.free.shape[0] and 0 <= column < interior.free.shape[1] and interior.free[row, column]:
-            return True
-        s += 0.5 * interior.cell_m
-    return False
+            cosine[j] = abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
+    return group_faces(interior, here, there, found, cosine, same[begin:end])

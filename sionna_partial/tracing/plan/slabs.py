@@ -1,4 +1,4 @@
-"""What walls reflect and let through, tabulated over the angle of incidence."""
+"""What walls reflect and let through, tabulated over the angle of incidence, and the field of a path after them."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.slab import reflection_coefficients, transmission_coefficients
 
 COSINES = 2048
@@ -49,3 +50,43 @@ def reflected_part(slabs, material, cosine):  # type: ignore[no-untyped-def]
     at = min(int(cosine * COSINES + 0.5), COSINES)
     te, tm = slabs.reflection[material, at]
     return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
+
+
+@njit(cache=True)
+def vertical_field(k):  # type: ignore[no-untyped-def]
+    """Field of a vertical antenna in a direction: the unit vector along theta of spherical coordinates."""
+    flat = max(np.hypot(k[0], k[1]), 1e-12)
+    return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
+
+
+@njit(cache=True)
+def received_power(k, e):  # type: ignore[no-untyped-def]
+    """Fraction of the power that a vertical antenna receives of a field that comes in a direction."""
+    vertical = vertical_field(k)
+    field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
+    return field.real**2 + field.imag**2
+
+
+@njit(cache=True)
+def at_slab(k, e, n, slabs, material, kind):  # type: ignore[no-untyped-def]
+    """Direction and field of a path after a reflection at a slab with the unit normal `n`, or a refraction."""
+    along = k[0] * n[0] + k[1] * n[1] + k[2] * n[2]
+    at = min(abs(along), 1.0) * COSINES
+    low = min(int(at), COSINES - 1)
+    part = at - low
+    sx, sy, sz = k[1] * n[2] - k[2] * n[1], k[2] * n[0] - k[0] * n[2], k[0] * n[1] - k[1] * n[0]
+    norm = np.sqrt(sx * sx + sy * sy + sz * sz)
+    if norm < 1e-9:
+        sx, sy, sz = (-n[2], 0.0, n[0]) if abs(n[1]) < 0.5 else (0.0, n[2], -n[1])
+        norm = np.sqrt(sx * sx + sy * sy + sz * sz)
+    sx, sy, sz = sx / norm, sy / norm, sz / norm
+    te = e[0] * sx + e[1] * sy + e[2] * sz
+    px, py, pz = sy * k[2] - sz * k[1], sz * k[0] - sx * k[2], sx * k[1] - sy * k[0]
+    tm = e[0] * px + e[1] * py + e[2] * pz
+    table = slabs.transmission if kind == REFRACTION else slabs.reflection
+    te *= table[material, low, 0] + part * (table[material, low + 1, 0] - table[material, low, 0])
+    tm *= table[material, low, 1] + part * (table[material, low + 1, 1] - table[material, low, 1])
+    if kind == REFLECTION:
+        k = k[0] - 2.0 * along * n[0], k[1] - 2.0 * along * n[1], k[2] - 2.0 * along * n[2]
+        px, py, pz = sy * k[2] - sz * k[1], sz * k[0] - sx * k[2], sx * k[1] - sy * k[0]
+    return k, (te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz)
