@@ -3,12 +3,15 @@
 import dataclasses
 import functools
 import itertools
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction import map_networks
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import Predictor
@@ -165,11 +168,21 @@ def trained_predictor():
     return Predictor.fit(*make_links(12_000), settings=settings)
 
 
+@contextmanager
+def shallow_map_networks() -> Iterator[None]:
+    """Let map networks have few layers, and see few windows at once: TensorFlow traces each layer of a training."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(map_networks, "_WIDTHS", ((4, 8), (4, 8)))
+        patch.setattr(map_networks, "WINDOWS_AT_ONCE", 4)
+        yield
+
+
 def fit_context_predictor(networks, seed=0):
     """Train a predictor that sees where links run, for two steps; its networks of the paper are untrained."""
     links = make_seen_links(300)
-    settings = PredictorSettings(networks, passes=8, minimum_links=1_000_000, seed=seed)
-    return Predictor.fit(*links, homes=["a", "b"], settings=settings)
+    settings = PredictorSettings(networks, passes=2, minimum_links=1_000_000, seed=seed)
+    with shallow_map_networks():
+        return Predictor.fit(*links, homes=["a", "b"], settings=settings)
 
 
 @functools.cache

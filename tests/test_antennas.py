@@ -55,7 +55,7 @@ def stock_gain_db(antenna: sp.Antenna, rx_m: np.ndarray, folder: Path) -> np.nda
 @pytest.mark.parametrize("antenna", [SECTOR, PANEL], ids=str)
 def test_a_complete_map_is_stock_sionna_rt(antenna: sp.Antenna, tmp_path: Path) -> None:
     rows = coverage_of(_room(), antenna).stack(at=("y", "x"))
-    rows = rows.isel(at=np.flatnonzero(rows["valid"] == 1))
+    rows = rows.isel(at=np.flatnonzero(rows["valid"] == 1)[::4])
     rx_m = np.stack([rows["x"], rows["y"], np.full(rows.sizes["at"], 1.5)], axis=1)
     expected_db = stock_gain_db(antenna, rx_m, tmp_path)
     for name in ("gain_mean_db", "partial_gain_db"):

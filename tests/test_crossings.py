@@ -46,21 +46,17 @@ def loss_db(partial: sp.PartialMap, tx: tuple[float, ...], rx: tuple[float, ...]
 
 
 class TestOneWall:
-    @pytest.mark.parametrize("cells", [1, 3, 6])
-    @pytest.mark.parametrize("angle_deg", [0, 30, 60])
+    @pytest.mark.parametrize(("cells", "angle_deg"), [(1, 0), (1, 60), (3, 30), (6, 0), (6, 60)])
     def test_costs_its_slab_however_deep_it_is(self, cells: int, angle_deg: float) -> None:
         aside = 1.5 * np.tan(np.radians(angle_deg))
         tx, rx = (3.0, 2.97 - aside, 1.5), (6.0, 2.97 + aside, 1.5)
         loss = loss_db(walled(cells), tx, rx)
         assert loss == pytest.approx(slab_loss_db(np.cos(np.radians(angle_deg))), abs=0.02)
 
-    @pytest.mark.parametrize("cells", [3, 6])
-    def test_reflects_as_much_however_deep_it_is(self, cells: int) -> None:
+    def test_reflects_as_much_however_deep_it_is(self) -> None:
         """Both links lose the same to a deep wall as to a thin one: its far face reflects nothing."""
         for rx in ((2.5, 3.9, 1.5), (6.5, 3.9, 1.5)):
-            losses = [
-                loss_db(walled(each), (2.5, 2.17, 1.5), rx, max_depth=3, diffraction=False) for each in (1, cells)
-            ]
+            losses = [loss_db(walled(each), (2.5, 2.17, 1.5), rx, max_depth=3, diffraction=False) for each in (1, 6)]
             assert losses[1] == pytest.approx(losses[0], abs=0.02)
 
     def test_costs_the_same_where_one_face_was_seen(self) -> None:

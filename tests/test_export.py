@@ -75,13 +75,11 @@ def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
     assert pd.read_csv(tmp_path / "coverage.csv")["x_m"][0] == 499_999.125
 
 
-@pytest.mark.parametrize("name", ["coverage", "several"])
-def test_png_is_the_picture(name, request, tmp_path):
-    data = request.getfixturevalue(name)
-    save_coverage(data, tmp_path / "coverage.png")
+def test_png_is_the_picture(several, tmp_path):
+    save_coverage(several, tmp_path / "coverage.png")
     with Image.open(tmp_path / "coverage.png") as image:
         assert image.width >= 1200
-    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(data))
+    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(several))
 
 
 def test_ros_map_holds_the_probability_of_outage_and_loads_as_a_map(coverage, tmp_path):
@@ -108,7 +106,7 @@ def test_equal_maps_give_equal_files(coverage, tmp_path):
         for suffix in SUFFIXES:
             save_coverage(coverage.copy(deep=True), folder / f"coverage{suffix}")
         files.append({file.name: file.read_bytes() for file in folder.iterdir()})
-        time.sleep(1.1)  # HDF5's time stamps are whole seconds
+        time.sleep(1.1 * (len(files) < 2))  # HDF5's time stamps are whole seconds
     assert files[0] == files[1]
     assert len(files[0]) == len(SUFFIXES) + 1
 
@@ -182,7 +180,7 @@ def test_an_unknown_suffix_is_named(coverage, tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("suffix", [".nc", ".tif", ".csv", ".yaml"])
 def test_a_folder_of_that_name_is_named_and_kept(coverage, tmp_path, suffix):
     target = tmp_path / f"coverage{suffix}"
     target.mkdir()

@@ -29,7 +29,7 @@ HOUSE = drawn(
 )
 TX = np.array([4.5, 1.3, 1.5])
 PLACES = np.array([(1.0, 0.7, 1.5), (2.3, 1.4, 1.5), (3.9, 1.5, 1.5), (5.3, 0.6, 1.5), (1.1, 1.9, 1.5)])
-OPTIONS = {"spacing_m": 0.4}
+OPTIONS, COARSE = {"spacing_m": 0.4}, {"spacing_m": 1.2}
 
 
 @functools.cache
@@ -79,13 +79,13 @@ class TestCoverage:
     def test_powers_are_located_too(self, offset_db, caplog):
         power_db = table()["gain_db"] + offset_db
         with caplog.at_level(logging.WARNING):
-            found = sp.predict_map(model(), measurements=table(gain_db=power_db), **OPTIONS)
+            found = sp.predict_map(model(), measurements=table(gain_db=power_db), **COARSE)
         assert np.linalg.norm(found.attrs["transmitter_m"] - TX) < 1.5
         warned = "powers were measured and no path gains" in caplog.text
         assert warned or abs(found.attrs["measured_offset_db"] - offset_db) < 10.0
 
     def test_its_height_may_be_known(self):
-        found = sp.predict_map(model(), measurements=table(tx=[np.nan, np.nan, 2.0]), **OPTIONS)
+        found = sp.predict_map(model(), measurements=table(tx=[np.nan, np.nan, 2.0]), **COARSE)
         assert found.attrs["transmitter_m"][2] == 2.0
 
     @pytest.mark.usefixtures("command_line")
@@ -94,7 +94,7 @@ class TestCoverage:
         rows = [f"{x},{y},{gain}" for (x, y, _), gain in zip(PLACES, table()["gain_db"], strict=True)]
         (tmp_path / "measured.csv").write_text("\n".join(["rx_x,rx_y,gain_db", *rows, ""]))
         command = ["predict", tmp_path / "house.yaml", "--measurements", tmp_path / "measured.csv"]
-        command += ["--out", tmp_path / "out", "--spacing", 0.8, "--predictor", "paper", "--format", ".nc"]
+        command += ["--out", tmp_path / "out", "--spacing", 1.2, "--predictor", "paper", "--format", ".nc"]
         result = CliRunner().invoke(app, [str(word) for word in command])
         assert result.exit_code == 0, result.output
         assert "p_transmitter" in sp.load_coverage(tmp_path / "out" / "coverage.nc")
@@ -118,7 +118,7 @@ class TestWhatIsRefused:
 
     def test_a_position_that_is_not_used_is_named(self, caplog):
         with caplog.at_level(logging.WARNING):
-            sp.predict_map(model(), measurements=table(tx=TX), **OPTIONS)
+            sp.predict_map(model(), measurements=table(tx=TX), **COARSE)
         assert "the position of the transmitter in the measurements is not used" in caplog.text
 
     def test_a_transmitter_can_be_nowhere(self):

@@ -83,10 +83,11 @@ TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
 def trained_and_scored(networks, rule):
     """Train by a rule in few, larger steps; return accuracy, cross-entropy and mean NLOS gain [dB] on other maps."""
     seen, others = make_room_links(*TRAINING), make_room_links(*OTHERS)
-    settings = PredictorSettings(networks, passes=100 if networks == "paths" else 16)
+    settings = PredictorSettings(networks, passes=100 if networks == "paths" else 14)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "LEARNING_RATE", 0.01)
         patch.setattr(module, "WINDOWS_AT_ONCE", 8)
+        patch.setattr(module, "_WIDTHS", ((8, 16), (8, 16)))
         found = fit_context_networks(seen.phi, *seen.truth(getattr(seen, rule)), settings)
     state, _ = others.truth(getattr(others, rule))
     probabilities, means_db, _ = evaluate_context_networks(found, others.phi, PredictorSettings())

@@ -184,8 +184,8 @@ class TestCoveragePolicy:
         home = sp.make_home(3, "apartment")
         free = np.argwhere(home.state == sp.CellState.FREE)
         tx_m = (free[len(free) // 2][::-1] + 0.5) * home.resolution_m + home.origin_m
-        runs = [sp.explore_trajectory(home, (20,), 1, policy="coverage", tx=tx_m) for _ in range(2)]
-        usual = sp.explore_trajectory(home, (20,), 1)
+        runs = [sp.explore_trajectory(home, (12,), 1, policy="coverage", tx=tx_m) for _ in range(2)]
+        usual = sp.explore_trajectory(home, (12,), 1)
         assert np.array_equal(runs[0].poses, runs[1].poses)
         assert np.array_equal(runs[0].poses[0], usual.poses[0])
         assert not np.array_equal(runs[0].poses, usual.poses)

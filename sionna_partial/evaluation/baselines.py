@@ -15,7 +15,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.inputs import free_space_gain_db
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.settings import PredictorSettings
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
@@ -96,7 +96,7 @@ class Baselines(Shown):
             raise PredictorError(
                 f"path = '{path}' cannot be read ({error!r}): copy it again, or train the predictor beside it anew."
             ) from error
-        return cls(majority, Predictor.load(folder / DISTANCE_FILE))
+        return cls(majority, warm_predictor(folder / DISTANCE_FILE))
 
 
 def nothing_seen(phi: LinkFeatures, frequency_hz: float | Floats) -> LinkFeatures:

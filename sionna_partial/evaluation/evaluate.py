@@ -15,7 +15,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.baselines import MAJORITY_FILE, Baselines, baseline_predictions
 from sionna_partial.evaluation.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 
@@ -240,7 +240,7 @@ def _baselines_folder(model: Predictor) -> Path:
 
 def _shipped(model: Predictor) -> dict[str, Predictor]:
     """Load the shipped predictors, without those that are the same, or differ in frequency or diffraction."""
-    here, every = LinkTraces.of_settings(model.settings), {name: Predictor.load(name) for name in ("paper", "map")}
+    here, every = LinkTraces.of_settings(model.settings), {name: warm_predictor(name) for name in ("paper", "map")}
     return {
         name: each
         for name, each in every.items()

@@ -8,7 +8,7 @@ from functools import lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -614,6 +614,10 @@ class OtherPredictor:
         return np.clip(link_numbers(f"{self.name}.predict_indoor", own(phi), phi.shape), 0.0, 1.0)
 
 
+@overload
+def warm_predictor(asked: Predictor | str | PathLike[str] | None) -> Predictor: ...
+@overload
+def warm_predictor(asked: Any) -> Predictor | OtherPredictor: ...
 def warm_predictor(asked: Any) -> Predictor | OtherPredictor:
     """Return `Predictor.load`, which reads files of the same name, size and date once in a process, or a user's model.
 
