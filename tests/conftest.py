@@ -43,6 +43,17 @@ def several() -> xr.Dataset:
     return small_coverage(several=True)
 
 
+@pytest.fixture(scope="module")
+def short_search() -> Iterator[None]:
+    """Let a calibration search few cells of the plane of a material, which takes little time."""
+    from sionna_partial.calibration import material_fit
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {"COARSE_CELLS": 8, "MOST_FRINGES": 1, "MOST_CELLS": 60, "FEW_FRINGES": 1}.items():
+            patch.setattr(material_fit, name, value)
+        yield
+
+
 @pytest.fixture
 def files_that_fit(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     """Let so many files fit on the disk from now on."""

@@ -11,7 +11,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
 from sionna_partial.tracing.bounds import Strengths, strengths_of
-from sionna_partial.tracing.candidates import Candidates, Wedges
+from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
 

@@ -3,7 +3,6 @@
 import json
 import logging
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,6 @@ from meshes import OBSERVED, room
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.calibration import material_fit
 from sionna_partial.calibration.measured_building import custom_material
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
@@ -58,17 +56,12 @@ def calibrate(measurements: object, **arguments: object) -> sp.MaterialCalibrati
     return sp.calibrate_materials(FLAT, measurements, **{"start": START, "trace_settings": SETTINGS, **arguments})  # type: ignore[arg-type]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def short_search() -> Iterator[None]:
-    """A slab of 1 cm has few fringes: few cells are enough, and quick."""
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"COARSE_CELLS": 12, "MOST_FRINGES": 2, "MOST_CELLS": 120, "FEW_FRINGES": 1}.items():
-            patch.setattr(material_fit, name, value)
-        yield
+pytestmark = pytest.mark.usefixtures("short_search")
+"""A slab of 1 cm has few fringes: few cells are enough."""
 
 
 @pytest.fixture(scope="module")
-def result() -> sp.MaterialCalibration:
+def result(short_search: None) -> sp.MaterialCalibration:
     return calibrate(measured())
 
 

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from coverage_cases import shipped
 
 import sionna_partial as sp
 from sionna_partial.errors import MemoryLimitError, SettingsError
@@ -49,7 +50,7 @@ def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receiver
 def test_draws_agree_with_the_prediction_and_with_themselves(
     partial: sp.PartialMap, receivers: np.ndarray, samples: sp.ChannelSamples
 ) -> None:
-    prediction = sp.Predictor.load().predict(sp.link_features(partial, sp.trace_links(partial, TX, receivers)))
+    prediction = shipped().predict(sp.link_features(partial, sp.trace_links(partial, TX, receivers)))
     for state, probability in zip(sp.LinkState, prediction.by_state[0], strict=True):
         assert np.abs((samples.link_state == state).mean(axis=0) - probability).max() < 0.02
     assert np.abs(samples.gain_db.mean(axis=0) - prediction.gain_mean_db).mean() < 1.0

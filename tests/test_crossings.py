@@ -12,6 +12,7 @@ import sionna_partial as sp
 from sionna_partial.scene.scene import build_scene
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import diffracted_as_exact, stock_paths
+from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.diffraction import find_wedges
 from sionna_partial.tracing.simulation import checked_settings
 from sionna_partial.tracing.slab import transmission_coefficients
@@ -87,7 +88,7 @@ class TestOneWall:
 
 
 def rooms() -> sp.PartialMap:
-    """Three rooms beside each other, with a door in one of the walls between them, a pillar and a tilted wall."""
+    """Three rooms next to each other, with a door in one of the walls between them, a pillar and a tilted wall."""
     state = np.zeros((50, 90), dtype=np.uint8)
     state[[0, -1]], state[:, [0, -1]] = 1, 1
     state[:30, 30:32], state[:, 60] = 1, 1
@@ -110,6 +111,21 @@ def of_several_materials() -> sp.PartialMap:
     return partial.with_wall_material("metal", [(-2.0, 2.9), (2.03, 2.9), (2.03, 3.1), (-2.0, 3.1)])
 
 
+def same_path(
+    ours: sp.TracedLinks, rx: int, paths: SolvedPaths, path: int, shift: np.ndarray
+) -> tuple[np.ndarray, int]:
+    """Return the interactions of a path of stock, and which of ours is the same, at the same points."""
+    kinds = paths.interactions[path][paths.interactions[path] > 0]
+    at_m = paths.vertices_m[path, : len(kinds)] + shift
+    (same,) = (
+        k
+        for k in np.flatnonzero(ours.path_rx == rx)
+        if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
+        and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
+    )
+    return kinds, int(same)
+
+
 @pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])
 def test_stock_finds_no_other_paths(partial: sp.PartialMap, tmp_path: Path) -> None:
     """With each face a slab, all strong paths of the public solver, at the same points, as strong."""
@@ -119,18 +135,9 @@ def test_stock_finds_no_other_paths(partial: sp.PartialMap, tmp_path: Path) -> N
     scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
     found = 0
     for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
-        own = np.flatnonzero(ours.path_rx == rx)
         for path in np.flatnonzero(paths.power > 1e-3 * paths.power.sum()):
-            kinds = paths.interactions[path][paths.interactions[path] > 0]
-            at_m = paths.vertices_m[path, : len(kinds)] + shift
-            same = [
-                k
-                for k in own
-                if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
-                and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
-            ]
-            assert len(same) == 1
-            assert abs(ours.a[same[0]]) ** 2 == pytest.approx(paths.power[path], rel=2e-3)
+            kinds, same = same_path(ours, rx, paths, path, shift)
+            assert abs(ours.a[same]) ** 2 == pytest.approx(paths.power[path], rel=2e-3)
             found += REFRACTION in kinds
     assert found > 30
 
@@ -145,22 +152,13 @@ def test_stock_is_diffracted_at_no_other_edges(tmp_path: Path) -> None:
     scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
     found = 0
     for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
-        own = np.flatnonzero(ours.path_rx == rx)
         at_edges = diffracted_as_exact(wedges, paths, 2)  # Sionna RT has junctions of walls and rims as well
         for path in np.flatnonzero(at_edges & (paths.power > 1e-4 * paths.power.sum())):
-            kinds = paths.interactions[path][paths.interactions[path] > 0]
-            at_m = paths.vertices_m[path, : len(kinds)] + shift
-            if {*kinds.tolist()} != {REFRACTION, DIFFRACTION}:
+            if {*paths.interactions[path].tolist()} - {0} != {REFRACTION, DIFFRACTION}:
                 continue
-            same = [
-                k
-                for k in own
-                if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
-                and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
-            ]
-            assert len(same) == 1
+            kinds, same = same_path(ours, rx, paths, path, shift)
             if len(kinds) == settings.max_depth:
-                assert abs(ours.a[same[0]]) ** 2 == pytest.approx(paths.power[path], rel=5e-3)
+                assert abs(ours.a[same]) ** 2 == pytest.approx(paths.power[path], rel=5e-3)
                 found += 1
     assert found > 2
 

@@ -8,8 +8,8 @@ from extruded import ROOM, SPLINTERS, chains_between, diffracted_blocks, extrude
 from numpy.typing import NDArray
 
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import DIFFRACTION
+from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, find_wedges
 
 TX = np.array([1.07, 1.93, 1.2])

@@ -13,7 +13,7 @@ from rosbag_files import write_drive
 
 import sionna_partial as sp
 
-pytestmark = QUIET
+pytestmark = [QUIET, pytest.mark.usefixtures("short_search")]
 
 CHAINS = (
     ("build_dataset", "read_dataset", "train", "evaluate"),

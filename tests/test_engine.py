@@ -16,9 +16,8 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.scene.scene import SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing import engine
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault, open_scene
-from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.paths import Candidates, SolvedPaths
 from sionna_partial.tracing.plan.diffraction import find_wedges
 
 SHAPES = ("walls", "floor", "ceiling")
@@ -50,7 +49,7 @@ class TestVerify:
         """Embree loses hits of rays that are called coherent and are not."""
         home = sp.make_home(9)
         geometry = build_scene(home)
-        free = (np.argwhere(home.state == CellState.FREE)[::40, ::-1] + 0.5) * home.resolution_m
+        free = (np.argwhere(home.state == CellState.FREE)[::80, ::-1] + 0.5) * home.resolution_m
         positions = np.column_stack([free, np.full(len(free), 1.5)])
         tx, rx = positions[len(positions) // 2], np.delete(positions, len(positions) // 2, axis=0)
         candidates = _specular(geometry, tx, rx, 6)

@@ -8,10 +8,9 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
-from sionna_partial.calibration import material_fit
 from sionna_partial.cli.app import app
 
-pytestmark = pytest.mark.usefixtures("command_line")
+pytestmark = pytest.mark.usefixtures("command_line", "short_search")
 
 HEADER = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
 HIDDEN = sp.Material(5.0, 2.0, 0.01)
@@ -37,12 +36,6 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ]
     (folder / "measured.csv").write_text("\n".join([HEADER, *rows, ""]))
     return folder
-
-
-@pytest.fixture(autouse=True)
-def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, value in {"COARSE_CELLS": 8, "MOST_FRINGES": 1, "MOST_CELLS": 40, "FEW_FRINGES": 1}.items():
-        monkeypatch.setattr(material_fit, name, value)
 
 
 def run(*arguments: object) -> Result:

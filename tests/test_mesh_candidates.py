@@ -10,10 +10,10 @@ from extruded import everything
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
-from sionna_partial.tracing.mesh.planes import group_planes
+from sionna_partial.tracing.mesh.faces import group_planes
 from sionna_partial.tracing.mesh.sequences import shoot_rays
+from sionna_partial.tracing.paths import Candidates
 
 SIZE = np.array([8.0, 6.0, 3.0])
 TX = np.array([0.3, -0.2, 0.1])

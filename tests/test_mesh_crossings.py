@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 import trimesh
 from meshes import box, scene_mesh
-from test_crossings import BRICK, EVERY, LONELY, REFRACTION, RX, STRAIGHT, TX, loss_db, rooms, slab_loss_db
+from test_crossings import BRICK, EVERY, LONELY, REFRACTION, RX, STRAIGHT, TX, loss_db, rooms, same_path, slab_loss_db
 
 import sionna_partial as sp
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import stock_paths
-from sionna_partial.tracing.mesh.faces import face_tree, faces_between, scratch
-from sionna_partial.tracing.mesh.planes import group_planes
+from sionna_partial.tracing.mesh.faces import face_tree, faces_between, group_planes, scratch
 from sionna_partial.tracing.simulation import checked_settings
 
 ENDS = (3.0, 2.97, 1.5), (6.0, 3.41, 1.5)
@@ -97,18 +96,9 @@ def test_stock_finds_no_other_paths(meshed: sp.PartialMap, tmp_path: Path) -> No
     scene = open_scene(folder / "scene.xml", 5e9)
     found = 0
     for rx, paths in enumerate(stock_paths(scene, settings, TX - SHIFT, RX - SHIFT)):
-        own = np.flatnonzero(ours.path_rx == rx)
         for path in np.flatnonzero(paths.power > 1e-3 * paths.power.sum()):
-            kinds = paths.interactions[path][paths.interactions[path] > 0]
-            at_m = paths.vertices_m[path, : len(kinds)]
-            same = [
-                k
-                for k in own
-                if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
-                and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
-            ]
-            assert len(same) == 1
-            assert abs(ours.a[same[0]]) ** 2 == pytest.approx(paths.power[path], rel=5e-3)
+            kinds, same = same_path(ours, rx, paths, path, np.zeros(3))
+            assert abs(ours.a[same]) ** 2 == pytest.approx(paths.power[path], rel=5e-3)
             found += REFRACTION in kinds
     assert found > 30
 

@@ -3,7 +3,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.mesh.planes import PLANE_TOLERANCE_M, MeshPlanes, face_at, group_planes
+from sionna_partial.tracing.mesh.faces import PLANE_TOLERANCE_M, MeshPlanes, face_at, group_planes
 
 
 def planes_of(mesh: trimesh.Trimesh) -> MeshPlanes:

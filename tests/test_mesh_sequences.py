@@ -8,7 +8,7 @@ import trimesh
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 
 from sionna_partial.tracing.mesh import sequences as module
-from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
+from sionna_partial.tracing.mesh.faces import MeshPlanes, group_planes
 from sionna_partial.tracing.mesh.sequences import MARGIN, Rays, Sequences, collect_sequences, shoot_rays, view_sequences
 
 TX = np.array([0.3, -0.2, 0.1])

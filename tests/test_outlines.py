@@ -250,14 +250,14 @@ def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float)
     }
 
 
-@pytest.mark.parametrize("cells", range(1, 7))
+@pytest.mark.parametrize("cells", [1, 5, 6])
 def test_gap_that_no_ray_passed_is_closed_up_to_half_a_metre(cells: int) -> None:
     wall = f"....####{'?' * cells}####...."
     partial = drawn(f"{'?' * len(wall)} {wall} {'.' * len(wall)}", 0.1)
     assert len(wall_outlines(partial).segments) == (1 if cells <= 5 else 2)
 
 
-@pytest.mark.parametrize("cells", range(1, 6))
+@pytest.mark.parametrize("cells", [1, 3, 5])
 def test_gap_around_a_corner_is_closed(cells: int) -> None:
     """Both walls end before they meet: the line between their ends."""
     size = 16
@@ -290,8 +290,7 @@ def test_unobserved_regions_become_no_walls() -> None:
     assert farthest_from_walls(partial, outlines) < 0.8
 
 
-@pytest.mark.parametrize("angle_deg", [3, 17, 30, 45, 73])
-@pytest.mark.parametrize("thickness", [0.0, -1.0])
+@pytest.mark.parametrize(("angle_deg", "thickness"), [(3, 0.0), (17, -1.0), (30, 0.0), (45, -1.0), (73, 0.0)])
 def test_gap_of_a_tilted_wall_is_closed_and_a_door_is_not(angle_deg: float, thickness: float) -> None:
     sampled = tilted(angle_deg, thickness)
     state = sampled.state.copy()
@@ -307,8 +306,9 @@ def test_gap_of_a_tilted_wall_is_closed_and_a_door_is_not(angle_deg: float, thic
     assert nearest > 3.0
 
 
-@pytest.mark.parametrize("angle_deg", [0, 3, 17, 45, 60, 87])
-@pytest.mark.parametrize("thickness", [0.0, -1.0])
+@pytest.mark.parametrize(
+    ("angle_deg", "thickness"), [(0, 0.0), (3, -1.0), (17, 0.0), (45, 0.0), (45, -1.0), (60, -1.0), (87, 0.0)]
+)
 def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: float) -> None:
     for phase in (0.11, 0.37, 0.8):
         partial = tilted(angle_deg, thickness, phase)
@@ -321,8 +321,7 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
         assert farthest_from_outlines(partial, outlines) < 0.8
 
 
-@pytest.mark.parametrize("angle_deg", [3, 17, 45])
-@pytest.mark.parametrize("thickness", [4, 6])
+@pytest.mark.parametrize(("angle_deg", "thickness"), [(3, 4), (17, 6), (45, 4), (45, 6)])
 def test_thick_tilted_wall_has_few_segments(angle_deg: float, thickness: float) -> None:
     partial = tilted(angle_deg, thickness, 0.2)
     outlines = wall_outlines(partial)
@@ -330,8 +329,9 @@ def test_thick_tilted_wall_has_few_segments(angle_deg: float, thickness: float) 
     assert_sound(outlines)
 
 
-@pytest.mark.parametrize("thickness", [1, 2, 3, 5])
-@pytest.mark.parametrize("fraction", [0.0, 0.05, 0.2])
+@pytest.mark.parametrize(
+    ("thickness", "fraction"), [(1, 0.0), (1, 0.2), (2, 0.05), (3, 0.2), (5, 0.0), (5, 0.05), (5, 0.2)]
+)
 def test_ragged_rooms_keep_their_regions(thickness: int, fraction: float) -> None:
     partial = ragged_room(7, thickness, fraction)
     outlines = wall_outlines(partial)
@@ -469,21 +469,20 @@ def test_outlines_turn_and_move_with_the_map(
     np.testing.assert_array_equal(there.segments, here.segments)
 
 
-@pytest.mark.parametrize("orientation", SYMMETRIES)
-def test_map_that_is_its_own_mirror_image_has_sound_outlines(orientation: tuple[bool, int, int]) -> None:
+def test_map_that_is_its_own_mirror_image_has_sound_outlines() -> None:
     """Of two equal choices one is taken; a plain room needs none."""
     partial = ragged_room(5, 3, 0.2)
     quarter = partial.state[:70, :70]
     quarter = np.where(quarter < quarter.T, quarter, quarter.T)
     half = np.concatenate([quarter, quarter[::-1]])
     whole = PartialMap(np.concatenate([half, half[:, ::-1]], axis=1), 0.05)
-    assert (transformed(whole.state, *orientation) == whole.state).all()
     assert_sound(wall_outlines(whole))
     room = drawn("######## #......# #......# #......# #......# #......# #......# ########")
     corners = in_cells(room, wall_outlines(room)).reshape(-1, 2)
-    assert {tuple(p) for p in corners.tolist()} == {
-        tuple(p) for p in transformed_points(corners, (8, 8), *orientation).tolist()
-    }
+    for orientation in SYMMETRIES:
+        assert (transformed(whole.state, *orientation) == whole.state).all()
+        turned = transformed_points(corners, (8, 8), *orientation)
+        assert {tuple(p) for p in turned.tolist()} == {tuple(p) for p in corners.tolist()}
 
 
 def test_large_warehouse_is_quick_and_few() -> None:

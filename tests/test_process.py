@@ -138,5 +138,5 @@ def test_cached_code_of_another_version_of_the_package_is_not_used(tmp_path: Pat
     outputs = [subprocess.run(run, check=True, capture_output=True, text=True).stdout for _ in range(2)]
     (index,) = (tmp_path / "__pycache__").glob("*.nbi")
     index.write_bytes(pickle.dumps(numba.__version__) + b"cpackage_that_is_gone\nThing\n.")
-    outputs += [subprocess.run(run, check=True, capture_output=True, text=True).stdout for _ in range(2)]
-    assert outputs == ["1.5 Counter()\n", "1.5 Counter({(float64,): 1})\n"] * 2
+    outputs.append(subprocess.run(run, check=True, capture_output=True, text=True).stdout)
+    assert outputs == ["1.5 Counter()\n", "1.5 Counter({(float64,): 1})\n", "1.5 Counter()\n"]

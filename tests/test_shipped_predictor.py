@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from coverage_cases import shipped
 from predictor_links import QUIET
 
 import sionna_partial as sp
@@ -55,13 +56,14 @@ def test_map_is_worth_more_than_the_distance_alone(evaluation: Evaluation) -> No
 
 @pytest.mark.parametrize(("range_noise_m", "noise"), [(0.0, 0.0), (0.03, 1.0)])
 def test_a_map_with_range_noise_is_predicted_less_certainly(range_noise_m: float, noise: float) -> None:
-    settings = replace(SETTINGS, stages=(100,), sensor=sp.SensorSettings(range_noise_m=range_noise_m))
+    sensor = sp.SensorSettings(range_noise_m=range_noise_m)
+    settings = replace(SETTINGS, links_per_home=60, transmitters_per_home=2, stages=(60,), sensor=sensor)
     links = home_links(sp.make_home(3, "apartment"), "home", settings)
     wall_noise = links.context.wall_noise[0]
     assert wall_noise == pytest.approx(noise, abs=LEAST_NOISE)
     phi = links.phi
     as_exact = replace(phi, context=replace(phi.context, wall_noise=np.zeros(len(links))))
-    wider, usual = (sp.Predictor.load().predict(each) for each in (phi, as_exact))
+    wider, usual = (shipped().predict(each) for each in (phi, as_exact))
     both_seen = links.context.tx_seen & links.context.rx_seen
     assert 10 < both_seen.sum() < len(links) - 10
     excess = max(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE)
@@ -99,7 +101,7 @@ def test_on_a_nearly_complete_map_the_trace_counts_with_its_errors(noise: float)
     phi = sp.link_features(partial, sp.trace_links(partial, (1.0, 1.0, 1.5), rx_m))
     assert phi.context.nearly_complete.tolist() == [True, True, True, True, False]
     alone = replace(phi, context=replace(phi.context, nearly_complete=np.zeros(5, dtype=bool)))
-    ours, networks = (sp.Predictor.load().predict(each) for each in (phi, alone))
+    ours, networks = (shipped().predict(each) for each in (phi, alone))
     np.testing.assert_allclose(ours.p_los + ours.p_nlos + ours.p_outage, 1.0)
     assert (ours.gain_std_db[:4] > 0.1).all()
     assert ours.gain_mean_db[4] == networks.gain_mean_db[4]

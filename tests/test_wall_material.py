@@ -135,6 +135,7 @@ class TestScene:
         assert powers[1][1] == pytest.approx(powers[0][1], rel=1e-6)
 
 
+@pytest.mark.usefixtures("short_search")
 def test_calibration_finds_what_a_kind_of_wall_lets_through() -> None:
     """Links on either side of a wall through the middle, at 5 GHz; the outer walls are of another material."""
     state = np.zeros((40, 60), dtype=np.uint8)

@@ -12,11 +12,10 @@ from typer.core import TyperGroup
 
 from sionna_partial import __version__
 from sionna_partial.cli.learning import dataset, evaluate, train
-from sionna_partial.cli.links import channels, network
 from sionna_partial.cli.live import live, open_app
 from sionna_partial.cli.options import TransmitterCommand
 from sionna_partial.cli.planning import calibrate, next_views, place
-from sionna_partial.cli.prediction import demo, explore, export_scene, info, predict
+from sionna_partial.cli.prediction import channels, demo, explore, export_scene, info, network, predict
 from sionna_partial.errors import SionnaPartialError, one_line
 from sionna_partial.process import end_at_signals, end_process
 

@@ -1,14 +1,17 @@
-"""Subcommands from a map to its coverage: predict, export-scene, explore, demo, info."""
+"""Subcommands that predict: predict, network, channels, export-scene, explore, demo, info."""
 
+import re
+from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB
-from sionna_partial.files import atomic_files
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.errors import PositionError
+from sionna_partial.files import atomic_files, read_columns
 from sionna_partial.progress import part_of
 from sionna_partial.settings import Policy, SceneSettings
 
@@ -17,6 +20,11 @@ FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 
 FRAMES = 50
 """About the number of frames in an animation."""
+
+COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
+"""Columns of positions, by any of these names."""
+
+ROWS_BY_COLUMNS = "ROWSxCOLUMNS"
 
 
 @opt.with_options
@@ -158,3 +166,158 @@ def _parse_format(name: str) -> str:
     if suffix not in FORMATS:
         raise typer.BadParameter(f"--format {name!r} is not known: choose from {', '.join(FORMATS)}.")
     return suffix
+
+
+@opt.with_options
+def network(
+    *,
+    tx: Annotated[
+        list[str],
+        typer.Option(metavar="X Y [Z]", help="Transmitter [m]; once for each.", show_default=False),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for coverage, network and picture.", show_default=False)],
+    tx_power: Annotated[
+        list[float], typer.Option(help="Transmit power [dBm]; once for all, or once for each.", show_default="20")
+    ] = [20.0],  # noqa: B006
+    tx_antenna: Annotated[
+        list[str],
+        typer.Option(
+            metavar="PATTERN|FILE", help="As for predict; once for all, or once for each.", show_default="iso"
+        ),
+    ] = ["iso"],  # noqa: B006
+    azimuth: Annotated[
+        list[float], typer.Option(help="Of the antennas, counterclockwise from x [degree].", show_default="0")
+    ] = [0.0],  # noqa: B006
+    tilt: Annotated[
+        list[float], typer.Option(help="Of the antennas, below the horizon [degree].", show_default="0")
+    ] = [0.0],  # noqa: B006
+    noise_figure: Annotated[float, typer.Option(help="Of the receivers [dB].")] = 7.0,
+    bandwidth: Annotated[float, typer.Option(help="Bandwidth [Hz].")] = 100e6,
+    load: Annotated[float, typer.Option(help="Fraction of time in which an interferer transmits.")] = 1.0,
+    sinr_threshold: Annotated[float, typer.Option(help="SINR that a receiver needs [dB].")] = 0.0,
+    spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.25,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
+    settings: opt.Settings,
+    predictor: opt.PredictorName = "",
+    partial: opt.PartialMap,
+    memory: opt.Memory = MEMORY_GB,
+) -> None:
+    """Predict best server, SINR and rate of several transmitters on a partial map."""
+    from sionna_partial.link_budget import LinkBudget, transmit_powers_dbm
+
+    positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
+    powers_dbm = transmit_powers_dbm(tx_power[0] if len(tx_power) == 1 else tx_power, len(positions))
+    antennas = [
+        opt.parse_antenna(*each)
+        for each in zip(*(opt.for_each(values, len(positions)) for values in (tx_antenna, azimuth, tilt)), strict=True)
+    ]
+    budget = LinkBudget(noise_figure, bandwidth, load, sinr_threshold)
+    with opt.reporting_to(out, "loading the predictor") as report:
+        coverage = sp.predict_map(
+            partial,
+            positions,
+            tx_antenna=antennas,
+            rx_height_m=rx_height,
+            spacing_m=spacing,
+            predictor=predictor or None,
+            **settings,
+            memory_gb=memory,
+            progress=part_of(report, 0.0, 0.8),
+        )
+        report(0.8, "drawing links together")
+        found = sp.network_map(coverage, tx_power_dbm=powers_dbm, **asdict(budget))
+        with atomic_files(out) as folder:
+            report(0.9, "writing")
+            for name in ("coverage.nc", "coverage.html"):
+                sp.save_coverage(coverage, folder / name)
+            sp.save_network(found, folder / "network.nc")
+            sp.plot_network(found).savefig(folder / "network.png")
+    opt.print_files(out, ["coverage.nc", "coverage.html", "network.nc", "network.png"])
+
+
+@opt.with_options
+def channels(
+    *,
+    tx: Annotated[
+        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m], 1.5 m high without Z.", show_default=False)
+    ],
+    out: Annotated[Path, typer.Option(help="A .nc or .h5 file, or a new .zarr folder.", show_default=False)],
+    rx: Annotated[
+        str, typer.Option(metavar="grid|CSV", help="Receivers: all free space, or a file with columns x,y,z [m].")
+    ] = "grid",
+    spacing: Annotated[float, typer.Option(help="Distance between receivers of the grid [m].")] = 0.5,
+    rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
+    array: Annotated[str, typer.Option(metavar=ROWS_BY_COLUMNS, help="Antennas of the transmitter.")] = "1x1",
+    rx_array: Annotated[str, typer.Option(metavar=ROWS_BY_COLUMNS, help="Antennas of the receivers.")] = "1x1",
+    pattern: Annotated[
+        str, typer.Option(metavar="NAME", help="Pattern of the transmitter's: iso, dipole, hw_dipole, tr38901.")
+    ] = "iso",
+    polarization: Annotated[str, typer.Option(metavar="V|H|VH|cross", help="Polarisation of all antennas.")] = "V",
+    orientation: Annotated[
+        tuple[float, float, float], typer.Option(metavar="A B C", help="Of the transmitter, about z, y, x [rad].")
+    ] = (0.0, 0.0, 0.0),
+    layout: Annotated[str, typer.Option(metavar="sionna|deepmimo", help="Axes of the arrays.")] = "sionna",
+    settings: opt.Settings,
+    partial: opt.PartialMap,
+    memory: opt.Memory = MEMORY_GB,
+) -> None:
+    """Trace a map, and write the channel impulse responses between antenna arrays."""
+    position = (*opt.parse_position(tx), DEFAULT_HEIGHT_M)[:3]
+    shapes = [_parse_shape(name, text) for name, text in (("array", array), ("rx-array", rx_array))]
+    with opt.reporting_to(out.parent, "loading Sionna RT") as report:
+        from sionna_partial.channels.files import checked_target
+        from sionna_partial.tracing.antennas import planar_array
+        from sionna_partial.tracing.simulation import valid_links
+
+        checked_target(out, layout)
+        arrays = [
+            planar_array(*shape, pattern=each, polarization=polarization)
+            for shape, each in zip(shapes, (pattern, "iso"), strict=True)
+        ]
+        if rx == "grid":
+            grid_m = _free_grid(partial, spacing, rx_height)
+            receivers_m = grid_m[valid_links(partial, position, grid_m, settings["trace_settings"].frequency_hz)[2][0]]
+        else:
+            receivers_m = _read_positions(Path(rx))
+        links = sp.trace_links(
+            partial, position, receivers_m, **settings, memory_gb=memory, progress=part_of(report, 0.0, 0.5)
+        )
+        sp.save_channels(
+            links,
+            out,
+            layout=layout,  # type: ignore[arg-type]
+            progress=part_of(report, 0.5, 1.0),
+            tx_array=arrays[0],
+            rx_array=arrays[1],
+            tx_orientation_rad=orientation,
+        )
+    typer.echo(f"{len(receivers_m)} receivers, {len(links.a)} paths")
+    opt.print_files(out.parent, [out.name])
+
+
+def _parse_shape(name: str, text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,4})x(\d{1,4})", text)
+    if not found:
+        raise typer.BadParameter(f"--{name} {text!r} is no array: give rows and columns, such as 8x8.")
+    return int(found[1]), int(found[2])
+
+
+def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
+    """Return positions (N, 3) in free cells [m]."""
+    import numpy as np
+
+    from sionna_partial.coverage_map import grid_axes
+
+    x_m, y_m = np.meshgrid(*grid_axes(partial, spacing_m))
+    grid_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, height_m)])
+    return grid_m[partial.state_at(grid_m) == CellState.FREE]
+
+
+def _read_positions(path: Path) -> list[tuple[float, ...]]:
+    """Read positions [m] from a CSV."""
+    remedy = "give a CSV with the columns x,y,z in metres."
+    found = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy)
+    names = next((names for names in COLUMNS if found.keys() >= {*names}), None)
+    if names is None:
+        raise PositionError(f"--rx = '{path}' has no positions: {remedy}")
+    return [*zip(*(found[name] for name in names), strict=True)]

@@ -27,8 +27,7 @@ from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.process import signals_held
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.candidates import Candidates, Wedges
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges, join_paths
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
 """Mitsuba variant of Sionna RT on a CPU."""

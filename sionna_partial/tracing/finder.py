@@ -23,23 +23,21 @@ from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
-from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, set_antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.crossings import MeshCrossings
-from sionna_partial.tracing.mesh.faces import FaceTree, face_tree
-from sionna_partial.tracing.mesh.planes import MeshPlanes, group_planes
+from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 from sionna_partial.tracing.mesh.walls import Bodies, Cells, SolidMesh, closed_bodies
-from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.legs import Interior, solid_sides
 from sionna_partial.tracing.plan.obstacles import Lowered
-from sionna_partial.tracing.plan.slabs import slabs_of
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
+from sionna_partial.tracing.slab import slabs_of
 
 CANDIDATES_AT_ONCE = 100_000
 """Number of candidates that Sionna RT verifies together, which bounds the memory."""
@@ -62,14 +60,26 @@ SAME_EDGE_M = 1e-3
 
 @dataclass(frozen=True)
 class PlanScene:
-    """An extruded floor plan on disk, with the names of its shapes in the order in which faces are counted."""
+    """An extruded floor plan on disk, with the names of its shapes in the order in which faces are counted.
+
+    `floor` (ny, nx) are the cells of its map that have a floor.
+    """
 
     xml: Path
     shapes: tuple[str, ...]
     settings: TraceSettings
     geometry: SceneGeometry
     wedges: Wedges
-    interior: Interior
+    partial: PartialMap
+    floor: Bools
+
+    @cached_property
+    def interior(self) -> Interior:
+        """What lies between its walls, for paths through them."""
+        depth_m, partial = self.settings.wall_depth_m, self.partial
+        walls = (partial.state == CellState.WALL) & (depth_m > 0.0)
+        solid = solid_sides(self.geometry.plan, walls, partial.resolution_m)
+        return Interior(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
 
     def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
         """Find the paths between a transmitter (3,) and receivers (N, 3) that are strong enough to matter."""
@@ -202,12 +212,9 @@ def write_scene_of(
         free &= ~narrow_areas(free, partial.resolution_m, settings.wall_depth_m)
         cells = Cells(free, partial.resolution_m, settings.wall_depth_m)
         return MeshScene(xml, shapes, settings, geometry.vertices_m - [*offset_m, 0.0], geometry.triangles, cells)
-    floor = floor_cells(partial, scene_settings.floor_extent)
-    walls = (partial.state == CellState.WALL) & (settings.wall_depth_m > 0.0)
-    solid = solid_sides(geometry.plan, walls, partial.resolution_m)
-    interior = Interior(partial.state == CellState.FREE, floor, solid, partial.resolution_m, settings.wall_depth_m)
     wedges = find_wedges(geometry, open_ends=settings.open_ends)
-    return PlanScene(xml, geometry.shapes, settings, geometry, wedges, interior)
+    floor = floor_cells(partial, scene_settings.floor_extent)
+    return PlanScene(xml, geometry.shapes, settings, geometry, wedges, partial, floor)
 
 
 def _strong_paths(

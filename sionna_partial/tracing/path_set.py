@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.display import Shown
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables, forward_passes
 from sionna_partial.tracing.links import LinkSums, TracedLinks
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.paths import Candidates, SolvedPaths, join_paths
 
 PATHS_PER_BLOCK = 50_000
 """Number of paths that are evaluated together, which bounds the memory."""

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFLECTION
-from sionna_partial.tracing.mesh.planes import MeshPlanes, face_at
+from sionna_partial.tracing.mesh.faces import MeshPlanes, face_at
 from sionna_partial.tracing.mesh.sequences import Rays, Sequences, Views, collect_sequences, view_sequences
+from sionna_partial.tracing.paths import Candidates
 
 REACH, REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may lie farther than the sequence's rays went."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
-from sionna_partial.tracing.mesh.planes import MeshPlanes, mix
+from sionna_partial.tracing.mesh.faces import MeshPlanes, mix
 
 MARGIN = 8.0
 """Distance in direction from a sequence's rays up to which its receivers are looked for, in spacings of the rays."""

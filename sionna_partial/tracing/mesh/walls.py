@@ -14,10 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.process import njit
 from sionna_partial.tracing.interactions import REFRACTION
-from sionna_partial.tracing.mesh.faces import FaceTree
-from sionna_partial.tracing.mesh.planes import MeshPlanes
+from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes
 from sionna_partial.tracing.plan.legs import choose_face, is_free_between
-from sionna_partial.tracing.plan.slabs import Slabs
+from sionna_partial.tracing.slab import Slabs
 
 
 class Bodies(NamedTuple):

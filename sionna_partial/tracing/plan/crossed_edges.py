@@ -15,11 +15,10 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.bounds import Strengths, at_edge, at_flats, transmitted_power, utd_terms, wedge_angle
-from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.interactions import DIFFRACTION
+from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.plan.crossing_beams import Building
-from sionna_partial.tracing.plan.crossing_powers import can_bounce_as
-from sionna_partial.tracing.plan.crossings import least_power, weakest_needed
+from sionna_partial.tracing.plan.crossings import can_bounce_as, least_power, weakest_needed
 from sionna_partial.tracing.plan.diffraction import angle_rad, edges_of, outside
 from sionna_partial.tracing.plan.legs import (
     Leg,

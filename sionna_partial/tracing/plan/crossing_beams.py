@@ -27,8 +27,8 @@ from sionna_partial.tracing.plan.beams import (
     _without_ended,
 )
 from sionna_partial.tracing.plan.legs import FACES, Interior
-from sionna_partial.tracing.plan.slabs import COSINES, Slabs
 from sionna_partial.tracing.plan.specular import Room
+from sionna_partial.tracing.slab import COSINES, Slabs
 
 USUAL_REFLECTIONS = 3
 """Reflections at walls beyond which beams must be stronger, unless all paths are asked for."""

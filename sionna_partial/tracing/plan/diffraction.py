@@ -29,8 +29,8 @@ from sionna_partial.tracing.bounds import (
     wedge_angle,
     wedge_constants,
 )
-from sionna_partial.tracing.candidates import Candidates, Wedges
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
+from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
 from sionna_partial.tracing.plan.specular import (
     CEILING,

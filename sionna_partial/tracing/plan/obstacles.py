@@ -7,8 +7,8 @@ import numpy as np
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import njit
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFRACTION
+from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.legs import Interior, group_faces
 from sionna_partial.tracing.plan.specular import Room
 

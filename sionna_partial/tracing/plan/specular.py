@@ -15,8 +15,8 @@ from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.bounds import LEVELS, Strengths, at_flats, at_wall, level_of
-from sionna_partial.tracing.candidates import Candidates
 from sionna_partial.tracing.interactions import REFLECTION
+from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.beams import trace_beams
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
