@@ -12,7 +12,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
 from predictor_links import walls_of_links
 
 from sionna_partial.constants import GAIN_FLOOR_DB
@@ -104,7 +103,8 @@ def fake_links(home: object, name: str, settings: DatasetSettings | None = None)
         map_index=map_index,
         link_state=state,
         gain_db=rng.uniform(GAIN_FLOOR_DB, -40.0, count),
-        **{column: _coins(rng, count) for column in ("inside", "anywhere")},
+        inside=rng.integers(0, 2, count).astype(bool),
+        anywhere=np.tile(np.repeat([False, True], settings.links_per_home), len(settings.stages)),
         observed_fraction=rng.uniform(0.0, 1.0, count),
         complete_maps={name: _map(rng)},
     )
@@ -114,10 +114,6 @@ def _map(rng: np.random.Generator) -> PartialMap:
     shape, origin_m = rng.integers(3, 9, 2), tuple(rng.uniform(-1.0, 1.0, 2))
     interior_cells = int(rng.integers(50)) if rng.random() < 0.5 else None
     return PartialMap(rng.integers(0, 3, shape), rng.uniform(0.5, 1.0), origin_m, rng.uniform(2.0, 4.0), interior_cells)
-
-
-def _coins(rng: np.random.Generator, count: int) -> NDArray[np.bool_]:
-    return rng.integers(0, 2, count).astype(bool)
 
 
 def _full_disk() -> Exception:

@@ -11,6 +11,7 @@ from meshes import OBSERVED, room
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.calibration import material_fit
 from sionna_partial.calibration.measured_building import custom_material
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
@@ -187,8 +188,10 @@ class TestPartialMap:
             calibrate({**measurements, "gain_db": gain_db})
 
 
-def test_materials_of_a_mesh() -> None:
+def test_materials_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     """The walls of the room and the one inside are of different materials, and a third one is not used."""
+    monkeypatch.setattr(material_fit, "COARSE_CELLS", 12)
+    monkeypatch.setattr(material_fit, "MOST_FRINGES", 2)
     walls, inner = room().geometry.values()
     vertices = np.concatenate([walls.vertices, inner.vertices])
     triangles = np.concatenate([walls.faces, inner.faces + len(walls.vertices)])

@@ -1,10 +1,12 @@
+from functools import partial
+
 import numpy as np
 import pytest
 from coverage_cases import COMPLETE, PICTURE, TX, map_of, shipped
 from PIL import Image
 from typer.testing import CliRunner
 
-from sionna_partial import cli
+from sionna_partial import cli, demo
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage import predict_map
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table, demo_scene
@@ -26,7 +28,8 @@ def coverages():
 
 
 @pytest.mark.usefixtures("command_line")
-def test_the_demo_writes_every_file_and_prints_the_table_and_their_names(tmp_path):
+def test_the_demo_writes_every_file_and_prints_the_table_and_their_names(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "predict_map", partial(predict_map, spacing_m=0.4))
     out = tmp_path / "out"
     result = CliRunner().invoke(cli.app, ["demo", "--out", str(out)])
     assert result.exit_code == 0, result.output

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from dataset_fakes import processes_make_fakes
 from predictor_links import QUIET
 from rosbag_files import write_drive
 
@@ -53,6 +54,7 @@ def searched_once() -> Iterator[None]:
 @pytest.mark.parametrize("names", [*CHAINS, *ALONE], ids=lambda names: names[0])
 def test_examples(names: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(processes_make_fakes(tmp_path))
     write_drive(tmp_path / "drive.bag")
     finder, report = doctest.DocTestFinder(exclude_empty=True), list[str]()
     for name in names:

@@ -177,20 +177,18 @@ def declared(kind: str) -> set[str]:
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
-def after(code: str, names: str) -> set[str]:
-    """Names in a Python of its own after some code."""
+def modules_after(*steps: str) -> list[set[str]]:
+    """Modules that a Python of its own has loaded after each step; packages end with a dot."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
-    command = f"{code}\nimport sys, json; print(json.dumps(sorted({names})))"
-    result = subprocess.run(
-        [sys.executable, "-c", command], env=environment, capture_output=True, text=True, timeout=60
-    )
+    loaded = "[name + '.' * hasattr(each, '__path__') for name, each in sys.modules.items()]"
+    code = "\n".join(["import sys, json", *(f"{step}\nprint(json.dumps({loaded}))" for step in steps)])
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
     assert result.returncode == 0, result.stderr
-    return set(json.loads(result.stdout.splitlines()[-1]))
+    return [set(json.loads(line)) for line in result.stdout.splitlines() if line.startswith("[")]
 
 
-def loaded_by(code: str) -> set[str]:
-    """Top-level modules in a Python of its own after some code."""
-    return after(code, "{name.partition('.')[0] for name in sys.modules}")
+def libraries(modules: set[str]) -> set[str]:
+    return {name.partition(".")[0] for name in modules}
 
 
 class TestOneDirection:
@@ -229,9 +227,6 @@ class TestOneDirection:
 
 
 class TestLightImports:
-    def test_package(self) -> None:
-        assert not loaded_by("import sionna_partial") & (HEAVY | {"typer", "rich"})
-
     def test_help(self) -> None:
         code = """
 import typer
@@ -242,13 +237,22 @@ for name in ("", *typer.main.get_command(app).commands):
     except SystemExit as end:
         assert end.code == 0, name
 """
-        assert not loaded_by(code) & HEAVY
+        assert not libraries(modules_after(code)[-1]) & HEAVY
 
+    def test_package_reader_and_prediction(self) -> None:
+        """The package loads no library, a map its reader alone, and a prediction few modules."""
+        path = ROOT / "scenes/apartment/step100/map.yaml"
+        package, reader, prediction = modules_after(
+            "import sionna_partial as sp", f"sp.load_map({str(path)!r})", "sp.predict_map"
+        )
+        assert not libraries(package) & (HEAVY | {"typer", "rich"})
+        others = ("bags", "drawings", "ifc", "mesh.cells", "mesh.files", "mesh.points")
+        assert not reader & {f"sionna_partial.maps.{name}" for name in others}
+        assert not libraries(reader) & {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
+        own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
+        assert len(own) <= 68
 
-class TestOneCall:
-    """Modules of the package, its `__init__` files aside, that `predict_map` imports, and whose functions it runs."""
-
-    def test_few_modules_run(self) -> None:
+    def test_a_prediction_runs_few_modules(self) -> None:
         codes: set[CodeType] = set()
         predict = sionna_partial.predict_map
         sys.setprofile(lambda frame, *_: codes.add(frame.f_code))
@@ -258,19 +262,6 @@ class TestOneCall:
             sys.setprofile(None)
         files = {code.co_filename for code in codes if code.co_name != "<module>"}
         assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 39
-
-    def test_no_other_reader_is_loaded(self) -> None:
-        read = f"import sionna_partial as sp\nsp.load_map({str(ROOT / 'scenes/apartment/step100/map.yaml')!r})"
-        readers = {
-            f"sionna_partial.maps.{name}"
-            for name in ("bags", "drawings", "ifc", "mesh.cells", "mesh.files", "mesh.points")
-        }
-        assert not after(read, "sys.modules") & (readers | {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"})
-
-    def test_few_modules_are_imported(self) -> None:
-        modules = "name for name, each in sys.modules.items() if not hasattr(each, '__path__')"
-        loaded = after("import sionna_partial as sp\nsp.predict_map", f"{{{modules}}}")
-        assert len([name for name in loaded if name.startswith("sionna_partial.")]) <= 69
 
 
 class TestPublicNames:

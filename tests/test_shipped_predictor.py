@@ -57,7 +57,7 @@ def test_map_is_worth_more_than_the_distance_alone(evaluation: Evaluation) -> No
 @pytest.mark.parametrize(("range_noise_m", "noise"), [(0.0, 0.0), (0.03, 1.0)])
 def test_a_map_with_range_noise_is_predicted_less_certainly(range_noise_m: float, noise: float) -> None:
     sensor = sp.SensorSettings(range_noise_m=range_noise_m)
-    settings = replace(SETTINGS, links_per_home=60, transmitters_per_home=2, stages=(60,), sensor=sensor)
+    settings = replace(SETTINGS, links_per_home=100, stages=(100,), sensor=sensor)
     links = home_links(sp.make_home(3, "apartment"), "home", settings)
     wall_noise = links.context.wall_noise[0]
     assert wall_noise == pytest.approx(noise, abs=LEAST_NOISE)

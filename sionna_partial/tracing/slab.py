@@ -54,13 +54,20 @@ def reflection_loss_db(
         return -20.0 * np.log10(np.abs(te if polarisation == "te" else tm))
 
 
+def _refracted(
+    permittivity: ArrayLike, conductivity_s_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
+) -> tuple[NDArray[np.complex128], Floats, NDArray[np.complex128]]:
+    """Return the complex permittivity, the cosines as an array, and the index of refraction times those inside."""
+    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
+    eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
+    return eta, cosine, np.sqrt(eta - (1.0 - cosine**2))
+
+
 def reflection_coefficients(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Return the reflection coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
-    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
-    eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
-    root = np.sqrt(eta - (1.0 - cosine**2))
+    eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
     inside = np.exp(-4j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
     te, tm = (face * (1.0 - inside) / (1.0 - face**2 * inside) for face in faces)
@@ -71,9 +78,7 @@ def transmission_coefficients(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
     """Return the transmission coefficients of a slab, TE and TM, likewise."""
-    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
-    eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
-    root = np.sqrt(eta - (1.0 - cosine**2))
+    eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
     once = np.exp(-2j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
     te, tm = ((1.0 - face**2) * once / (1.0 - face**2 * once**2) for face in faces)
