@@ -1,5 +1,6 @@
 """Materials from measured gains: found again, with an honest uncertainty, from any start."""
 
+import functools
 import json
 import logging
 import re
@@ -45,12 +46,18 @@ def positions(count: int = 60) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return TX[np.arange(count) % 2], rx
 
 
-def measured(scene: sp.PartialMap = FLAT, hidden: sp.Material | None = HIDDEN, noise_db: float = 1.0) -> dict:
+@functools.cache
+def traced_db(hidden: sp.Material) -> NDArray[np.float64]:
+    """Return the gains of the links between walls of a hidden material."""
+    rx = positions()[1]
+    links = sp.trace_links(FLAT, TX, rx, trace_settings=SETTINGS, scene_settings=sp.SceneSettings(material=hidden))
+    return np.asarray(links.gain_db[np.arange(len(rx)) % 2, np.arange(len(rx))])
+
+
+def measured(hidden: sp.Material = HIDDEN, noise_db: float = 1.0) -> dict:
     tx, rx = positions()
-    settings = None if hidden is None else sp.SceneSettings(material=hidden)
-    links = sp.trace_links(scene, TX, rx, trace_settings=SETTINGS, scene_settings=settings)
-    gain_db = links.gain_db[np.arange(len(rx)) % 2, np.arange(len(rx))]
-    return {"tx": tx, "rx": rx, "gain_db": gain_db + noise_db * np.random.default_rng(4).standard_normal(len(rx))}
+    noise = np.random.default_rng(4).standard_normal(len(rx))
+    return {"tx": tx, "rx": rx, "gain_db": traced_db(hidden) + noise_db * noise}
 
 
 def calibrate(measurements: object, **arguments: object) -> sp.MaterialCalibration:

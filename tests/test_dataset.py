@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from dataset_fakes import HANGS, KILLS, KILLS_ONCE, RAISES, UNWRITABLE, fake_links, processes_make_fakes
 from link_tables import assert_same
@@ -320,32 +321,30 @@ class TestWorker:
 
 
 class TestScheduler:
-    def test_cluster_by_file_with_a_worker_that_is_killed(self, unbroken: Path, tmp_path: Path, notes: Path) -> None:
-        dask, file, folder = Path(sys.executable).parent / "dask", tmp_path / "scheduler.json", tmp_path / "set"
-        quiet = ("--scheduler-file", file, "--no-dashboard")
-        lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--local-directory", tmp_path, "--death-timeout", 30)
-        with (
-            started(dask, "scheduler", "--port", 0, "--host", "127.0.0.1", *quiet),
-            started(dask, "worker", *quiet, *lone) as victim,
-            started(sys.executable, "-c", BUILD.replace("workers=2", f"scheduler={str(file)!r}"), folder) as run,
-        ):
-            wait_until(lambda: shards(folder) >= 2)
-            victim.kill()
-            with started(dask, "worker", *quiet, *lone):
-                _, errors = run.communicate(timeout=60.0)
-        assert run.returncode == 0, errors
-        assert files(folder) == files(unbroken)
-
-    def test_slurm_example_without_slurm(self, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        script = Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch"
+    def test_slurm_example_whose_worker_is_killed(
+        self, unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Without SLURM the script starts a scheduler and a worker; another worker goes on where that one was."""
+        script, bin_folder = (
+            Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch",
+            Path(sys.executable).parent,
+        )
         subprocess.run(["bash", "-n", script], check=True)
-        monkeypatch.setenv("PATH", f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+        monkeypatch.setenv("PATH", f"{bin_folder}{os.pathsep}{os.environ['PATH']}")
         monkeypatch.setenv("SLURM_SUBMIT_DIR", str(tmp_path))
         monkeypatch.delenv("SLURM_JOB_ID", raising=False)
-        with started("bash", script, tmp_path / "set", "--homes", 1, "--links", 5) as run:
-            _, errors = run.communicate(timeout=60.0)
+        options = ("--homes", 8, "--first-seed", 0, "--links", 5, "--transmitters", 1, "--stage", 0, "--stage", 50)
+        with started("bash", script, tmp_path / "set", *options) as run:
+            wait_until(lambda: shards(tmp_path / "set") >= 2)
+            (worker,) = (each for each in psutil.Process(run.pid).children() if "worker" in each.cmdline())
+            for each in [*worker.children(recursive=True), worker]:
+                each.kill()
+            (file,) = tmp_path.glob("scheduler.*.json")
+            lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--local-directory", notes)
+            with started(bin_folder / "dask", "worker", "--scheduler-file", file, *lone):
+                _, errors = run.communicate(timeout=60.0)
         assert run.returncode == 0, errors
-        assert shards(tmp_path / "set") == 1
+        assert files(tmp_path / "set") == files(unbroken)
         assert [path.name for path in tmp_path.iterdir()] == ["set"]
 
     def test_file_that_is_not_there(self, tmp_path: Path) -> None:
