@@ -49,7 +49,7 @@ from sionna_partial.measurements.measurements import (
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
-from sionna_partial.prediction.through_walls import WALL_LOSSES, predict_through_walls
+from sionna_partial.prediction.through_walls import WALL_LOSSES
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.prediction.windows import map_windows
 from sionna_partial.progress import part_of, reporting
@@ -167,7 +167,7 @@ class LinkModel:
         """The predictor, which is read when it is first needed."""
         model = warm_predictor(self.asked)
         if self._by_wall_losses:
-            _log.warning("paths go through walls, which no network was trained for: %s predicts", WALL_LOSSES)
+            _log.warning("paths go through walls, which no shipped network was trained for: %s predicts", WALL_LOSSES)
         elif isinstance(model, Predictor):
             _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
@@ -266,7 +266,7 @@ class LinkModel:
         if complete.all():
             return trace
         if self._by_wall_losses:
-            return predict_through_walls(phi).where(complete, trace)
+            return LinkPrediction.of_mean_losses(phi).where(complete, trace)
         return self.predictor.predict(phi).where(complete, trace)
 
     def links(

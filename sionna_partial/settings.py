@@ -441,8 +441,8 @@ class PredictorSettings(Checked):
     seed : int
         Of first weights and batches.
     through_walls : bool
-        Whether paths go through walls. Frequency and losses of walls are then inputs of the added networks, and
-        `frequency_hz` is that of the paper's networks alone.
+        Whether paths go through walls. Frequency and losses of walls are then inputs of the added networks, which
+        correct what the mean loss of walls predicts, and `frequency_hz` is that of the paper's networks alone.
 
     Raises
     ------

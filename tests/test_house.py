@@ -51,8 +51,8 @@ ROOMS = {
         "antennas",
     ),
     "prediction": (
-        *("unobserved", "windows", "features", "inputs"),
-        *("paper_networks", "map_networks", "predictor_files", "predictor", "through_walls", "path_model"),
+        *("unobserved", "windows", "features", "inputs", "through_walls"),
+        *("paper_networks", "map_networks", "predictor_files", "predictor", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("link_budget", "coverage_map", "link_model", "coverage"),

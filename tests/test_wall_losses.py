@@ -14,7 +14,9 @@ from sionna_partial.datasets.home_walls import MIXED_FREQUENCIES_HZ, with_drawn_
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.prediction.features import LinkFeatures, WallLosses
-from sionna_partial.prediction.through_walls import WALL_LOSSES, predict_through_walls
+from sionna_partial.prediction.map_networks import context_networks, evaluate_context_networks
+from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.through_walls import WALL_LOSSES
 from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db, wall_reflection_db
 
 WIFI = sp.TraceSettings(5e9, max_depth=2)
@@ -53,7 +55,7 @@ def test_walls_of_a_map_count_by_their_cells() -> None:
 def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
     model = sp.LinkModel(half_seen(), trace_settings=WIFI)
     phi = model.features((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
-    found = predict_through_walls(phi)
+    found = LinkPrediction.of_mean_losses(phi)
     assert phi.unobserved_distance_m[0] == 0.0
     assert found.p_los[0] == 1.0
     assert found.gain_mean_db[0] == pytest.approx(phi.gain_db[0])
@@ -66,7 +68,7 @@ def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
 def test_outages_stay() -> None:
     phi = sp.LinkModel(half_seen(), trace_settings=WIFI).features((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
     lost = replace(phi, gain_db=np.array([-150.0]), link_state=np.array([LinkState.OUTAGE], dtype=np.uint8))
-    found = predict_through_walls(lost)
+    found = LinkPrediction.of_mean_losses(lost)
     assert (found.p_outage.item(), found.gain_mean_db.item(), found.gain_std_db.item()) == (1.0, -150.0, 0.0)
 
 
@@ -75,7 +77,7 @@ def test_the_default_through_walls(caplog: pytest.LogCaptureFixture) -> None:
     tx, options = (1.0, 2.0, 1.5), {"spacing_m": 0.5, "trace_settings": WIFI}
     with caplog.at_level(logging.WARNING):
         coverage = sp.predict_map(half_seen(), tx, **options)
-    assert any("no network was trained for" in message for message in caplog.messages)
+    assert any("no shipped network was trained for" in message for message in caplog.messages)
     assert coverage.attrs["predictor"] == WALL_LOSSES
     assert coverage.attrs["walls"] == "through walls"
     assert float(coverage.p_outage.max()) == 0.0
@@ -120,6 +122,25 @@ def test_measured_powers_through_walls() -> None:
     error_db = found.gain_mean_db + fitted.offset_db - power_dbm[20:]
     assert np.sqrt(np.mean(error_db**2)) < 4.0
     assert (found.gain_std_db > 0.5).all()
+
+
+@QUIET
+@pytest.mark.parametrize("with_map", [False, True])
+def test_untrained_networks_predict_the_mean_losses_of_walls(*, with_map: bool) -> None:
+    """They correct them by two standard deviations at most, whatever the walls."""
+    points_m = [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)]
+    phi = sp.link_features(half_seen(), sp.trace_links(half_seen(), (1.0, 2.0, 1.5), points_m, trace_settings=WIFI))
+    settings = sp.PredictorSettings("map" if with_map else "paths", through_walls=True)
+    networks = context_networks(0, with_map=with_map, through_walls=True)
+    found = LinkPrediction.of_parts(*evaluate_context_networks(networks, phi, settings))
+    base = LinkPrediction.of_mean_losses(phi)
+    for name in ("gain_los_mean_db", "gain_nlos_mean_db", "gain_los_std_db", "gain_nlos_std_db"):
+        np.testing.assert_allclose(getattr(found, name), getattr(base, name), rtol=1e-6)
+    np.testing.assert_allclose(found.p_los, base.p_los, atol=1e-4)
+    weights = networks["link_network"].get_weights()
+    networks["link_network"].set_weights([*weights[:-1], np.full_like(weights[-1], 1e3)])
+    far = LinkPrediction.of_parts(*evaluate_context_networks(networks, phi, settings))
+    np.testing.assert_allclose(far.gain_nlos_mean_db, base.gain_nlos_mean_db + 2.0 * base.gain_nlos_std_db, rtol=1e-6)
 
 
 @QUIET

@@ -38,12 +38,11 @@ from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, link_features
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of, link_features
 from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
-    context_of,
     distribution,
     read_links,
     read_maps,

@@ -487,6 +487,12 @@ class LinkFeatures(Shown):
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in ("context", "frequency_hz"))
 
 
+def context_of(phi: LinkFeatures) -> LinkContext:
+    """Return the context that features must have here."""
+    assert phi.context is not None
+    return phi.context
+
+
 def one_or_each(frequency_hz: Floats) -> float | Floats:
     """Return the frequency that all links (N,) have, or those of each link."""
     same = len(frequency_hz) > 0 and bool((frequency_hz == frequency_hz[0]).all())

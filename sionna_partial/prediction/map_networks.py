@@ -13,6 +13,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import LinkContext, LinkFeatures, excess_noise
+from sionna_partial.prediction.features import LinkContext, LinkFeatures, context_of, excess_noise
 from sionna_partial.prediction.inputs import (
     LINK_INPUTS,
     WALL_INPUTS,
@@ -32,6 +33,7 @@ from sionna_partial.prediction.inputs import (
     wall_inputs,
 )
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
+from sionna_partial.prediction.through_walls import MeanLosses
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
 from sionna_partial.settings import PredictorSettings
 
@@ -71,8 +73,14 @@ _LOS_MOST_DB = 10.0
 """Largest mean gain given LOS, over free space [dB]: other paths add power to the direct one, and never so much."""
 
 _LOS_OFFSET = -1.5
-_OPAQUE = (-25.0, 20.0)
-_LEAST_ANCHOR_DB, _WALL_SCALE_DB, _WALL_SCALE, _MOST_SCALED_DB = -80.0, 3.0, 0.5, 30.0
+_NLOS_DB, _NLOS_SCALE_DB = -25.0, 20.0
+_LEAST_P = 1e-5
+"""Least probability of a link state in `MeanLosses`, from which networks may raise it."""
+
+_MOST_STDS, _LOG_WIDER = 2.0, 1.5
+"""By how many standard deviations of `MeanLosses` means are corrected, and by how much these become larger or smaller,
+as a logarithm, at most: walls that are like none of the training must not be far off."""
+
 _STATISTICS_MOMENTUM = 0.9
 _FADE_CELLS = 8.0
 """Width of the rim of a window in which its numbers fade to 0 [cells]."""
@@ -100,12 +108,6 @@ CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = ({}, *_shapes_of(LINK_INPUTS)
 the last two where paths go through walls."""
 
 
-def context_of(phi: LinkFeatures) -> LinkContext:
-    """Return the context that features must have here."""
-    assert phi.context is not None
-    return phi.context
-
-
 def scaled_inputs(phi: LinkFeatures, settings: PredictorSettings) -> NDArray[np.float32]:
     """Return the inputs of the link network of some settings for the features of N links, which have a context."""
     if settings.through_walls:
@@ -115,16 +117,13 @@ def scaled_inputs(phi: LinkFeatures, settings: PredictorSettings) -> NDArray[np.
     return inputs.astype(np.float32)
 
 
-def nlos_anchors(phi: LinkFeatures, settings: PredictorSettings) -> tuple[Any, Any]:
-    """Return the gain over free space from which the one without line of sight is counted, and its scale [dB].
-
-    Through walls they are the traced gain and what grows with the loss of a wall, of each link (N,).
-    """
-    if not settings.through_walls:
-        return _OPAQUE
-    traced_db = phi.gain_db - free_space_gain_db(phi.distance_m, phi.carrier_hz)
-    scale_db = _WALL_SCALE_DB + _WALL_SCALE * np.minimum(context_of(phi).wall_loss_db, _MOST_SCALED_DB)
-    return np.maximum(traced_db, _LEAST_ANCHOR_DB), scale_db
+def base_of(phi: LinkFeatures, settings: PredictorSettings) -> Floats | MeanLosses:
+    """Return what the outputs of the link network correct: the gain of free space (N,), or `MeanLosses` of walls."""
+    if settings.through_walls:
+        return MeanLosses.of(phi)
+    frequency_hz = settings.frequency_hz if phi.frequency_hz is None else phi.frequency_hz
+    free_db: Floats = free_space_gain_db(phi.distance_m, frequency_hz)
+    return free_db
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
@@ -242,35 +241,40 @@ def _interpolated(maps: Any, offsets: Any) -> Any:
     return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))
 
 
-def decode(outputs: Any, free_db: Any, anchors: tuple[Any, Any] = _OPAQUE) -> tuple[Any, Any, Any]:
+def decode(outputs: Any, base: Any) -> tuple[Any, Any, Any]:
     """Return log-probabilities (..., 3) of the link states, and means [dB] and log-variances (..., 2) given LOS, NLOS.
 
-    `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB],
-    `anchors` are from `nlos_anchors`. The mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
+    `outputs` (..., LINK_OUTPUTS) are those of the link network, `base` is from `base_of`. On opaque walls the mean
+    given LOS is that of free space or up to `_LOS_MOST_DB` more. Through walls the outputs correct `MeanLosses`, in its
+    standard deviations; outputs of 0 leave it as it is.
     """
+    if isinstance(base, MeanLosses):
+        shift, wider = (
+            most * tf.tanh(each / most)
+            for each, most in ((outputs[..., 3:5], _MOST_STDS), (outputs[..., 5:], _LOG_WIDER))
+        )
+        log_p = tf.nn.log_softmax(tf.math.log(tf.maximum(base.p, _LEAST_P)) + outputs[..., :3])
+        return log_p, base.means_db + base.stds_db * shift, 2.0 * (tf.math.log(base.stds_db) + wider)
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
-    nlos_db = anchors[0] + anchors[1] * outputs[..., 4]
-    means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
+    nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]
+    means_db = base[..., None] + tf.stack([los_db, nlos_db], axis=-1)
     low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
     return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
 
 
-def distribution(
-    outputs: Any, free_db: Any, context: LinkContext, anchors: tuple[Any, Any] = _OPAQUE
-) -> tuple[Any, Any, Any]:
+def distribution(outputs: Any, base: Any, context: LinkContext) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
-    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,), `anchors` are from `nlos_anchors`. States that are not possible
-    have probability 0. On maps with range noise, which the networks of opaque walls do not notice, standard deviations
-    are larger.
+    `outputs` are (N, LINK_OUTPUTS), `base` is from `base_of`. States that are not possible have probability 0. On maps
+    with range noise, which the networks of opaque walls do not notice, standard deviations are larger.
     """
-    widening = 1.0 + (anchors is _OPAQUE) * excess_noise(context.wall_noise) * np.where(
+    widening = 1.0 + (not isinstance(base, MeanLosses)) * excess_noise(context.wall_noise) * np.where(
         context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
     )
     states = tf.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
     outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
-    log_probabilities, gains_db, log_variances = decode(outputs, free_db, anchors)
-    outage = tf.fill([1, len(free_db)], tf.constant(GAIN_FLOOR_DB, tf.float64))
+    log_probabilities, gains_db, log_variances = decode(outputs, base)
+    outage = tf.fill([1, len(context)], tf.constant(GAIN_FLOOR_DB, tf.float64))
     means_db = tf.concat([outage, tf.transpose(tf.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
     stds_db = tf.concat([tf.zeros_like(outage), tf.transpose(tf.exp(0.5 * log_variances))], axis=0) * widening
     return tf.transpose(tf.exp(log_probabilities)), means_db, stds_db
@@ -289,9 +293,7 @@ def evaluate_context_networks(
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
-    frequency_hz = settings.frequency_hz if phi.frequency_hz is None else phi.frequency_hz
-    free_db = free_space_gain_db(phi.distance_m, frequency_hz)
-    probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi), nlos_anchors(phi, settings))
+    probabilities, means_db, stds_db = distribution(outputs, base_of(phi, settings), context_of(phi))
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
@@ -350,17 +352,15 @@ class _Examples:
         self._used, links = _links_by_window(context_of(phi))
         self._windows = context_of(phi).windows if settings.networks == "map" else None
         self._first = np.cumsum([0, *map(len, links)])
-        frequency_hz = phi.carrier_hz if settings.through_walls else settings.frequency_hz
+        base = base_of(replace(phi, frequency_hz=None), settings)
+        of_base = base._asdict() if isinstance(base, MeanLosses) else {"free_db": base}
         columns = {
             "links": scaled_inputs(phi, settings),
             "offsets_m": receiver_offsets_m(phi),
-            "free_db": free_space_gain_db(phi.distance_m, frequency_hz).astype(np.float32),
             "link_state": link_state.astype(np.int32),
             "gain_db": gain_db.astype(np.float32),
+            **{name: column.astype(np.float32) for name, column in of_base.items()},
         }
-        if settings.through_walls:
-            offset_db, scale_db = nlos_anchors(phi, settings)
-            columns |= {"offset_db": offset_db.astype(np.float32), "scale_db": scale_db.astype(np.float32)}
         order = np.concatenate(links)
         self._columns = {name: column[order] for name, column in columns.items()}
 
@@ -413,18 +413,20 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     def step(
         links: Any,
         offsets_m: Any,
-        free_db: Any,
         link_state: Any,
         gain_db: Any,
         windows: Any = None,
-        offset_db: Any = _OPAQUE[0],
-        scale_db: Any = _OPAQUE[1],
+        free_db: Any = None,
+        **of_base: Any,
     ) -> Any:
+        base = free_db if free_db is not None else MeanLosses(**of_base)
         with tf.GradientTape() as tape:
             outputs = read_links(networks, read_maps(networks, windows, training=True), links, offsets_m)
-            log_p, means_db, log_variances = decode(outputs, free_db, (offset_db, scale_db))
+            log_p, means_db, log_variances = decode(outputs, base)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             scores_db = _crps(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
+            if isinstance(base, MeanLosses):
+                scores_db *= base.weight[..., None]
             states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
             linked = tf.cast(link_state[..., None] == states, tf.float32)
             loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db * linked, axis=-1))

@@ -21,6 +21,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.prediction.features import (
     LinkFeatures,
+    context_of,
     excess_noise,
     link_numbers,
     link_states,
@@ -31,7 +32,6 @@ from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MapReader,
-    context_of,
     evaluate_context_networks,
     fit_context_networks,
     reads_maps,
@@ -47,6 +47,7 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.prediction.through_walls import MeanLosses
 from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
@@ -183,6 +184,16 @@ class LinkPrediction(Shown):
         """
         probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
+
+    @classmethod
+    def of_mean_losses(cls, phi: LinkFeatures) -> LinkPrediction:
+        """Return what the mean loss of walls predicts of links through walls, which have a context: `MeanLosses`."""
+        base = MeanLosses.of(phi)
+        means_db, stds_db = (
+            np.concatenate([np.full((1, len(phi)), outage_db), each.T])
+            for outage_db, each in ((GAIN_FLOOR_DB, base.means_db), (0.0, base.stds_db))
+        )
+        return cls.of_parts(base.p.T, means_db, stds_db)
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:

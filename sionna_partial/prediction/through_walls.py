@@ -1,18 +1,17 @@
-"""Prediction from a trace through walls: what walls that were not seen take from its gains.
+"""What the mean loss of walls predicts of links whose paths go through walls: the base that networks correct.
 
-The shipped networks were trained on opaque walls at 28 GHz, and know nothing of gains behind walls. Here the gain falls
-by the mean loss of the known walls times the number of walls that unobserved space has on a direct line, on average.
-The constants were fitted to procedural homes at 5 GHz, of drywall and of brick, and to procedural floors and halls;
-`benchmarks/unseen_walls.py` measures others.
+The gain falls by the mean loss of the known walls times the number of walls that unobserved space has on a direct line,
+on average. The constants were fitted to procedural homes at 5 GHz, of drywall and of brick, and to procedural floors
+and halls; `benchmarks/unseen_walls.py` measures others. They predict by default: networks that corrected them were no
+better on real homes and floors.
 """
 
+from typing import Any, NamedTuple
+
 import numpy as np
-from numpy.typing import NDArray
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.map_networks import context_of
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.features import LinkFeatures, context_of
 
 WALL_LOSSES = "the mean loss of unobserved walls"
 """Stands for the predictor's name in coverage maps."""
@@ -36,25 +35,48 @@ LOS_GAIN_DB, SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 1.0, 0.5, 0.4, 0.5
 """By how much unseen reflections add to a link with LOS, for the square root of a metre; standard deviations of gains
 whose direct line is observed, and of links with LOS likewise [dB]; and of all other links, in losses of a wall [1]."""
 
+_WEIGHT_DB, _LEAST_UNIT_DB, _UNIT_WALLS, _MOST_LOSS_DB = 20.0, 3.0, 0.5, 30.0
 
-def predict_through_walls(phi: LinkFeatures) -> LinkPrediction:
-    """Predict links (N,) from features of a trace through walls, which have a context.
 
-    A link that is traced in line of sight has LOS the rarer, the longer its direct line is unobserved.
+class MeanLosses(NamedTuple):
+    """Distributions of N links by the mean loss of walls, or tensors of any shape (...) in place of N.
+
+    Parameters
+    ----------
+    p : (N, 3) array
+        Probability of each LinkState.
+    means_db, stds_db : (N, 2) arrays
+        Means and standard deviations of the gain given LOS, and given NLOS [dB].
+    weight : (N,) array
+        Weight of an error in training, relative to one of opaque walls: it falls with the loss of a wall.
     """
-    wall_loss_db = context_of(phi).wall_loss_db
-    unseen_m, los = phi.unobserved_distance_m, phi.link_state == LinkState.LOS
-    p_los = np.where(los, 1.0 / (1.0 + (unseen_m / LOS_RANGE_M) ** LOS_FALL), 0.0)
-    walled_m = WALLS_RANGE_M * np.log1p(unseen_m / WALLS_RANGE_M)
-    root_m = np.sqrt(walled_m)
-    hidden = HIDDEN_WALLS_PER_M * np.maximum(walled_m - HIDDEN_FROM_M, 0.0)
-    walls = np.where(los, FIRST_WALLS + WALLS_PER_M * walled_m, hidden)
-    mean_db = np.maximum(phi.gain_db - wall_loss_db * walls, GAIN_FLOOR_DB)
-    p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
-    los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root_m, 0.0)
-    means_db = np.stack([np.full(len(root_m), GAIN_FLOOR_DB), los_db, mean_db])
-    los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root_m)
-    std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * wall_loss_db * root_m)
-    stds_db = np.stack([np.zeros(len(root_m)), los_std_db, std_db])
-    probabilities: NDArray[np.float64] = np.stack([p_outage, p_los, 1.0 - p_los - p_outage])
-    return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+    p: Any
+    means_db: Any
+    stds_db: Any
+    weight: Any
+
+    @classmethod
+    def of(cls, phi: LinkFeatures) -> "MeanLosses":
+        """Predict links (N,) from features of a trace through walls, which have a context.
+
+        A link that is traced in line of sight has LOS the rarer, the longer its direct line is unobserved.
+        """
+        wall_loss_db = context_of(phi).wall_loss_db
+        unseen_m, los = phi.unobserved_distance_m, phi.link_state == LinkState.LOS
+        p_los = np.where(los, 1.0 / (1.0 + (unseen_m / LOS_RANGE_M) ** LOS_FALL), 0.0)
+        walled_m = WALLS_RANGE_M * np.log1p(unseen_m / WALLS_RANGE_M)
+        root_m = np.sqrt(walled_m)
+        hidden = HIDDEN_WALLS_PER_M * np.maximum(walled_m - HIDDEN_FROM_M, 0.0)
+        walls = np.where(los, FIRST_WALLS + WALLS_PER_M * walled_m, hidden)
+        mean_db = np.maximum(phi.gain_db - wall_loss_db * walls, GAIN_FLOOR_DB)
+        p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
+        los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root_m, 0.0)
+        los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root_m)
+        std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * wall_loss_db * root_m)
+        return cls(
+            p=np.stack([p_outage, p_los, 1.0 - p_los - p_outage], axis=1),
+            means_db=np.stack([los_db, mean_db], axis=1),
+            stds_db=np.stack([los_std_db, std_db], axis=1),
+            weight=_WEIGHT_DB / (_LEAST_UNIT_DB + _UNIT_WALLS * np.minimum(wall_loss_db, _MOST_LOSS_DB)),
+        )
