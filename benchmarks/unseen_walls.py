@@ -8,7 +8,7 @@ known, less a loss for each unobserved metre, less a constant. The three are fit
 the row, or to the very links of the row, which no one can do beforehand. Procedural homes, or complete maps of a folder
 with one folder each:
 
-    python benchmarks/unseen_walls.py --homes 8
+    python benchmarks/unseen_walls.py --homes 8 [--kind floor]
     python benchmarks/unseen_walls.py --maps ../shared/gibson --homes 20
 """
 
@@ -25,6 +25,7 @@ from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.maps.partial_map import cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.settings import HOME_KINDS, HomeKind
 
 BANDS_GHZ = {2.4: "brick", 5.0: "drywall", 28.0: "drywall", 60.0: "glass"}
 STEPS = (0, 50, 100, 200)
@@ -55,11 +56,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--maps", type=Path, metavar="FOLDER")
     parser.add_argument("--homes", type=int, default=8)
+    parser.add_argument("--kind", choices=HOME_KINDS, help="of procedural homes")
     parser.add_argument("--first-seed", type=int, default=91_000)
     parser.add_argument("--predictor", metavar="NAME|FILE")
     arguments = parser.parse_args()
     rows = defaultdict(list)
-    for seed, home in homes(arguments.maps, arguments.homes, arguments.first_seed):
+    for seed, home in homes(arguments.maps, arguments.homes, arguments.first_seed, arguments.kind):
         for band_ghz, step, links in links_of(home, seed, arguments.predictor):
             rows[band_ghz, step].append(links)
     print_table(rows)
@@ -98,11 +100,13 @@ def _fitted(found: list[tuple[np.ndarray, np.ndarray]], true_db: list[np.ndarray
     return np.linalg.lstsq(losses, np.concatenate(true_db) - free_db, rcond=None)[0]
 
 
-def homes(folder: Path | None, count: int, first_seed: int) -> Iterator[tuple[int, sp.PartialMap]]:
+def homes(
+    folder: Path | None, count: int, first_seed: int, kind: HomeKind | None = None
+) -> Iterator[tuple[int, sp.PartialMap]]:
     """Yield seeds of links and complete homes."""
     for index in range(count):
         if folder is None:
-            yield first_seed + index, sp.make_home(first_seed + index)
+            yield first_seed + index, sp.make_home(first_seed + index, kind)
         else:
             yield index, sp.load_map(sorted(folder.glob("*/map.yaml"))[index])
 
