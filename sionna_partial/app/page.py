@@ -456,7 +456,8 @@ class Page:
         self.pattern.value, self.pattern.disabled = chosen.antenna.pattern if chosen else "iso", chosen is None
         for field in self.aims.values():  # an isotropic antenna points nowhere
             field.disabled |= self.pattern.value == "iso"
-        self._aims.data = self._aimed()
+        aims = self._aimed()
+        self._once("aims", (repr(aims),), functools.partial(setattr, self._aims, "data", aims))
         self.name.disabled = chosen is None
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
         if self.which.options != options:  # of several, first what a receiver gets
