@@ -64,6 +64,7 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
 	@$(BIN)/python -m sionna_partial.path_training sionna_partial/predictors/paths.npz
+	@$(BIN)/python -m sionna_partial.wall_training sionna_partial/predictors/unseen_walls.npz
 	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 

@@ -51,6 +51,7 @@ from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor, warm_predictor
 from sionna_partial.prediction.through_walls import WALL_LOSSES
 from sionna_partial.prediction.unobserved import is_enclosed
+from sionna_partial.prediction.unseen_walls import UnseenWalls, WallDensity
 from sionna_partial.prediction.windows import map_windows
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -166,15 +167,13 @@ class LinkModel:
     def predictor(self) -> Predictor | OtherPredictor:
         """The predictor, which is read when it is first needed."""
         model = warm_predictor(self.asked)
-        if self._by_wall_losses:
-            _log.warning("paths go through walls, which no shipped network was trained for: %s predicts", WALL_LOSSES)
-        elif isinstance(model, Predictor):
+        if isinstance(model, Predictor) and not self._by_wall_losses:
             _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
 
     @property
     def _by_wall_losses(self) -> bool:
-        """Whether the mean loss of walls predicts: networks trained on opaque walls have no gains behind them."""
+        """Whether `MeanLosses` predict: networks trained on opaque walls have no gains behind them."""
         return self.asked is None and self.simulation.trace_settings.through_walls
 
     @property
@@ -189,7 +188,8 @@ class LinkModel:
         """
         if partial != self.partial:
             self.simulation = Simulation(partial, *self._settings)
-            self.__dict__.pop("_every_path", None)
+            for of_map in ("_every_path", "_wall_density"):
+                self.__dict__.pop(of_map, None)
             self._latest.clear()
             self._windows.clear()
 
@@ -198,6 +198,11 @@ class LinkModel:
         """The simulation without a tolerance: paths that are weak without an antenna may be strong with it."""
         settings = replace(self.simulation.trace_settings, power_tolerance_db=0.0)
         return Simulation(self.partial, settings, self.simulation.scene_settings)
+
+    @cached_property
+    def _wall_density(self) -> WallDensity:
+        """The walls that the map does not show, as far as they can be expected."""
+        return UnseenWalls.shipped().of_map(self.partial)
 
     def predict(self, tx: ArrayLike, rx: ArrayLike) -> LinkPrediction:
         """Trace and predict links.
@@ -266,7 +271,7 @@ class LinkModel:
         if complete.all():
             return trace
         if self._by_wall_losses:
-            return LinkPrediction.of_mean_losses(phi).where(complete, trace)
+            return LinkPrediction.of_mean_losses(phi, self._wall_density.counts(phi)).where(complete, trace)
         return self.predictor.predict(phi).where(complete, trace)
 
     def links(

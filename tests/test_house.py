@@ -52,7 +52,7 @@ ROOMS = {
     ),
     "prediction": (
         *("unobserved", "windows", "features", "inputs", "through_walls"),
-        *("paper_networks", "map_networks", "predictor_files", "predictor", "path_model"),
+        *("paper_networks", "unseen_walls", "map_networks", "predictor_files", "predictor", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("link_budget", "coverage_map", "link_model", "coverage"),
@@ -77,7 +77,7 @@ ROOMS = {
         "dataset_links",
     ),
     "evaluation": ("metrics", "baselines", "evaluate"),
-    "training": ("training", "path_training"),
+    "training": ("training", "path_training", "wall_training"),
     "plots": (
         *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
         *("material_plot", "placement_plot", "evaluation_plot"),

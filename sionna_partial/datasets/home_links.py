@@ -133,7 +133,7 @@ def _draw_positions(
     open_cells = np.logical_and.reduce([each.state != CellState.WALL for each in (home, *maps)])
     free = open_cells & (home.state == CellState.FREE)
     links, count = settings.links_per_home, settings.transmitters_per_home
-    tx_m = list(_points_in(free, count, home, settings.tx_height_m, rng))
+    tx_m = list(points_in(free, count, home, settings.tx_height_m, rng))
     receivers, anywhere = [], []
     for index, tx in enumerate(tx_m):
         number = links * (index + 1) // count - links * index // count
@@ -157,16 +157,16 @@ def _receivers(
     x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
     near_cells = np.hypot(x[None] - tx_m[0], y[:, None] - tx_m[1]) <= SHORT_LINK_M
     drawn = [(cells, count - short), (cells & near_cells, short)]
-    rx_m = np.concatenate([_points_in(where, number, home, height_m, rng) for where, number in drawn])
+    rx_m = np.concatenate([points_in(where, number, home, height_m, rng) for where, number in drawn])
     for _ in range(MAX_DRAWS):
         near = np.linalg.norm(rx_m - tx_m, axis=1) < NEAREST_M
         if not near.any():
             return rx_m
-        rx_m[near] = _points_in(cells, int(near.sum()), home, height_m, rng)
+        rx_m[near] = points_in(cells, int(near.sum()), home, height_m, rng)
     raise MapError(f"home {name!r} is too small, all of it is within {NEAREST_M:g} m of a transmitter: leave it out.")
 
 
-def _points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: np.random.Generator) -> Floats:
+def points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: np.random.Generator) -> Floats:
     """Draw points (count, 3) uniformly from cells, off their borders [m]."""
     rows, columns = np.nonzero(cells)
     index = rng.integers(len(rows), size=count)

@@ -186,9 +186,12 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
     @classmethod
-    def of_mean_losses(cls, phi: LinkFeatures) -> LinkPrediction:
-        """Return what the mean loss of walls predicts of links through walls, which have a context: `MeanLosses`."""
-        base = MeanLosses.of(phi)
+    def of_mean_losses(cls, phi: LinkFeatures, walls: Floats) -> LinkPrediction:
+        """Return what the mean loss of walls predicts of links through walls, which have a context: `MeanLosses`.
+
+        `walls` (N,) are the expected numbers of unseen walls on their direct lines.
+        """
+        base = MeanLosses.of(phi, walls)
         means_db, stds_db = (
             np.concatenate([np.full((1, len(phi)), outage_db), each.T])
             for outage_db, each in ((GAIN_FLOOR_DB, base.means_db), (0.0, base.stds_db))

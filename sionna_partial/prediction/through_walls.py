@@ -1,39 +1,34 @@
-"""What the mean loss of walls predicts of links whose paths go through walls: the base that networks correct.
+"""What unseen walls change on links whose paths go through walls: known losses times their expected number.
 
-The gain falls by the mean loss of the known walls times the number of walls that unobserved space has on a direct line,
-on average. The constants were fitted to procedural homes at 5 GHz, of drywall and of brick, and to procedural floors
-and halls; `benchmarks/unseen_walls.py` measures others. They predict by default: networks that corrected them were no
-better on real homes and floors.
+A wall that is not known is taken to lose what the known ones do on average. `unseen_walls` gives the expected number of
+walls on a direct line. The constants were fitted to procedural homes of one material and to procedural floors and
+halls, whose walls lose 2 to 20 dB; `benchmarks/unseen_walls.py` measures others.
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.prediction.features import LinkFeatures, context_of
 
 WALL_LOSSES = "the mean loss of unobserved walls"
 """Stands for the predictor's name in coverage maps."""
 
-LOS_RANGE_M, LOS_FALL = 2.2, 2.2
-"""Unobserved length at which a link that is traced in line of sight has LOS in half of all cases [m], and the exponent
-with which that falls beyond."""
+LOSS_OF_WALL, LARGEST_LOSS_DB = 0.78, 72.0
+"""Loss of an unseen wall in losses of a known one, on lines that are traced in LOS and have none, as other paths add
+power; and what many walls come near to [dB]: paths around them are the strongest there."""
 
-WALLS_RANGE_M = 10.0
-"""Unobserved length from which on walls add little [m]: other paths than the direct one are the strongest there."""
+FOUND_WALLS = 0.43
+"""How many walls unseen reflections make up for, of links that are traced without LOS."""
 
-FIRST_WALLS, WALLS_PER_M = 0.6, 0.19
-"""Walls that a link loses which turns out to have no LOS, and those on each of the first unobserved metres of its
-direct line."""
+LOS_GAIN_DB = 2.0
+"""By how much unseen reflections add to a link with LOS, for the square root of an expected wall."""
 
-HIDDEN_WALLS_PER_M, HIDDEN_FROM_M = 0.18, 1.5
-"""Walls on each unobserved metre, beyond the first, of links that are traced without LOS: unseen reflections make up
-for part of them."""
-
-LOS_GAIN_DB, SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 1.0, 0.5, 0.4, 0.5
-"""By how much unseen reflections add to a link with LOS, for the square root of a metre; standard deviations of gains
-whose direct line is observed, and of links with LOS likewise [dB]; and of all other links, in losses of a wall [1]."""
+SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD, LARGEST_STD_DB = 0.5, 0.8, 0.72, 25.0
+"""Standard deviations of gains whose direct line is observed, and of links with LOS likewise [dB]; those of all other
+links, likewise in losses of a wall [1], and the largest of them [dB]."""
 
 _WEIGHT_DB, _LEAST_UNIT_DB, _UNIT_WALLS, _MOST_LOSS_DB = 20.0, 3.0, 0.5, 30.0
 
@@ -57,23 +52,23 @@ class MeanLosses(NamedTuple):
     weight: Any
 
     @classmethod
-    def of(cls, phi: LinkFeatures) -> "MeanLosses":
-        """Predict links (N,) from features of a trace through walls, which have a context.
+    def of(cls, phi: LinkFeatures, walls: Floats) -> "MeanLosses":
+        """Predict links (N,) from features of a trace through walls, which have a context, and unseen walls (N,).
 
-        A link that is traced in line of sight has LOS the rarer, the longer its direct line is unobserved.
+        The number of unseen walls on the direct line has a Poisson distribution, whose mean is `walls`. A link that is
+        traced in line of sight has LOS if there are none.
         """
-        wall_loss_db = context_of(phi).wall_loss_db
-        unseen_m, los = phi.unobserved_distance_m, phi.link_state == LinkState.LOS
-        p_los = np.where(los, 1.0 / (1.0 + (unseen_m / LOS_RANGE_M) ** LOS_FALL), 0.0)
-        walled_m = WALLS_RANGE_M * np.log1p(unseen_m / WALLS_RANGE_M)
-        root_m = np.sqrt(walled_m)
-        hidden = HIDDEN_WALLS_PER_M * np.maximum(walled_m - HIDDEN_FROM_M, 0.0)
-        walls = np.where(los, FIRST_WALLS + WALLS_PER_M * walled_m, hidden)
-        mean_db = np.maximum(phi.gain_db - wall_loss_db * walls, GAIN_FLOOR_DB)
+        wall_loss_db, los = context_of(phi).wall_loss_db, phi.link_state == LinkState.LOS
+        p_los = np.where(los, np.exp(-walls), 0.0)
+        some = walls / np.maximum(-np.expm1(-walls), np.finfo(float).tiny)
+        count = np.where(los, np.where(walls > 0.0, some, 1.0), np.maximum(walls - FOUND_WALLS, 0.0))
+        loss_db = LOSS_OF_WALL * wall_loss_db * count
+        mean_db = np.maximum(phi.gain_db - loss_db / (1.0 + loss_db / LARGEST_LOSS_DB), GAIN_FLOOR_DB)
         p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
-        los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root_m, 0.0)
-        los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root_m)
-        std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * wall_loss_db * root_m)
+        root = np.sqrt(walls)
+        los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root, 0.0)
+        los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root)
+        std_db = np.hypot(SEEN_STD_DB, np.minimum(UNSEEN_STD * wall_loss_db * root, LARGEST_STD_DB))
         return cls(
             p=np.stack([p_outage, p_los, 1.0 - p_los - p_outage], axis=1),
             means_db=np.stack([los_db, mean_db], axis=1),

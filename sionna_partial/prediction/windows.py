@@ -91,7 +91,7 @@ def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx
         beside[beside == CellState.WALL] = CellState.FREE
     steps = cell_m / partial.resolution_m * (np.arange(WINDOW_CELLS + 1) - WINDOW_CELLS / 2)
     edges = start[:, None] + steps
-    columns, rows = (_overlaps(edge, len(state)) for edge in edges)
+    columns, rows = (overlaps(edge, len(state)) for edge in edges)
     free, wall = (rows @ (state == kind) @ columns.T for kind in (CellState.FREE, CellState.WALL))
     centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
     lines = line_fractions(state, np.tile(start, (len(centres), 1)), centres).reshape(*free.shape, -1)
@@ -115,7 +115,7 @@ def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[Sta
     return state, start - np.array([spans[1][0], spans[0][0]])
 
 
-def _overlaps(edges: Floats, count: int) -> Floats:
+def overlaps(edges: Floats, count: int) -> Floats:
     """Fraction of each interval between `edges` (K + 1,) that each of `count` unit cells covers: (K, count)."""
     cells = np.arange(count)
     low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)

@@ -1,0 +1,192 @@
+"""How many walls a straight line meets where the map is unknown: two small networks, which know no frequency.
+
+A U-Net (Ronneberger, Fischer and Brox 2015) reads the map and estimates the walls of each unknown cell: how many a line
+along x, and one along y, meets on a metre. The integral over the unknown part of a line is what a second network
+corrects by the lengths of the line and its known walls. They were trained on lines in procedural buildings, in which
+walls are counted without tracing anything further (`wall_training`). The number of walls has about a Poisson
+distribution.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats
+from sionna_partial.constants import CellState
+from sionna_partial.files import atomic_write
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.features import LinkFeatures, context_of
+from sionna_partial.prediction.paper_networks import import_keras, layer, tf
+from sionna_partial.prediction.windows import overlaps
+from sionna_partial.resources import PREDICTORS_FOLDER
+
+if TYPE_CHECKING:
+    import keras
+
+CELL_M = 0.3
+"""Edge of the cells that the network reads [m]."""
+
+WEIGHTS_FILE = PREDICTORS_FOLDER / "unseen_walls.npz"
+"""The shipped weights."""
+
+_WIDTHS, _UNITS = (16, 32, 48, 64), 24
+_LINE_INPUTS = 6
+_POINTS, _LENGTH_M = 96, 3.0
+"""Number of points of a line at which the walls per metre are read, and the unit of lengths [m]."""
+
+_FIRST, _LEAST = -1.5, -4.0
+"""What walls per metre begin with in training, and the least number of walls, as logits of a softplus."""
+
+_BORDER_CELLS, _POOLED = 8, 8
+_LINES_AT_ONCE = 16_384
+_STATISTICS_MOMENTUM = 0.9
+
+
+class WallDensity(NamedTuple):
+    """Estimated walls of the unknown cells of a map.
+
+    Parameters
+    ----------
+    per_m : (1, ny, nx, 2) float32 tensor
+        Walls on a metre along x, and along y; 0 in what is known.
+    origin_m : (2,) array
+        The corner of the first cell [m].
+    lines : keras.Model
+        The network that corrects integrals.
+    """
+
+    per_m: Any
+    origin_m: Floats
+    lines: Any
+
+    def counts(self, phi: LinkFeatures) -> Floats:
+        """Return the expected number of unseen walls on the direct line (N,) of links, which have a context."""
+        context = context_of(phi)
+        ends = ((end_m[:, :2] - self.origin_m) / CELL_M for end_m in (context.tx_m, context.rx_m))
+        columns = [*ends, phi.unobserved_distance_m, phi.distance_m, context.straight_walls]
+        start, end, *lengths = (np.asarray(column, dtype=np.float32) for column in columns)
+        found = np.zeros(len(phi))
+        for first in range(0, len(phi), _LINES_AT_ONCE):
+            here = slice(first, first + _LINES_AT_ONCE)
+            integral = walls_met(self.per_m, start[None, here], end[None, here])[0]
+            found[here] = corrected(self.lines, integral, *(each[here] for each in lengths))
+        return np.where(phi.unobserved_distance_m > 0.0, found, 0.0)
+
+
+class UnseenWalls(NamedTuple):
+    """The two networks: walls of cells, and corrections of lines."""
+
+    cells: "keras.Model"
+    lines: "keras.Model"
+
+    @classmethod
+    def untrained(cls, seed: int = 0) -> Self:
+        """Build the networks with random weights."""
+        keras, seeds = import_keras(), itertools.count(1000 * seed + 1)
+
+        def start() -> Any:
+            return keras.initializers.GlorotUniform(seed=next(seeds))
+
+        return cls(_cell_network(keras, start), _line_network(keras, start))
+
+    @classmethod
+    @functools.cache
+    def shipped(cls) -> Self:
+        """Return those of the package."""
+        networks = cls.untrained()
+        with np.load(WEIGHTS_FILE) as stored:
+            for name, network in networks._asdict().items():
+                network.set_weights([stored[f"{name}_{number}"] for number in range(len(network.weights))])
+        return networks
+
+    def save(self, path: Path) -> None:
+        """Write the weights to an .npz file."""
+        arrays = {
+            f"{name}_{number}": values
+            for name, network in self._asdict().items()
+            for number, values in enumerate(network.get_weights())
+        }
+        with atomic_write(path) as stream:
+            np.savez_compressed(stream, **arrays)
+
+    def of_map(self, partial: PartialMap) -> WallDensity:
+        """Read a map."""
+        image = map_image(partial)
+        sides = [(_BORDER_CELLS, _BORDER_CELLS + -(count + 2 * _BORDER_CELLS) % _POOLED) for count in image.shape[:2]]
+        image = np.pad(image, [*sides, (0, 0)])[None].astype(np.float32)
+        per_m = walls_per_m(self.cells, image)
+        return WallDensity(per_m, np.asarray(partial.origin_m) - _BORDER_CELLS * CELL_M, self.lines)
+
+
+def _cell_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
+    def convolved(x: Any, units: int, name: str) -> Any:
+        options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
+        x = layer(keras, "Conv2D", name, units, 3, **options)(x)
+        x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
+        return layer(keras, "ReLU", f"{name}_active")(x)
+
+    image = keras.Input((None, None, 3), name="image", dtype="float32")
+    x, levels = convolved(image, _WIDTHS[0], "down_0"), []
+    for depth, units in enumerate(_WIDTHS[1:], 1):
+        levels.append(x)
+        x = layer(keras, "MaxPooling2D", f"pool_{depth}")(x)
+        x = convolved(convolved(x, units, f"down_{depth}"), units, f"down_{depth}_again")
+    for depth in reversed(range(len(levels))):
+        x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
+        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), _WIDTHS[depth], f"up_{depth}")
+        x = convolved(x, _WIDTHS[depth], f"up_{depth}_again") if depth else x
+    options = {"kernel_initializer": start(), "bias_initializer": keras.initializers.Constant(_FIRST)}
+    return keras.Model(image, layer(keras, "Conv2D", "per_m", 2, 1, activation="softplus", **options)(x), name="cells")
+
+
+def _line_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
+    line = keras.Input((_LINE_INPUTS,), name="line", dtype="float32")
+    x = layer(keras, "Dense", "hidden", _UNITS, activation="silu", kernel_initializer=start())(line)
+    return keras.Model(line, layer(keras, "Dense", "outputs", 2, kernel_initializer="zeros")(x), name="lines")
+
+
+def map_image(partial: PartialMap) -> NDArray[np.uint8]:
+    """Return the fraction of free and wall of each coarse cell (ny, nx, 2) [1/255], from the origin of a map on."""
+    counts = [max(1, math.ceil(count * partial.resolution_m / CELL_M - 1e-9)) for count in partial.shape]
+    rows, columns = (
+        overlaps(np.arange(count + 1.0) * (CELL_M / partial.resolution_m), fine)
+        for count, fine in zip(counts, partial.shape, strict=True)
+    )
+    kinds = CellState.FREE, CellState.WALL
+    fractions = [rows @ (partial.state == kind).astype(np.float64) @ columns.T for kind in kinds]
+    return np.round(255.0 * np.stack(fractions, axis=-1)).astype(np.uint8)
+
+
+def walls_per_m(cells: "keras.Model", images: Any, *, training: bool = False) -> Any:
+    """Return the walls per metre (B, ny, nx, 2) along x and y of images (B, ny, nx, 2) in [0, 255]."""
+    known = images / 255.0
+    unknown = tf.maximum(1.0 - tf.reduce_sum(known, axis=-1, keepdims=True), 0.0)  # fractions are rounded
+    return cells(tf.concat([known, unknown], axis=-1), training=training) * unknown
+
+
+def walls_met(per_m: Any, start: Any, end: Any) -> Any:
+    """Integrate walls per metre (B, ny, nx, 2) over lines (B, R) from `start` to `end` (B, R, 2) [cells]."""
+    at = (tf.range(_POINTS, dtype=tf.float32) + 0.5) / _POINTS
+    points = start[..., None, :] + (end - start)[..., None, :] * at[:, None]
+    ny, nx = tf.shape(per_m)[1], tf.shape(per_m)[2]
+    column, row = (
+        tf.clip_by_value(tf.cast(tf.floor(points[..., axis]), tf.int32), 0, count - 1)
+        for axis, count in enumerate((nx, ny))
+    )
+    values = tf.gather(tf.reshape(per_m, (tf.shape(per_m)[0], -1, 2)), row * nx + column, batch_dims=1)
+    return tf.reduce_sum(tf.reduce_sum(values, axis=2) * tf.abs(end - start) * (CELL_M / _POINTS), axis=-1)
+
+
+def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m: Any, known: Any) -> Any:
+    """Return the expected number of unseen walls of lines (...), from integrals, lengths and known walls."""
+    lengths = (tf.math.log(1.0 + each_m / _LENGTH_M) for each_m in (unobserved_m, distance_m))
+    share, none = unobserved_m / (distance_m + 0.1), tf.cast(known == 0.0, tf.float32)
+    inputs = tf.stack([tf.math.log(integral + 0.02), *lengths, tf.math.log(1.0 + known), share, none], axis=-1)
+    outputs = tf.reshape(lines(tf.reshape(inputs, (-1, _LINE_INPUTS))), tf.concat([tf.shape(integral), [2]], axis=0))
+    return integral * tf.exp(outputs[..., 0]) + tf.math.softplus(outputs[..., 1] + _LEAST)

@@ -1,0 +1,89 @@
+"""Expected walls in unknown space: integrals over lines, what the shipped networks know, and their training."""
+
+import numpy as np
+import pytest
+
+import sionna_partial as sp
+from sionna_partial.constants import CellState
+from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
+from sionna_partial.wall_training import Lines, fit_unseen_walls, lines_of
+
+WALLS_PER_M = 0.37
+WIFI = sp.TraceSettings(5e9, max_depth=1)
+
+
+def half_known(width: int = 80) -> sp.PartialMap:
+    """A room without an end: what is behind its first 4 m is unknown."""
+    state = np.zeros((40, width), dtype=np.uint8)
+    state[[0, -1]], state[:, 0] = CellState.WALL, CellState.WALL
+    state[:, 40:] = CellState.UNKNOWN
+    return sp.PartialMap(state, 0.1, (3.0, -2.0))
+
+
+@pytest.fixture(scope="module")
+def unseen_home() -> list[Lines]:
+    """Lines of a home that the shipped networks were not trained on."""
+    return lines_of(540_000, None, robot=False)
+
+
+def test_lines_count_the_walls_that_they_cross():
+    """Those along x by the extent along x, those along y by that along y."""
+    per_m = np.zeros((1, 10, 20, 2), dtype=np.float32)
+    per_m[..., 0], per_m[..., 1] = 0.5, 2.0
+    start, end = (np.array([[ends]], dtype=np.float32) for ends in ((2.0, 3.0), (12.0, 7.0)))
+    assert float(walls_met(per_m, start, end)[0, 0]) == pytest.approx((10 * 0.5 + 4 * 2.0) * CELL_M, rel=1e-5)
+
+
+def test_images_have_fractions_of_cells():
+    image = map_image(half_known())
+    assert image.shape == (14, 27, 2)
+    np.testing.assert_allclose(image[5, 5] / 255.0, (1.0, 0.0))
+    np.testing.assert_allclose(image[5, 0] / 255.0, (2 / 3, 1 / 3))
+    assert not image[5, 20].any()
+
+
+def test_no_walls_are_expected_in_what_is_known():
+    model = sp.LinkModel(half_known(), trace_settings=WIFI)
+    phi = model.features((4.0, 0.0, 1.5), [(x, 0.0, 1.5) for x in (6.0, 7.5, 9.0, 10.5)])
+    walls = UnseenWalls.shipped().of_map(model.partial).counts(phi)
+    assert walls[0] == 0.0
+    assert (np.diff(walls) > 0.0).all()
+    seen = UnseenWalls.shipped().of_map(sp.PartialMap(np.zeros((40, 40), dtype=np.uint8), 0.1))
+    assert not np.any(seen.per_m[0, 8:21, 8:21])
+
+
+def test_a_grown_map_is_read_again():
+    model = sp.LinkModel(half_known(), trace_settings=WIFI)
+    ends = (4.0, 0.0, 1.5), [(10.5, 0.0, 1.5)]
+    before = model.predict(*ends)
+    grown = half_known().state.copy()
+    grown[1:-1, 40:50] = CellState.FREE
+    model.update(sp.PartialMap(grown, 0.1, (3.0, -2.0)))
+    fresh = sp.LinkModel(model.partial, trace_settings=WIFI).predict(*ends)
+    assert model.predict(*ends).gain_mean_db == fresh.gain_mean_db
+    assert before.p_los < fresh.p_los
+
+
+def test_better_than_as_many_walls_on_every_metre(unseen_home):
+    """As many as in other homes."""
+    networks, errors, others = UnseenWalls.shipped(), [], []
+    for lines in unseen_home:
+        pad = [(0, -count % 8) for count in lines.image.shape[:2]]
+        per_m = walls_per_m(networks.cells, np.pad(lines.image, [*pad, (0, 0)])[None].astype(np.float32))
+        integral = walls_met(per_m, lines.start[None], lines.end[None])[0]
+        expected = corrected(networks.lines, integral, lines.unobserved_m, lines.distance_m, lines.known)
+        errors.append(np.asarray(expected) - lines.unseen)
+        others.append(WALLS_PER_M * lines.unobserved_m - lines.unseen)
+    rmse, other = (np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in (errors, others))
+    assert rmse < 0.85 * other
+
+
+def test_training_repeats_itself(unseen_home, tmp_path):
+    first, second = (fit_unseen_walls(unseen_home, steps=2) for _ in range(2))
+    first.save(tmp_path / "first.npz")
+    start = UnseenWalls.untrained().cells.get_weights()[0]
+    for one, other in zip(first, second, strict=True):
+        assert all(np.array_equal(*pair) for pair in zip(one.get_weights(), other.get_weights(), strict=True))
+    assert not np.array_equal(first.cells.get_weights()[0], start)
+    with np.load(tmp_path / "first.npz") as stored:
+        assert np.array_equal(stored["cells_0"], first.cells.get_weights()[0])
