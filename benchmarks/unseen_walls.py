@@ -97,7 +97,7 @@ def print_table(rows: dict[tuple[float, int], list[Links]]) -> None:
 def _fitted(found: list[tuple[np.ndarray, np.ndarray]], true_db: list[np.ndarray]) -> np.ndarray:
     """Return the constants (3,) of a multi-wall model that fit links best."""
     free_db, losses = (np.concatenate(each) for each in zip(*found, strict=True))
-    return np.linalg.lstsq(losses, np.concatenate(true_db) - free_db, rcond=None)[0]
+    return np.linalg.lstsq(losses, np.concatenate(true_db) - free_db, rcond=1e-3)[0]
 
 
 def homes(
