@@ -399,13 +399,13 @@ def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_setti
     trained = model.settings
     if trained.through_walls != settings.through_walls:
         then, now = (f"{'through' if each.through_walls else 'on opaque'} walls" for each in (trained, settings))
-    elif not trained.through_walls and not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
+    elif not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
         then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
     elif trained.diffraction != settings.diffraction:
         then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
     elif settings.max_depth < _LEAST_DEPTH:
         then, now = (f"with max_depth = {depth}" for depth in (TraceSettings.max_depth, settings.max_depth))
-    elif not trained.through_walls and scene_settings.material.itu == "metal":
+    elif scene_settings.material.itu == "metal":
         then, now = "on walls that transmit", "on walls of metal"
     else:
         return

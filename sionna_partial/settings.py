@@ -369,9 +369,6 @@ class DatasetSettings(Checked):
         How maps become scenes.
     trace : TraceSettings
         What is traced, on the complete and on the partial maps.
-    walls : {"given", "mixed"}
-        "mixed" draws for each home, by `seed` and its name, a carrier frequency from 0.7 to 100 GHz and the materials
-        of its walls, through which paths go, in place of those of `scene` and `trace`.
 
     Raises
     ------
@@ -397,7 +394,6 @@ class DatasetSettings(Checked):
     short_link_fraction: Fraction = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
-    walls: Literal["given", "mixed"] = "given"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -441,8 +437,7 @@ class PredictorSettings(Checked):
     seed : int
         Of first weights and batches.
     through_walls : bool
-        Whether paths go through walls. Frequency and losses of walls are then inputs of the added networks, which
-        correct what the mean loss of walls predicts, and `frequency_hz` is that of the paper's networks alone.
+        Whether the links were traced through walls.
 
     Raises
     ------

@@ -96,8 +96,8 @@ def train(
     test_fraction : float
         Fraction of the homes that is kept for testing, in [0, 1).
     settings : PredictorSettings, optional
-        Networks "map" by default, with a `PredictorWarning` on fewer than 20 homes. Frequency and diffraction must be
-        those of the data set, and are by default; the seed splits the homes, too.
+        Networks "map" by default, with a `PredictorWarning` on fewer than 20 homes. Frequency, diffraction and paths
+        through walls must be those of the data set, and are by default; the seed splits the homes, too.
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
         terminals and notebooks after 2 s.
@@ -125,7 +125,7 @@ def train(
     table, traces = open_links(dataset)
     settings = settings_for(traces) if settings is None else settings
     settings = settings_or_default("settings", settings, PredictorSettings)
-    remedy = "give PredictorSettings with the frequency and diffraction of the data set."
+    remedy = "give PredictorSettings with frequency_hz, diffraction and through_walls of the data set."
     require_like(traces, LinkTraces.of_settings(settings), "settings are for links", remedy)
     train_homes, test_homes = split_homes(list(dict.fromkeys(map(str, table.home))), test_fraction, settings.seed)
     links = table.take(np.isin(table.home, train_homes))

@@ -63,7 +63,6 @@ def walls_of_links(count, loss_db=60.0):
         "straight_gain_db": np.full(count, -150.0),
         "straight_walls": np.zeros(count),
         "wall_loss_db": np.full(count, loss_db),
-        "wall_reflection_db": np.full(count, 6.0),
     }
 
 

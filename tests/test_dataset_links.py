@@ -95,6 +95,7 @@ class TestRequireLike:
         [
             (LinkTraces(60e9, True), "at 60 GHz with diffraction"),
             (LinkTraces(28e9, False), "at 28 GHz without diffraction"),
+            (LinkTraces(28e9, True, True), "at 28 GHz through walls with diffraction"),
         ],
     )
     def test_others(self, found, words):

@@ -76,6 +76,7 @@ def test_context_of_other_links():
         ({"unobserved_distance_m": [-0.5, 0.5, 0.5]}, "unobserved_distance_m[0] = -0.5 is not allowed"),
         ({"gain_db": [-60.0, -151.0, -60.0]}, "gain_db[1] = -151 is not allowed: clip gains at -150 dB"),
         ({"gain_db": ["x", "y", "z"]}, "gain_db = ['x', 'y', 'z'] is not numeric: give an array of 3 numbers."),
+        ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed: give a frequency in Hz, or None for that of the"),
     ],
 )
 def test_bad_features(change, message):
@@ -83,9 +84,13 @@ def test_bad_features(change, message):
         dataclasses.replace(phi_of(3), **change)
 
 
-def test_nothing_to_concatenate():
+def test_what_cannot_be_concatenated():
     with pytest.raises(PredictorError, match="parts is empty: give at least one LinkFeatures"):
         LinkFeatures.concatenate([])
+    parts = [dataclasses.replace(phi_of(), frequency_hz=each) for each in (5e9, None)]
+    message = r"parts have frequency_hz = 5e\+09, None: give links of one frequency together\."
+    with pytest.raises(PredictorError, match=message):
+        LinkFeatures.concatenate(parts)
 
 
 def test_swapped_arguments_are_named():

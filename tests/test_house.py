@@ -66,16 +66,7 @@ ROOMS = {
     "placement": ("area", "placement", "several"),
     "exploration": ("next_views", "explore"),
     "live": ("coverage", "topics", "bags", "dds", "rosbridge"),
-    "datasets": (
-        "link_table",
-        "home_sources",
-        "home_walls",
-        "home_links",
-        "shards",
-        "home_process",
-        "dataset",
-        "dataset_links",
-    ),
+    "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
     "training": ("training", "path_training", "wall_training"),
     "plots": (

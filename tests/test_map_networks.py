@@ -28,7 +28,6 @@ from sionna_partial.prediction.map_networks import (
 )
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
 from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS
-from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -37,7 +36,7 @@ FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 
 def inputs(phi):
     """Return the columns of `scaled_inputs` by name."""
-    return dict(zip(LINK_INPUTS, scaled_inputs(phi, PredictorSettings()).T, strict=True))
+    return dict(zip(LINK_INPUTS, scaled_inputs(phi, FREQUENCY_HZ).T, strict=True))
 
 
 def shaken(networks, seed=0):
@@ -70,7 +69,7 @@ def nothing():
 
 class TestLinkInputs:
     def test_every_column_is_there_and_finite(self):
-        found = scaled_inputs(make_seen_links(500)[0], PredictorSettings())
+        found = scaled_inputs(make_seen_links(500)[0], FREQUENCY_HZ)
         assert found.shape == (500, len(LINK_INPUTS))
         assert found.dtype == np.float32
         assert np.isfinite(found).all()
@@ -288,7 +287,7 @@ class TestEvaluateContextNetworks:
                 (PartialMap(state, 0.5, nothing.origin_m), (3.17, -4.4, 1.5)),
             ):
                 phi = features(partial, tx_m + distance_m * circle, tx_m=tx_m, unobserved_m=0.9 * distance_m)
-                found = np.stack(evaluate_context_networks(networks, phi, PredictorSettings()))
+                found = np.stack(evaluate_context_networks(networks, phi, FREQUENCY_HZ))
                 one = answers.setdefault(distance_m, found[..., :1])
                 np.testing.assert_allclose(found, np.repeat(one, 8, axis=-1), rtol=1e-5, atol=1e-5)
         near, far = answers.values()
@@ -300,9 +299,9 @@ class TestEvaluateContextNetworks:
         state = home.state.copy()
         state[8:12, 8:12] = FREE
         phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), position, tx_m=(0.5, 0.5, 1.5), unobserved_m=1.0)
-        one, other = scaled_inputs(phi, PredictorSettings())
+        one, other = scaled_inputs(phi, FREQUENCY_HZ)
         np.testing.assert_array_equal(one, other)
-        probabilities, *_ = evaluate_context_networks(networks, phi, PredictorSettings())
+        probabilities, *_ = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
         assert abs(probabilities[:, 0] - probabilities[:, 1]).max() > 1e-3
 
     def test_links_of_several_windows_keep_their_order(self, networks, home, nothing):
@@ -311,16 +310,16 @@ class TestEvaluateContextNetworks:
         tx_m, map_index = rng.integers(-3, 3, (40, 3)) + 0.4, rng.integers(0, 2, 40)
         phi = features(((home, nothing), map_index), rx_m, tx_m=tx_m)
         assert len(phi.context.windows) > 20
-        together = evaluate_context_networks(networks, phi, PredictorSettings())
+        together = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
         for number in range(0, 40, 7):
-            alone = evaluate_context_networks(networks, phi.take(slice(number, number + 1)), PredictorSettings())
+            alone = evaluate_context_networks(networks, phi.take(slice(number, number + 1)), FREQUENCY_HZ)
             for one, all_of_them in zip(alone, together, strict=True):
                 np.testing.assert_allclose(one[:, 0], all_of_them[:, number], rtol=1e-5, atol=1e-5)
 
     def test_many_links_of_one_window(self, networks, home):
         phi = features(home, np.random.default_rng(10).uniform(-7.5, 7.5, (50, 3)))
-        at_once = evaluate_context_networks(networks, phi, PredictorSettings())
-        many = evaluate_context_networks(networks, phi.take(np.arange(17_000) % 50), PredictorSettings())
+        at_once = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
+        many = evaluate_context_networks(networks, phi.take(np.arange(17_000) % 50), FREQUENCY_HZ)
         for one, other in zip(at_once, many, strict=True):
             np.testing.assert_allclose(one, other[:, -50:], rtol=1e-5, atol=1e-5)
 
@@ -338,7 +337,7 @@ class TestEvaluateContextNetworks:
             return np.full((len(links), LINK_OUTPUTS), -50.0, dtype=np.float32)
 
         phi = features(home, (1.0, 2.0, 1.5), unobserved_m=1.0)
-        probabilities, means_db, stds_db = evaluate_context_networks({LINK_NETWORK: low}, phi, PredictorSettings())
+        probabilities, means_db, stds_db = evaluate_context_networks({LINK_NETWORK: low}, phi, FREQUENCY_HZ)
         assert (means_db[[LinkState.OUTAGE, LinkState.NLOS]] == -150.0).all()
         np.testing.assert_allclose(means_db[LinkState.LOS], free_space_gain_db(phi.distance_m, FREQUENCY_HZ))
         np.testing.assert_allclose(probabilities, 1 / 3)
@@ -346,4 +345,4 @@ class TestEvaluateContextNetworks:
 
     def test_no_links(self, networks, home):
         phi = features(home, (1.0, 2.0, 1.5)).take(slice(0))
-        assert [each.shape for each in evaluate_context_networks(networks, phi, PredictorSettings())] == [(3, 0)] * 3
+        assert [each.shape for each in evaluate_context_networks(networks, phi, FREQUENCY_HZ)] == [(3, 0)] * 3

@@ -90,7 +90,7 @@ def trained_and_scored(networks, rule):
         patch.setattr(module, "_WIDTHS", ((8, 16), (8, 16)))
         found = fit_context_networks(seen.phi, *seen.truth(getattr(seen, rule)), settings)
     state, _ = others.truth(getattr(others, rule))
-    probabilities, means_db, _ = evaluate_context_networks(found, others.phi, PredictorSettings())
+    probabilities, means_db, _ = evaluate_context_networks(found, others.phi, FREQUENCY_HZ)
     entropy = -np.log(probabilities[state, np.arange(len(state))]).mean()
     return (probabilities.argmax(axis=0) == state).mean(), entropy, means_db[NLOS][state == NLOS].mean()
 
@@ -104,7 +104,7 @@ class TestFitContextNetworks:
     def test_links_of_the_rules_look_alike(self):
         """The rooms are seen on the map alone, the paths in one column and what is made of it alone."""
         links = make_room_links(*OTHERS)
-        assert np.flatnonzero(np.ptp(scaled_inputs(links.phi, PredictorSettings()), axis=0)).tolist() == [21, 27]
+        assert np.flatnonzero(np.ptp(scaled_inputs(links.phi, FREQUENCY_HZ), axis=0)).tolist() == [21, 27]
         assert not links.phi.context.rx_seen.any()
         assert 0.4 < links.in_seen_room.mean() < 0.6
 
@@ -167,7 +167,7 @@ class TestExamples:
     def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
         """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
         phi, half, cell_m = links.phi, WINDOW_CELLS / 2, 0.3
-        inputs, state = scaled_inputs(phi, PredictorSettings()), links.truth(links.in_seen_room)[0]
+        inputs, state = scaled_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
         turns = set()
         for batch in examples.batches(4, np.random.default_rng(4)):
             for number, drawn in enumerate(batch["gain_db"].astype(int)):

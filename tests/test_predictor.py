@@ -21,7 +21,6 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
 from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
-from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -149,7 +148,7 @@ def test_shipped_predictor(name):
 class TestNetworksOfMapsAndPaths:
     def test_its_networks_answer_where_maps_are_partial(self, seeing):
         phi = make_seen_links(100, seed=3)[0]
-        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, PredictorSettings()))
+        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, 28e9))
         for name, values in arrays(seeing.predict(phi)).items():
             np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
 
@@ -208,6 +207,10 @@ class TestNetworksOfMapsAndPaths:
             Predictor.fit(make_links(5)[0], state, gain_db, settings=seeing.settings)
         with pytest.raises(PredictorError, match="features has no links: give at least one"):
             Predictor.fit(make_seen_links(0)[0], [], [], settings=seeing.settings)
+        wifi = dataclasses.replace(make_links(5)[0], frequency_hz=5e9)
+        message = "features are at 5 GHz, settings at 28 GHz: give PredictorSettings(frequency_hz=5e+09)."
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            Predictor.fit(wifi, state, gain_db)
 
     def test_features_without_windows(self):
         phi, state, gain_db = make_links(5)

@@ -62,7 +62,7 @@ class TestShard:
         positions = {f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"}
         phi = {"partial_link_state", "partial_gain_db", "unobserved_distance_m", "distance_m"}
         indirect = {f"indirect_gain_reach_{reach}_m_db" for reach in ("inf", "4", "1", "0.25", "0")}
-        straight = {"straight_gain_db", "straight_walls", "wall_loss_db", "wall_reflection_db", "carrier_hz"}
+        straight = {"straight_gain_db", "straight_walls", "wall_loss_db"}
         others = {"strongest_unobserved_m", "map_index"}
         assert names == {*COLUMNS} | positions | phi | indirect | straight | others
 
@@ -76,7 +76,13 @@ class TestShard:
 
     def test_notes(self, shard: Path) -> None:
         notes = shard_metadata(shard)
-        assert {name: notes[name] for name in notes if name != "maps"} == {"format": FORMAT, **NOTES}
+        expected = {"format": FORMAT, "frequency_hz": None, **NOTES}
+        assert {name: notes[name] for name in notes if name != "maps"} == expected
+
+    def test_frequency_comes_back(self, links: LinkTable, tmp_path: Path) -> None:
+        wifi = replace(links, features=replace(links.features, frequency_hz=5e9))
+        write_shard(wifi, tmp_path / "wifi.parquet", NOTES)
+        assert read_shard(tmp_path / "wifi.parquet").features.frequency_hz == 5e9
 
     def test_equal_links_give_equal_bytes(self, links: LinkTable, shard: Path, tmp_path: Path) -> None:
         write_shard(links, tmp_path / "again.parquet", dict(reversed(NOTES.items())))

@@ -123,7 +123,7 @@ class TestTrain:
         folder = make_dataset(tmp_path, table, frequency_hz=60e9, diffraction=False)
         message = (
             "dataset was traced at 60 GHz without diffraction, settings are for links at 28 GHz with diffraction: give "
-            "PredictorSettings with the frequency and diffraction of the data set."
+            "PredictorSettings with frequency_hz, diffraction and through_walls of the data set."
         )
         with pytest.raises(PredictorError, match=re.escape(message)):
             train(folder, settings=UNTRAINED)

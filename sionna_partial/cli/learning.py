@@ -66,10 +66,6 @@ def dataset(
     ] = False,
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     material: opt.MaterialText = "",
-    mixed_walls: Annotated[
-        bool,
-        typer.Option("--mixed-walls", help="Draw frequency and materials for each home; paths go through its walls."),
-    ] = False,
     workers: Annotated[
         int | None, typer.Option(help="Homes at a time on this machine. Default: one for each core.")
     ] = None,
@@ -94,7 +90,6 @@ def dataset(
         short_link_fraction=short_links,
         scene=SceneSettings(material=opt.parse_material(material)),
         trace=TraceSettings(frequency_hz=frequency),
-        walls="mixed" if mixed_walls else "given",
     )
     count = homes if homes is not None else 0 if maps else DEFAULT_HOMES
     seeds = range(first_seed, first_seed + count)

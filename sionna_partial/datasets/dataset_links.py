@@ -4,7 +4,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -17,10 +17,7 @@ from sionna_partial.settings import NetworkKind, PredictorSettings, TraceSetting
 
 @dataclass(frozen=True)
 class LinkTraces:
-    """How links were traced: carrier frequency [Hz], and whether with diffraction on plans, and through walls.
-
-    Through walls links have frequencies of their own.
-    """
+    """How links were traced: carrier frequency [Hz], and whether with diffraction on plans, and through walls."""
 
     frequency_hz: float
     diffraction: bool
@@ -33,14 +30,13 @@ class LinkTraces:
 
     def __str__(self) -> str:
         """Return them in words."""
-        where = "through walls" if self.through_walls else f"at {self.frequency_hz / 1e9:g} GHz"
+        where = f"at {self.frequency_hz / 1e9:g} GHz{' through walls' if self.through_walls else ''}"
         return f"{where} {'with' if self.diffraction else 'without'} diffraction"
 
     def is_like(self, other: "LinkTraces") -> bool:
-        """Whether frequency (within 1e-6) and diffraction are the same."""
+        """Whether frequency (within 1e-6), diffraction and paths through walls are the same."""
         same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
-        same = self.diffraction == other.diffraction and self.through_walls == other.through_walls
-        return same and (same_frequency or self.through_walls)
+        return same_frequency and replace(self, frequency_hz=other.frequency_hz) == other
 
 
 Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
@@ -99,8 +95,9 @@ def settings_for(
 ) -> PredictorSettings:
     """Return settings of a training on such links; None takes the defaults."""
     known = traces or LinkTraces.of_settings(PredictorSettings())
-    through = {"through_walls": known.through_walls}
-    return PredictorSettings(networks, known.frequency_hz, known.diffraction, passes, seed=seed, **through)
+    return PredictorSettings(
+        networks, known.frequency_hz, known.diffraction, passes, seed=seed, through_walls=known.through_walls
+    )
 
 
 def require_like(
@@ -114,10 +111,8 @@ def require_like(
 def _read_traces(folder: Path) -> LinkTraces:
     index = read_index(folder)
     try:
-        settings = index["settings"]
-        trace = TraceSettings(**settings["trace"])
-        through_walls = settings.get("walls") == "mixed" or trace.through_walls
-        return LinkTraces(trace.frequency_hz, trace.diffraction is not False, through_walls)
+        trace = TraceSettings(**index["settings"]["trace"])
+        return LinkTraces(trace.frequency_hz, trace.diffraction is not False, trace.through_walls)
     except (ValueError, KeyError, TypeError, AttributeError, SettingsError) as error:
         path = folder / INDEX_FILE
         raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error

@@ -9,7 +9,6 @@ import numpy as np
 
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets.home_walls import with_drawn_walls
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import MapError
 from sionna_partial.exploration.explore import explore_trajectory
@@ -58,8 +57,6 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     """
     require_map("home", home)
     home = map_area(closed_home(home, name), settings.margin_m)
-    if settings.walls == "mixed":
-        home, settings = with_drawn_walls(home, settings, np.random.default_rng([2, *_home_seed(name, settings)]))
     rng = np.random.default_rng(_home_seed(name, settings))
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
     maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps

@@ -22,14 +22,14 @@ from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
 from sionna_partial.maps.mesh.mesh import material_records
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkContext, LinkFeatures, one_or_each
+from sionna_partial.prediction.features import LinkContext, LinkFeatures
 from sionna_partial.prediction.inputs import FEATURES, columns_of, features_of_columns
 from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
 """Files and folders of a data set: settings and homes, a shard for each home, a note for each home that failed."""
 
-FORMAT = "sionna-partial links 3"
+FORMAT = "sionna-partial links 4"
 """Name and version of the shards' format, in their metadata."""
 
 _MAX_LINKS, _MAX_CELLS, _MAX_BYTES = 10_000_000, 100_000_000, 4_000_000_000
@@ -74,14 +74,14 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
 
     Columns are named as in `LinkTable`, with the unit behind the name; positions have a column for each axis
     (`tx_x_m`), and the link state and the gain of the partial trace are `partial_link_state` and `partial_gain_db`. The
-    maps are in the file's metadata, as is `metadata`, as JSON under `sionna_partial.` and its name; `map_index` is the
-    index of the map on which a link was traced.
+    frequency and the maps are in the file's metadata, as is `metadata`, as JSON under `sionna_partial.` and its name;
+    `map_index` is the index of the map on which a link was traced.
     """
     maps = {
         "partial": [_packed(each) for each in table.maps],
         "complete": {name: _packed(home) for name, home in table.complete_maps.items()},
     }
-    notes = {"format": FORMAT, "maps": maps, **metadata}
+    notes = {"format": FORMAT, "frequency_hz": table.features.frequency_hz, "maps": maps, **metadata}
     texts = {_PREFIX + name: json.dumps(notes[name], sort_keys=True) for name in sorted(notes)}
     schema, columns = pa.schema(_FIELDS, metadata=texts), _columns(table)
     values = [pa.array(columns[field.name], type=field.type) for field in _FIELDS]
@@ -103,7 +103,7 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
         raise _damaged(path, error) from error
     columns = {name: table[name].to_numpy() for name in table.column_names}
     try:
-        return _links_of(columns, notes["maps"])
+        return _links_of(columns, notes)
     except (KeyError, TypeError, ValueError, IndexError, zlib.error, MapError, PredictorError) as error:
         raise _damaged(path, error) from error
 
@@ -205,17 +205,16 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
     positions = {
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
-    maps, map_index = tuple(_unpacked(each) for each in notes["partial"]), columns.pop("map_index")
+    maps, map_index = tuple(_unpacked(each) for each in notes["maps"]["partial"]), columns.pop("map_index")
     found = features_of_columns(columns)
     of_context = {name: found.pop(name) for name in [*found] if name in LinkContext.__dataclass_fields__}
     traced = {name: found[name] for name in ("link_state", "unobserved_distance_m")}
-    found["frequency_hz"] = one_or_each(found.pop("carrier_hz"))
     context = LinkContext.on_maps(maps, map_index, **traced, **of_context, **positions)
     table = {name: columns[name] for name in COLUMNS if name != "home"}
     home = columns["home"].astype(np.str_)
-    complete_maps = {name: _unpacked(each) for name, each in notes["complete"].items()}
-    known = {"features": LinkFeatures(**found, context=context), "maps": maps, "map_index": map_index}
-    return LinkTable(home=home, complete_maps=complete_maps, **known, **table)
+    complete_maps = {name: _unpacked(each) for name, each in notes["maps"]["complete"].items()}
+    phi = LinkFeatures(**found, context=context, frequency_hz=notes["frequency_hz"])
+    return LinkTable(home=home, features=phi, maps=maps, map_index=map_index, complete_maps=complete_maps, **table)
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:

@@ -157,8 +157,6 @@ class DifferentiableScene:
                 "dataclasses.replace(partial, obstacle=None)."
             )
         self.predictor = Predictor.load(model.asked)
-        remedy = "choose one of opaque walls, as links through walls have no gradients through its inputs."
-        require(not self.predictor.settings.through_walls, "predictor", self.predictor.name, remedy)
         self.networks = parts(self.predictor.model)
 
     @property

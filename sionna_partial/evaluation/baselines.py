@@ -99,12 +99,12 @@ class Baselines(Shown):
         return cls(majority, warm_predictor(folder / DISTANCE_FILE))
 
 
-def nothing_seen(phi: LinkFeatures, frequency_hz: float | Floats) -> LinkFeatures:
+def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
     """Return the features of the same N links on an empty map, where the distance is all that is known.
 
-    `frequency_hz` is that of links which have none of their own.
+    `frequency_hz` is that of links whose features have none.
     """
-    frequency_hz = frequency_hz if phi.frequency_hz is None else phi.frequency_hz
+    frequency_hz = phi.frequency_hz or frequency_hz
     gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)
     state = np.full(len(phi), LinkState.LOS)
     return LinkFeatures(state, phi.distance_m, phi.distance_m, gain_db, frequency_hz=frequency_hz)
@@ -123,7 +123,7 @@ def indoor_los_probability(distance_m: Floats, office: str) -> Floats:
     return np.select([d <= 5.0, d <= 49.0], [1.0, near], far)
 
 
-def indoor_gain_db(distance_m: Floats, frequency_hz: float | Floats) -> dict[LinkState, Floats]:
+def indoor_gain_db(distance_m: Floats, frequency_hz: float) -> dict[LinkState, Floats]:
     """Return the path gain [dB] of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
 
     The distance (N,) is three-dimensional [m]; the model is made for 1 to 150 m and 0.5 to 100 GHz, and is extended to
@@ -141,8 +141,8 @@ def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkP
     The gain is Gaussian with the shadow fading of Table 7.4.1-1: 3 dB in LOS, 8.03 dB in NLOS. Transmitter and receiver
     are taken to be at the same height, so that the horizontal distance is the distance.
     """
-    carrier_hz = frequency_hz if phi.frequency_hz is None else phi.frequency_hz
-    p_los, gains_db = indoor_los_probability(phi.distance_m, office), indoor_gain_db(phi.distance_m, carrier_hz)
+    p_los = indoor_los_probability(phi.distance_m, office)
+    gains_db = indoor_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
     nothing = np.zeros(len(phi))
     means_db = np.stack([nothing + GAIN_FLOOR_DB, gains_db[LinkState.LOS], gains_db[LinkState.NLOS]])
     stds_db = np.stack([nothing + std_db for std_db in _INDOOR_STD_DB])

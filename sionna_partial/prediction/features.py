@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import number_of, require_bool, require_type, shown
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
@@ -32,7 +32,7 @@ from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db, wall_reflection_db
+from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
@@ -54,28 +54,6 @@ _OPAQUE_CELLS = 3.0
 
 _BEYOND_CELLS = 2
 """Width of what is labelled around a map, so that walls that reach its border do not part it [cells]."""
-
-
-class WallLosses(NamedTuple):
-    """Mean losses of the walls of a map for vertical antennas, at most `MOST_LOSS_DB`: transmitted, reflected [dB]."""
-
-    loss_db: float
-    reflection_db: float
-
-    @classmethod
-    def of(cls, partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> "WallLosses":
-        """Average over the known wall cells of a map, whose default material is that of the settings.
-
-        Walls that no path goes through lose the most.
-        """
-        materials = scene_settings.material, *partial.wall_materials
-        cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
-        count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
-        weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
-        used, frequency_hz = np.flatnonzero(weights), trace_settings.frequency_hz
-        loss_db = sum(weights[k] * wall_loss_db(materials[k], frequency_hz) for k in used)
-        reflection_db = sum(weights[k] * wall_reflection_db(materials[k], frequency_hz) for k in used)
-        return cls(float(loss_db) if trace_settings.through_walls else MOST_LOSS_DB, float(reflection_db))
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +87,8 @@ class LinkContext(Shown):
         Gain of the direct path, through whatever known walls it crosses [dB], at least -150.
     straight_walls : (N,) float64 array
         Number of known walls that it crosses; 0 where there is no direct path.
-    wall_loss_db, wall_reflection_db : (N,) float64 arrays
-        What a known wall of the map loses on average where a path goes through it, and where it is reflected [dB]:
-        see `WallLosses`.
+    wall_loss_db : (N,) float64 array
+        Mean loss of going through a known wall of the map [dB]: see `mean_wall_loss_db`.
     window_index : (N,) int array
         The transmitter, and window, of each link.
     """
@@ -130,7 +107,6 @@ class LinkContext(Shown):
     straight_gain_db: Floats
     straight_walls: Floats
     wall_loss_db: Floats
-    wall_reflection_db: Floats
     window_index: Indices
     windows: NDArray[np.uint8] | None = None
 
@@ -207,11 +183,11 @@ _COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "w
 class IndirectPaths:
     """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced.
 
-    `walls` are the mean losses of the walls of the map.
+    `wall_loss_db` is from `mean_wall_loss_db`.
     """
 
-    def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats, walls: WallLosses) -> None:
-        self.partial, self.tx_m, self.rx_m, self.walls = partial, tx_m, rx_m, walls
+    def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats, wall_loss_db: float) -> None:
+        self.partial, self.tx_m, self.rx_m, self.wall_loss_db = partial, tx_m, rx_m, wall_loss_db
         count = len(tx_m) * len(rx_m)
         self._straight_power, self._straight_walls = np.zeros(count), np.zeros(count)
         self._power, self._strongest = np.zeros((len(ATTENUATION_LENGTHS_M), count)), np.zeros(count)
@@ -255,9 +231,23 @@ class IndirectPaths:
             strongest_unobserved_m=self._strongest_m,
             straight_gain_db=path_gain_db(self._straight_power),
             straight_walls=self._straight_walls,
-            wall_loss_db=np.full(len(tx_m), self.walls.loss_db),
-            wall_reflection_db=np.full(len(tx_m), self.walls.reflection_db),
+            wall_loss_db=np.full(len(tx_m), self.wall_loss_db),
         )
+
+
+def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> float:
+    """Return the mean loss of the known wall cells of a map [dB], whose default material is that of the settings.
+
+    It is `MOST_LOSS_DB` where no path goes through walls.
+    """
+    if not trace_settings.through_walls:
+        return MOST_LOSS_DB
+    materials = scene_settings.material, *partial.wall_materials
+    cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
+    count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
+    weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
+    used, frequency_hz = np.flatnonzero(weights), trace_settings.frequency_hz
+    return float(sum(weights[k] * wall_loss_db(materials[k], frequency_hz) for k in used))
 
 
 def path_unobserved_m(
@@ -382,7 +372,7 @@ class LinkFeatures(Shown):
     context : LinkContext, optional
         What the map shows along and around the links, as arrays, from `link_features`; one link after the other. The
         paper's predictor does not use it.
-    frequency_hz : float or (N,) array, optional
+    frequency_hz : float, optional
         Carrier frequency of the trace [Hz], from `link_features`. None is that of the predictor.
 
     Raises
@@ -403,7 +393,7 @@ class LinkFeatures(Shown):
     distance_m: Floats
     gain_db: Floats
     context: LinkContext | None = None
-    frequency_hz: float | Floats | None = None
+    frequency_hz: float | None = None
 
     def __post_init__(self) -> None:
         count, shape = np.size(self.distance_m), np.shape(self.distance_m)
@@ -416,19 +406,12 @@ class LinkFeatures(Shown):
         require_each(inside, "unobserved_distance_m", self.unobserved_distance_m, "it lies between 0 and distance_m.")
         remedy = f"clip gains at {GAIN_FLOOR_DB:g} dB, the gain of an outage."
         require_each(self.gain_db >= GAIN_FLOOR_DB, "gain_db", self.gain_db, remedy)
-        self._check_frequency()
+        low_hz, high_hz = FREQUENCIES_HZ
+        if self.frequency_hz is not None and not low_hz <= number_of(self.frequency_hz) <= high_hz:
+            what = f"frequency_hz = {shown(self.frequency_hz)} is not allowed"
+            raise PredictorError(f"{what}: give a frequency in Hz, or None for that of the predictor.")
         if self.context is not None and len(self.context) != count:
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
-
-    def _check_frequency(self) -> None:
-        given = self.frequency_hz
-        if isinstance(given, np.ndarray):
-            frequency_hz = link_numbers("frequency_hz", given, (len(self),))
-            known = (frequency_hz >= FREQUENCIES_HZ[0]) & (frequency_hz <= FREQUENCIES_HZ[1])
-            require_each(known, "frequency_hz", frequency_hz, "give frequencies in Hz.")
-        elif given is not None and not FREQUENCIES_HZ[0] <= number_of(given) <= FREQUENCIES_HZ[1]:
-            what = f"frequency_hz = {shown(given)} is not allowed"
-            raise PredictorError(f"{what}: give a frequency in Hz, or None for that of the predictor.")
 
     def __len__(self) -> int:
         """Return the number of links, N or T N."""
@@ -447,19 +430,10 @@ class LinkFeatures(Shown):
         """Return the links that an index array, a mask or a slice selects, one after the other."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
-        frequency_hz = self.frequency_hz[index] if isinstance(self.frequency_hz, np.ndarray) else self.frequency_hz
-        return LinkFeatures(**columns, context=context, frequency_hz=frequency_hz)
+        return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz)
 
-    @property
-    def carrier_hz(self) -> Floats:
-        """Carrier frequency (N,) of each link [Hz]; where none is given 28 GHz."""
-        given = CARRIER_FREQUENCY_HZ if self.frequency_hz is None else self.frequency_hz
-        return np.broadcast_to(given, len(self))
-
-    def free_space_shift_db(self, frequency_hz: float) -> Any:
-        """Return how much stronger free space is at another frequency [dB], one number or one of each link (N,)."""
-        if isinstance(self.frequency_hz, np.ndarray):
-            return 20.0 * np.log10(self.frequency_hz / frequency_hz)
+    def free_space_shift_db(self, frequency_hz: float) -> float:
+        """Return how much stronger free space is at another frequency than at that of the links [dB]."""
         return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
@@ -467,15 +441,14 @@ class LinkFeatures(Shown):
         """Return the links of all `parts`, one after the other."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
-        missing = [part.frequency_hz is None for part in parts]
-        if any(missing) and not all(missing):
-            raise PredictorError("parts have a frequency_hz, and none: give it for all of them, or for none.")
-        each_hz = np.concatenate([part.carrier_hz for part in parts])
-        frequency_hz = one_or_each(each_hz) if len(each_hz) else parts[0].frequency_hz
+        frequencies_hz = {part.frequency_hz for part in parts}
+        if len(frequencies_hz) > 1:
+            given = ", ".join(sorted(f"{each:g}" if each else "None" for each in frequencies_hz))
+            raise PredictorError(f"parts have frequency_hz = {given}: give links of one frequency together.")
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
         columns = {name: np.concatenate([getattr(part, name).ravel() for part in parts]) for name in _PAPER}
-        return cls(**columns, context=context, frequency_hz=None if any(missing) else frequency_hz)
+        return cls(**columns, context=context, frequency_hz=frequencies_hz.pop())
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
         """Return the features with what map networks read of the maps; `map_index` (N,) is the map of each link."""
@@ -491,12 +464,6 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     """Return the context that features must have here."""
     assert phi.context is not None
     return phi.context
-
-
-def one_or_each(frequency_hz: Floats) -> float | Floats:
-    """Return the frequency that all links (N,) have, or those of each link."""
-    same = len(frequency_hz) > 0 and bool((frequency_hz == frequency_hz[0]).all())
-    return float(frequency_hz[0]) if same else frequency_hz
 
 
 def excess_noise(wall_noise: Floats) -> Floats:
@@ -572,8 +539,8 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     if not links.valid.all():
         count = int((~links.valid).sum())
         raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")
-    walls = WallLosses.of(partial, links.trace_settings, links.scene_settings)
-    paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx, walls)
+    loss_db = mean_wall_loss_db(partial, links.trace_settings, links.scene_settings)
+    paths = IndirectPaths(partial, links.tx.reshape(-1, 3), links.rx, loss_db)
     paths.add(links)
     frequency_hz = links.trace_settings.frequency_hz
     phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz)
@@ -596,7 +563,7 @@ def features_of_paths(
     need.
     """
     sums = LinkSums(1, len(rx_m))
-    indirect = IndirectPaths(partial, tx_m[None], rx_m, WallLosses.of(partial, *settings))
+    indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
     for paths in blocks:
         sums.add(paths)
         if windows is not None:

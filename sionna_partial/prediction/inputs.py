@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Floats
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkFeatures, shifted_gain_db
 
 NEAREST_M = 0.01
@@ -46,16 +46,12 @@ FEATURES = (
     Feature("straight_gain_db", "dB", ("straight_gain_db",)),
     Feature("straight_walls", "1", ("straight_walls",)),
     Feature("wall_loss_db", "dB", ("wall_loss_db",)),
-    Feature("wall_reflection_db", "dB", ("wall_reflection_db",)),
-    Feature("carrier_hz", "Hz", ("carrier_hz",)),
     Feature("tx_seen", "bool"),
     Feature("rx_seen", "bool"),
     Feature("possible", "bool by LinkState"),
     Feature("walled_m", "m"),
-    Feature("nearly_complete", "bool"),
-    Feature("wall_noise", "1"),
 )
-"""All features that networks read, and in which order data sets have them."""
+"""Features that networks, the mean loss of walls and multi-wall models read, in the order that data sets have them."""
 
 STATE_INPUTS = ("distance_m", "unobserved_distance_m")
 GAIN_INPUTS = (*STATE_INPUTS, "gain_db")
@@ -115,39 +111,9 @@ LINK_INPUTS: dict[str, Make] = {
 """The inputs of the link network in their order, without units: how each is made of features."""
 
 
-def _below_free(gain_db: Callable[[Values], Any]) -> Make:
-    return lambda of, ops: ops.clip((gain_db(of) - of["free_db"]) / _EXCESS_DB, -3.0, 0.5)
-
-
-WALL_INPUTS: dict[str, Make] = {
-    **{name: LINK_INPUTS[name] for name in ("los", "nlos", "tx_seen", "rx_seen", "los_possible", "walled")},
-    **{name: LINK_INPUTS[name] for name in ("log_distance", "unobserved_fraction", "distance", "unobserved")},
-    **{name: LINK_INPUTS[name] for name in ("observed", "strongest_unobserved", "free_gain")},
-    "nearly_complete": _flag("nearly_complete"),
-    "wall_noise": _flag("wall_noise"),
-    "gain_above_free": _below_free(lambda of: of["gain_db"]),
-    **{f"{name}_above_free": _below_free(gain_db) for name, gain_db in _INDIRECT.items()},
-    "straight_above_free": _below_free(lambda of: of["straight_gain_db"]),
-    "straight_walls": lambda of, ops: ops.log(1.0 + of["straight_walls"]),
-    "wall_loss": lambda of, ops: of["wall_loss_db"] / _EXCESS_DB,
-    "log_wall_loss": lambda of, ops: ops.log(1.0 + of["wall_loss_db"]),
-    "wall_reflection": lambda of, ops: of["wall_reflection_db"] / _EXCESS_DB,
-    "unobserved_loss": lambda of, ops: ops.log(1.0 + of["wall_loss_db"] * of["unobserved_distance_m"] / _EXCESS_DB),
-    "log_frequency": lambda of, ops: ops.log(of["carrier_hz"] / CARRIER_FREQUENCY_HZ),
-}
-"""The inputs of the link network for walls that let waves through, at any frequency, likewise."""
-
-
 def feature_values(phi: LinkFeatures) -> dict[str, Any]:
     """Return all features of links, which have a context, by name."""
     return {each.name: each.of(phi) for each in FEATURES}
-
-
-def wall_inputs(values: Values) -> Floats:
-    """Return the inputs (N, len(WALL_INPUTS)) of the link network for walls that let waves through."""
-    near_m = np.maximum(values["distance_m"], _LOG_NEAREST_M)
-    of = {**values, "free_db": free_space_gain_db(values["distance_m"], values["carrier_hz"]), "near_m": near_m}
-    return np.stack([make(of, np) for make in WALL_INPUTS.values()], axis=1)
 
 
 def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleType = np) -> Any:
@@ -163,15 +129,13 @@ def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleT
     return ops.stack([make(of, ops) for make in LINK_INPUTS.values()], axis=1)
 
 
-def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float | Floats, ops: ModuleType = np) -> Any:
+def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
     """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
     return gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
 
 
-def gain_at_1m_db(frequency_hz: float | Floats) -> Any:
-    """Return the same at 1 m [dB], of one frequency or of each link (N,)."""
-    if isinstance(frequency_hz, np.ndarray):
-        return 20.0 * np.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
+def gain_at_1m_db(frequency_hz: float) -> float:
+    """Return the same at 1 m [dB]."""
     return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
 
 

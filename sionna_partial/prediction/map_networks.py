@@ -13,7 +13,6 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,16 +23,8 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkContext, LinkFeatures, context_of, excess_noise
-from sionna_partial.prediction.inputs import (
-    LINK_INPUTS,
-    WALL_INPUTS,
-    feature_values,
-    free_space_gain_db,
-    link_inputs,
-    wall_inputs,
-)
+from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
-from sionna_partial.prediction.through_walls import MeanLosses
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
 from sionna_partial.settings import PredictorSettings
 
@@ -74,13 +65,6 @@ _LOS_MOST_DB = 10.0
 
 _LOS_OFFSET = -1.5
 _NLOS_DB, _NLOS_SCALE_DB = -25.0, 20.0
-_LEAST_P = 1e-5
-"""Least probability of a link state in `MeanLosses`, from which networks may raise it."""
-
-_MOST_STDS, _LOG_WIDER = 2.0, 1.5
-"""By how many standard deviations of `MeanLosses` means are corrected, and by how much these become larger or smaller,
-as a logarithm, at most: walls that are like none of the training must not be far off."""
-
 _STATISTICS_MOMENTUM = 0.9
 _FADE_CELLS = 8.0
 """Width of the rim of a window in which its numbers fade to 0 [cells]."""
@@ -93,37 +77,23 @@ _log = logging.getLogger(__name__)
 
 
 _SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
-_MAP_INPUTS = len(CELLS_M) * MAP_FEATURES
-_MAP_SHAPES = dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES)))
+_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + len(CELLS_M) * MAP_FEATURES
+
+CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
+    {},
+    {LINK_NETWORK: ((None, len(LINK_INPUTS)), (None, LINK_OUTPUTS))},
+    {
+        LINK_NETWORK: ((None, _LINK_INPUTS_WITH_MAP), (None, LINK_OUTPUTS)),
+        **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
+    },
+)
+"""Inputs and outputs of the networks that a predictor may have in addition to the paper's: none, "paths", or "map"."""
 
 
-def _shapes_of(table: Mapping[str, Any]) -> tuple[Mapping[str, Shapes], ...]:
-    """Return inputs and outputs of the networks "paths" and "map" whose link network has the inputs of a table."""
-    alone, beside = ({LINK_NETWORK: ((None, len(table) + more), (None, LINK_OUTPUTS))} for more in (0, _MAP_INPUTS))
-    return alone, {**beside, **_MAP_SHAPES}
-
-
-CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = ({}, *_shapes_of(LINK_INPUTS), *_shapes_of(WALL_INPUTS))
-"""Inputs and outputs of the networks that a predictor may have in addition to the paper's: none, "paths", or "map";
-the last two where paths go through walls."""
-
-
-def scaled_inputs(phi: LinkFeatures, settings: PredictorSettings) -> NDArray[np.float32]:
-    """Return the inputs of the link network of some settings for the features of N links, which have a context."""
-    if settings.through_walls:
-        return wall_inputs(feature_values(phi)).astype(np.float32)
-    shift_db = phi.free_space_shift_db(settings.frequency_hz)
-    inputs: Floats = link_inputs(feature_values(phi), settings.frequency_hz, shift_db)
+def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
+    """Return the inputs of the link network of a frequency for the features of N links, which have a context."""
+    inputs: Floats = link_inputs(feature_values(phi), frequency_hz, phi.free_space_shift_db(frequency_hz))
     return inputs.astype(np.float32)
-
-
-def base_of(phi: LinkFeatures, settings: PredictorSettings) -> Floats | MeanLosses:
-    """Return what the outputs of the link network correct: the gain of free space (N,), or `MeanLosses` of walls."""
-    if settings.through_walls:
-        return MeanLosses.of(phi)
-    frequency_hz = settings.frequency_hz if phi.frequency_hz is None else phi.frequency_hz
-    free_db: Floats = free_space_gain_db(phi.distance_m, frequency_hz)
-    return free_db
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
@@ -132,7 +102,7 @@ def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
     return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
 
 
-def context_networks(seed: int, *, with_map: bool = True, through_walls: bool = False) -> dict[str, "keras.Model"]:
+def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
     """Build the networks, untrained, by name; the link network alone without map networks."""
     keras = import_keras()
     seeds = itertools.count(1000 * seed + 1)
@@ -140,8 +110,7 @@ def context_networks(seed: int, *, with_map: bool = True, through_walls: bool = 
     def start() -> Any:
         return keras.initializers.GlorotUniform(seed=next(seeds))
 
-    inputs = len(WALL_INPUTS if through_walls else LINK_INPUTS) + (_MAP_INPUTS if with_map else 0)
-    networks = {LINK_NETWORK: _link_network(keras, start, inputs)}
+    networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
         networks[name] = _map_network(keras, start, name, widths)
     return networks
@@ -241,39 +210,31 @@ def _interpolated(maps: Any, offsets: Any) -> Any:
     return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))
 
 
-def decode(outputs: Any, base: Any) -> tuple[Any, Any, Any]:
+def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     """Return log-probabilities (..., 3) of the link states, and means [dB] and log-variances (..., 2) given LOS, NLOS.
 
-    `outputs` (..., LINK_OUTPUTS) are those of the link network, `base` is from `base_of`. On opaque walls the mean
-    given LOS is that of free space or up to `_LOS_MOST_DB` more. Through walls the outputs correct `MeanLosses`, in its
-    standard deviations; outputs of 0 leave it as it is.
+    `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB]. The
+    mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
     """
-    if isinstance(base, MeanLosses):
-        shift, wider = (
-            most * tf.tanh(each / most)
-            for each, most in ((outputs[..., 3:5], _MOST_STDS), (outputs[..., 5:], _LOG_WIDER))
-        )
-        log_p = tf.nn.log_softmax(tf.math.log(tf.maximum(base.p, _LEAST_P)) + outputs[..., :3])
-        return log_p, base.means_db + base.stds_db * shift, 2.0 * (tf.math.log(base.stds_db) + wider)
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
     nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]
-    means_db = base[..., None] + tf.stack([los_db, nlos_db], axis=-1)
+    means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
     low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
     return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
 
 
-def distribution(outputs: Any, base: Any, context: LinkContext) -> tuple[Any, Any, Any]:
+def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
-    `outputs` are (N, LINK_OUTPUTS), `base` is from `base_of`. States that are not possible have probability 0. On maps
-    with range noise, which the networks of opaque walls do not notice, standard deviations are larger.
+    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not possible have probability 0. On maps with
+    range noise, which the networks do not notice, standard deviations are larger.
     """
-    widening = 1.0 + (not isinstance(base, MeanLosses)) * excess_noise(context.wall_noise) * np.where(
+    widening = 1.0 + excess_noise(context.wall_noise) * np.where(
         context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
     )
     states = tf.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
     outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
-    log_probabilities, gains_db, log_variances = decode(outputs, base)
+    log_probabilities, gains_db, log_variances = decode(outputs, free_db)
     outage = tf.fill([1, len(context)], tf.constant(GAIN_FLOOR_DB, tf.float64))
     means_db = tf.concat([outage, tf.transpose(tf.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
     stds_db = tf.concat([tf.zeros_like(outage), tf.transpose(tf.exp(0.5 * log_variances))], axis=0) * widening
@@ -281,19 +242,20 @@ def distribution(outputs: Any, base: Any, context: LinkContext) -> tuple[Any, An
 
 
 def evaluate_context_networks(
-    networks: Networks, phi: LinkFeatures, settings: PredictorSettings, read: MapReader | None = None
+    networks: Networks, phi: LinkFeatures, frequency_hz: float, read: MapReader | None = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Evaluate the networks of some settings on the features of N links, which have a context: see `distribution`.
+    """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`.
 
     `read` is the reader of these networks, where one is kept.
     """
-    inputs, offsets_m = scaled_inputs(phi, settings), receiver_offsets_m(phi)
+    inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for maps, links in _by_window(networks, context_of(phi), read):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
-    probabilities, means_db, stds_db = distribution(outputs, base_of(phi, settings), context_of(phi))
+    free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
+    probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi))
     return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
 
 
@@ -328,8 +290,7 @@ def fit_context_networks(
 
     Windows are turned and mirrored at random. The same links and settings give the same weights.
     """
-    kind = {"with_map": settings.networks == "map", "through_walls": settings.through_walls}
-    networks = context_networks(settings.seed, **kind)
+    networks = context_networks(settings.seed, with_map=settings.networks == "map")
     examples = _Examples(phi, link_state, gain_db, settings)
     steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
     step = _gradient_step(networks, steps)
@@ -352,14 +313,12 @@ class _Examples:
         self._used, links = _links_by_window(context_of(phi))
         self._windows = context_of(phi).windows if settings.networks == "map" else None
         self._first = np.cumsum([0, *map(len, links)])
-        base = base_of(replace(phi, frequency_hz=None), settings)
-        of_base = base._asdict() if isinstance(base, MeanLosses) else {"free_db": base}
         columns = {
-            "links": scaled_inputs(phi, settings),
+            "links": scaled_inputs(phi, settings.frequency_hz),
             "offsets_m": receiver_offsets_m(phi),
+            "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
             "link_state": link_state.astype(np.int32),
             "gain_db": gain_db.astype(np.float32),
-            **{name: column.astype(np.float32) for name, column in of_base.items()},
         }
         order = np.concatenate(links)
         self._columns = {name: column[order] for name, column in columns.items()}
@@ -410,23 +369,12 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer.build(weights)  # or TensorFlow traces the step again, after the first has made variables
 
-    def step(
-        links: Any,
-        offsets_m: Any,
-        link_state: Any,
-        gain_db: Any,
-        windows: Any = None,
-        free_db: Any = None,
-        **of_base: Any,
-    ) -> Any:
-        base = free_db if free_db is not None else MeanLosses(**of_base)
+    def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
         with tf.GradientTape() as tape:
             outputs = read_links(networks, read_maps(networks, windows, training=True), links, offsets_m)
-            log_p, means_db, log_variances = decode(outputs, base)
+            log_p, means_db, log_variances = decode(outputs, free_db)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             scores_db = _crps(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
-            if isinstance(base, MeanLosses):
-                scores_db *= base.weight[..., None]
             states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
             linked = tf.cast(link_state[..., None] == states, tf.float32)
             loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db * linked, axis=-1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import lru_cache
@@ -26,7 +27,6 @@ from sionna_partial.prediction.features import (
     link_numbers,
     link_states,
     require_each,
-    shifted_gain_db,
 )
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
@@ -399,7 +399,8 @@ class Predictor(Shown):
         Raises
         ------
         PredictorError
-            For no links, arrays of other shapes or values, or a training that diverges.
+            For no links, arrays of other shapes or values, links of another frequency than the settings', or a training
+            that diverges.
         """
         settings = settings or PredictorSettings()
         _require_features(features)
@@ -408,6 +409,10 @@ class Predictor(Shown):
         states = link_states("link_state", link_state, features.shape).ravel()
         gains_db = np.maximum(link_numbers("gain_db", gain_db, features.shape), GAIN_FLOOR_DB).ravel()
         features = features.flat()
+        given_hz, frequency_hz = features.frequency_hz, settings.frequency_hz
+        if given_hz is not None and not math.isclose(given_hz, frequency_hz, rel_tol=1e-6):
+            what = f"features are at {given_hz / 1e9:g} GHz, settings at {frequency_hz / 1e9:g} GHz"
+            raise PredictorError(f"{what}: give PredictorSettings(frequency_hz={given_hz:g}).")
         context_networks = {}
         if settings.networks != "paper":
             if features.context is None:
@@ -417,12 +422,7 @@ class Predictor(Shown):
                 _require_windows(features)
             with reporting(progress) as report:
                 context_networks = fit_context_networks(features, states, gains_db, settings, progress=report)
-        shift_db = features.free_space_shift_db(settings.frequency_hz)
-        at_one_db, truth_db = (
-            np.maximum(shifted_gain_db(each, shift_db), GAIN_FLOOR_DB) for each in (features.gain_db, gains_db)
-        )
-        alike = replace(features, gain_db=at_one_db, frequency_hz=None)
-        model = assemble(parts(fit_networks(alike, states, truth_db, settings)) | context_networks)
+        model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
         links = {
             f"{true.name} given {partial.name}": int(((states == true) & (features.link_state == partial)).sum())
             for partial in LinkState
@@ -489,7 +489,9 @@ class Predictor(Shown):
             _require_windows(features)
         context = context_of(features)
         read = _map_reader(self.model) if self.reads_maps else None
-        prediction = LinkPrediction.of_parts(*evaluate_context_networks(networks, features, self.settings, read))
+        prediction = LinkPrediction.of_parts(
+            *evaluate_context_networks(networks, features, self.settings.frequency_hz, read)
+        )
         if context.nearly_complete.any() and not self.settings.through_walls:
             traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
             trust = 1.0 - (1.0 - NOISY_TRUST) * excess_noise(context.wall_noise)

@@ -5,7 +5,7 @@ walls on a direct line. The constants were fitted to procedural homes of one mat
 halls, whose walls lose 2 to 20 dB; `benchmarks/unseen_walls.py` measures others.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,11 +30,9 @@ SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD, LARGEST_STD_DB = 0.5, 0.8, 0.72, 25.0
 """Standard deviations of gains whose direct line is observed, and of links with LOS likewise [dB]; those of all other
 links, likewise in losses of a wall [1], and the largest of them [dB]."""
 
-_WEIGHT_DB, _LEAST_UNIT_DB, _UNIT_WALLS, _MOST_LOSS_DB = 20.0, 3.0, 0.5, 30.0
-
 
 class MeanLosses(NamedTuple):
-    """Distributions of N links by the mean loss of walls, or tensors of any shape (...) in place of N.
+    """Distributions of N links by the mean loss of walls.
 
     Parameters
     ----------
@@ -42,14 +40,11 @@ class MeanLosses(NamedTuple):
         Probability of each LinkState.
     means_db, stds_db : (N, 2) arrays
         Means and standard deviations of the gain given LOS, and given NLOS [dB].
-    weight : (N,) array
-        Weight of an error in training, relative to one of opaque walls: it falls with the loss of a wall.
     """
 
-    p: Any
-    means_db: Any
-    stds_db: Any
-    weight: Any
+    p: Floats
+    means_db: Floats
+    stds_db: Floats
 
     @classmethod
     def of(cls, phi: LinkFeatures, walls: Floats) -> "MeanLosses":
@@ -73,5 +68,4 @@ class MeanLosses(NamedTuple):
             p=np.stack([p_outage, p_los, 1.0 - p_los - p_outage], axis=1),
             means_db=np.stack([los_db, mean_db], axis=1),
             stds_db=np.stack([los_std_db, std_db], axis=1),
-            weight=_WEIGHT_DB / (_LEAST_UNIT_DB + _UNIT_WALLS * np.minimum(wall_loss_db, _MOST_LOSS_DB)),
         )

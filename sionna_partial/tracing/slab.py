@@ -1,7 +1,7 @@
 """Reflection and transmission of slabs, as Sionna RT has them (ITU-R P.2040-3, eq. 31, 37 and 38), and their tables."""
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -87,20 +87,9 @@ def transmission_coefficients(
 
 def wall_loss_db(material: Material, frequency_hz: float) -> float:
     """Return the mean loss [dB] of going through a wall at angles of incidence up to 60 degrees."""
-    return _mean_loss_db(transmission_coefficients, material, frequency_hz)
-
-
-def wall_reflection_db(material: Material, frequency_hz: float) -> float:
-    """Return the mean loss [dB] of being reflected at a wall, likewise."""
-    return _mean_loss_db(reflection_coefficients, material, frequency_hz)
-
-
-def _mean_loss_db(
-    coefficients: Callable[..., tuple[np.ndarray, np.ndarray]], material: Material, frequency_hz: float
-) -> float:
     permittivity, conductivity_s_m = constants_of(material, frequency_hz)
     cosine = np.cos(np.radians(_ANGLES_DEG))
-    te, _ = coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
+    te, _ = transmission_coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
     return float(np.mean(np.minimum(-20.0 * np.log10(np.maximum(np.abs(te), 1e-8)), MOST_LOSS_DB)))
 
 
