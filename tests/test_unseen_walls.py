@@ -5,6 +5,7 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
+from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
 from sionna_partial.wall_training import Lines, fit_unseen_walls, lines_of
 
@@ -76,6 +77,12 @@ def test_better_than_as_many_walls_on_every_metre(unseen_home):
         others.append(WALLS_PER_M * lines.unobserved_m - lines.unseen)
     rmse, other = (np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in (errors, others))
     assert rmse < 0.85 * other
+
+
+def test_missing_weights(monkeypatch, tmp_path):
+    monkeypatch.setattr("sionna_partial.prediction.unseen_walls.WEIGHTS_FILE", tmp_path / "unseen_walls.npz")
+    with pytest.raises(PredictorError, match=r"unseen_walls\.npz' cannot be read"):
+        UnseenWalls.shipped.__wrapped__(UnseenWalls)
 
 
 def test_training_repeats_itself(unseen_home, tmp_path):

@@ -8,6 +8,7 @@ distribution.
 """
 
 import functools
+import io
 import itertools
 import math
 from collections.abc import Callable
@@ -19,7 +20,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import CellState
-from sionna_partial.files import atomic_write
+from sionna_partial.errors import PredictorError
+from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.paper_networks import import_keras, layer, tf
@@ -45,6 +47,7 @@ _FIRST, _LEAST = -1.5, -4.0
 
 _BORDER_CELLS, _POOLED = 8, 8
 _LINES_AT_ONCE = 16_384
+_MAX_BYTES = 10_000_000
 _STATISTICS_MOMENTUM = 0.9
 
 
@@ -100,7 +103,8 @@ class UnseenWalls(NamedTuple):
     def shipped(cls) -> Self:
         """Return those of the package."""
         networks = cls.untrained()
-        with np.load(WEIGHTS_FILE) as stored:
+        content = read_bytes(WEIGHTS_FILE, "path", PredictorError, _MAX_BYTES, "install sionna-partial again.")
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             for name, network in networks._asdict().items():
                 network.set_weights([stored[f"{name}_{number}"] for number in range(len(network.weights))])
         return networks
