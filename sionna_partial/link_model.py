@@ -173,7 +173,7 @@ class LinkModel:
 
     @property
     def _by_wall_losses(self) -> bool:
-        """Whether `MeanLosses` predict: networks trained on opaque walls have no gains behind them."""
+        """Whether the mean loss of walls predicts: networks trained on opaque walls have no gains behind them."""
         return self.asked is None and self.simulation.trace_settings.through_walls
 
     @property

@@ -16,7 +16,8 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.datasets.home_links import home_sensor, map_area, points_in
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.paper_networks import import_keras, tf
+from sionna_partial.prediction.map_networks import adam_w, turned, turned_offsets
+from sionna_partial.prediction.paper_networks import tf
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
 from sionna_partial.process import core_count
@@ -36,8 +37,7 @@ TRANSMITTERS, RECEIVERS, MARGIN_M = 10, 80, 1.5
 LEAST_UNSEEN_M, LEAST_M, FEWEST_LINES = 0.05, 0.3, 30
 """Unobserved and whole length from which a line counts [m], and number of lines from which a map does."""
 
-LEARNING_RATE, WEIGHT_DECAY, STEPS_OF_TRAINING = 4e-3, 1e-4, 1_400
-"""Of AdamW; the rate falls to 0 along a cosine."""
+STEPS_OF_TRAINING = 1_400
 
 IMAGE_CELLS, IMAGES, LINES = 96, 16, 100
 """Edge of the part of a map that is read [cells], number of them in a gradient step, and of lines in each."""
@@ -115,11 +115,9 @@ def all_lines() -> Iterator[list[Lines]]:
 
 def fit_unseen_walls(maps: list[Lines], steps: int = STEPS_OF_TRAINING, seed: int = 0) -> UnseenWalls:
     """Train by the likelihood of Poisson distributions; the same lines and seed give the same weights."""
-    keras, networks = import_keras(), UnseenWalls.untrained(seed)
-    rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
-    optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
+    networks = UnseenWalls.untrained(seed)
     weights = [weight for network in networks for weight in network.trainable_variables]
-    optimizer.build(weights)
+    optimizer = adam_w(weights, steps)
 
     @bind(tf.function, autograph=False)
     def step(batch: Lines) -> None:
@@ -161,20 +159,12 @@ def _part(lines: Lines, rng: np.random.Generator) -> Lines | None:
     top, left = max(y, 0), max(x, 0)
     known = lines.image[top : min(y + IMAGE_CELLS, ny), left : min(x + IMAGE_CELLS, nx)]
     image[top - y : top - y + known.shape[0], left - x : left - x + known.shape[1]] = known
-    part = lines.taken(rng.choice(rows, LINES))
-    return _turned(part._replace(image=image, start=part.start - corner, end=part.end - corner), int(rng.integers(8)))
-
-
-def _turned(lines: Lines, turn: int) -> Lines:
-    image, ends = lines.image, [lines.start, lines.end]
-    for axis, flag in ((1, turn & 1), (0, turn & 2)):
-        if flag:
-            image = np.flip(image, axis)
-            mirrored = np.arange(2) == 1 - axis
-            ends = [np.where(mirrored, IMAGE_CELLS - end, end) for end in ends]
-    if turn & 4:
-        image, ends = image.transpose(1, 0, 2), [end[:, ::-1] for end in ends]
-    return lines._replace(image=image, start=ends[0], end=ends[1])
+    part, turn = lines.taken(rng.choice(rows, LINES)), int(rng.integers(8))
+    middle = corner + IMAGE_CELLS / 2
+    start, end = (
+        turned_offsets((each - middle).astype(np.float32), turn) + IMAGE_CELLS / 2 for each in (part.start, part.end)
+    )
+    return part._replace(image=turned(image[None], turn)[0], start=start, end=end)
 
 
 if __name__ == "__main__":

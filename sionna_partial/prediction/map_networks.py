@@ -104,28 +104,40 @@ def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
 
 def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
     """Build the networks, untrained, by name; the link network alone without map networks."""
-    keras = import_keras()
-    seeds = itertools.count(1000 * seed + 1)
-
-    def start() -> Any:
-        return keras.initializers.GlorotUniform(seed=next(seeds))
-
+    keras, start = import_keras(), kernel_starts(seed)
     networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
         networks[name] = _map_network(keras, start, name, widths)
     return networks
 
 
+def kernel_starts(seed: int) -> Callable[[], Any]:
+    """Return a function that returns the initial values of one kernel after the other, drawn by `seed`."""
+    keras, seeds = import_keras(), itertools.count(1000 * seed + 1)
+    return lambda: keras.initializers.GlorotUniform(seed=next(seeds))
+
+
 def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[int, ...]) -> "keras.Model":
+    window = keras.Input((*_SQUARE, len(CHANNELS)), name="window", dtype="float32")
+    fractions = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
+    joined = layer(keras, "Concatenate", "all")([u_net(keras, start, fractions, widths), fractions])
+    values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
+    return keras.Model(window, values, name=name)
+
+
+def u_net(keras: Any, start: Callable[[], Any], image: Any, widths: tuple[int, ...]) -> Any:
+    """Return what a U-Net makes of images (B, H, W, C): widths[0] numbers for each of their cells.
+
+    H and W are multiples of 2 ** (len(widths) - 1); `start` returns the initial values of a kernel.
+    """
+
     def convolved(x: Any, units: int, name: str) -> Any:
         options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
         x = layer(keras, "Conv2D", name, units, 3, **options)(x)
         x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
         return layer(keras, "ReLU", f"{name}_active")(x)
 
-    window = keras.Input((*_SQUARE, len(CHANNELS)), name="window", dtype="float32")
-    fractions = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
-    x = convolved(fractions, widths[0], "down_0")
+    x = convolved(image, widths[0], "down_0")
     levels = []
     for depth, units in enumerate(widths[1:], 1):
         levels.append(x)
@@ -135,9 +147,7 @@ def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[
         x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
         x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), widths[depth], f"up_{depth}")
         x = convolved(x, widths[depth], f"up_{depth}_again") if depth else x
-    joined = layer(keras, "Concatenate", "all")([x, fractions])
-    values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
-    return keras.Model(window, values, name=name)
+    return x
 
 
 def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.Model":
@@ -339,21 +349,21 @@ class _Examples:
             batch = {name: column[links] for name, column in self._columns.items()}
             turns = rng.integers(8, size=len(chosen))
             pairs = zip(batch["offsets_m"], turns, strict=True)
-            batch["offsets_m"] = np.stack([_turned_offsets(offset_m, turn) for offset_m, turn in pairs])
+            batch["offsets_m"] = np.stack([turned_offsets(offset_m, turn) for offset_m, turn in pairs])
             if self._windows is not None:
                 images = zip(self._windows[self._used[chosen]], turns, strict=True)
-                batch["windows"] = np.stack([_turned(image, turn) for image, turn in images]).astype(np.float32)
+                batch["windows"] = np.stack([turned(image, turn) for image, turn in images]).astype(np.float32)
             yield batch
 
 
-def _turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
+def turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
     """One of the eight orientations of squares (K, S, S, C)."""
     image = image[:, :, ::-1] if turn & 1 else image
     image = image[:, ::-1] if turn & 2 else image
     return image.transpose(0, 2, 1, 3) if turn & 4 else image
 
 
-def _turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
+def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
     """Offsets (R, 2) from the centre of a window that is turned so [m]."""
     x, y = offsets_m.T
     x = -x if turn & 1 else x
@@ -363,11 +373,8 @@ def _turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.flo
 
 def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     """Return a function that takes one of so many gradient steps and returns the loss."""
-    keras = import_keras()
-    rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
-    optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
-    optimizer.build(weights)  # or TensorFlow traces the step again, after the first has made variables
+    optimizer = adam_w(weights, steps)
 
     def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
         with tf.GradientTape() as tape:
@@ -383,6 +390,15 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
 
     compiled: Callable[..., Any] = tf.function(step, autograph=False, jit_compile=False)
     return compiled
+
+
+def adam_w(weights: Sequence[Any], steps: int) -> Any:
+    """Return the optimizer of so many gradient steps."""
+    keras = import_keras()
+    rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
+    optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
+    optimizer.build(weights)  # or TensorFlow traces the step again, after the first has made variables
+    return optimizer
 
 
 def _crps(errors_db: Any, stds_db: Any) -> Any:

@@ -47,7 +47,7 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
-from sionna_partial.prediction.through_walls import MeanLosses
+from sionna_partial.prediction.through_walls import by_mean_losses
 from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
@@ -187,16 +187,11 @@ class LinkPrediction(Shown):
 
     @classmethod
     def of_mean_losses(cls, phi: LinkFeatures, walls: Floats) -> LinkPrediction:
-        """Return what the mean loss of walls predicts of links through walls, which have a context: `MeanLosses`.
+        """Return what the mean loss of walls predicts of links through walls, which have a context.
 
         `walls` (N,) are the expected numbers of unseen walls on their direct lines.
         """
-        base = MeanLosses.of(phi, walls)
-        means_db, stds_db = (
-            np.concatenate([np.full((1, len(phi)), outage_db), each.T])
-            for outage_db, each in ((GAIN_FLOOR_DB, base.means_db), (0.0, base.stds_db))
-        )
-        return cls.of_parts(base.p.T, means_db, stds_db)
+        return cls.of_parts(*by_mean_losses(phi, walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:

@@ -5,8 +5,6 @@ walls on a direct line. The constants were fitted to procedural homes of one mat
 halls, whose walls lose 2 to 20 dB; `benchmarks/unseen_walls.py` measures others.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from sionna_partial.arrays import Floats
@@ -31,41 +29,27 @@ SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD, LARGEST_STD_DB = 0.5, 0.8, 0.72, 25.0
 links, likewise in losses of a wall [1], and the largest of them [dB]."""
 
 
-class MeanLosses(NamedTuple):
-    """Distributions of N links by the mean loss of walls.
+def by_mean_losses(phi: LinkFeatures, walls: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return probabilities, means and standard deviations of the gain [dB] of links through walls, each (3, N).
 
-    Parameters
-    ----------
-    p : (N, 3) array
-        Probability of each LinkState.
-    means_db, stds_db : (N, 2) arrays
-        Means and standard deviations of the gain given LOS, and given NLOS [dB].
+    They are by LinkState, from the features of N links, which have a context, and the expected numbers of unseen walls
+    on their direct lines (N,). That number has a Poisson distribution: a link that is traced in line of sight has LOS
+    if it is 0.
     """
-
-    p: Floats
-    means_db: Floats
-    stds_db: Floats
-
-    @classmethod
-    def of(cls, phi: LinkFeatures, walls: Floats) -> "MeanLosses":
-        """Predict links (N,) from features of a trace through walls, which have a context, and unseen walls (N,).
-
-        The number of unseen walls on the direct line has a Poisson distribution, whose mean is `walls`. A link that is
-        traced in line of sight has LOS if there are none.
-        """
-        wall_loss_db, los = context_of(phi).wall_loss_db, phi.link_state == LinkState.LOS
-        p_los = np.where(los, np.exp(-walls), 0.0)
-        some = walls / np.maximum(-np.expm1(-walls), np.finfo(float).tiny)
-        count = np.where(los, np.where(walls > 0.0, some, 1.0), np.maximum(walls - FOUND_WALLS, 0.0))
-        loss_db = LOSS_OF_WALL * wall_loss_db * count
-        mean_db = np.maximum(phi.gain_db - loss_db / (1.0 + loss_db / LARGEST_LOSS_DB), GAIN_FLOOR_DB)
-        p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
-        root = np.sqrt(walls)
-        los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root, 0.0)
-        los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root)
-        std_db = np.hypot(SEEN_STD_DB, np.minimum(UNSEEN_STD * wall_loss_db * root, LARGEST_STD_DB))
-        return cls(
-            p=np.stack([p_outage, p_los, 1.0 - p_los - p_outage], axis=1),
-            means_db=np.stack([los_db, mean_db], axis=1),
-            stds_db=np.stack([los_std_db, std_db], axis=1),
-        )
+    wall_loss_db, los = context_of(phi).wall_loss_db, phi.link_state == LinkState.LOS
+    p_los = np.where(los, np.exp(-walls), 0.0)
+    some = walls / np.maximum(-np.expm1(-walls), np.finfo(float).tiny)
+    count = np.where(los, np.where(walls > 0.0, some, 1.0), np.maximum(walls - FOUND_WALLS, 0.0))
+    loss_db = LOSS_OF_WALL * wall_loss_db * count
+    mean_db = np.maximum(phi.gain_db - loss_db / (1.0 + loss_db / LARGEST_LOSS_DB), GAIN_FLOOR_DB)
+    p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
+    root = np.sqrt(walls)
+    los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root, 0.0)
+    los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root)
+    std_db = np.hypot(SEEN_STD_DB, np.minimum(UNSEEN_STD * wall_loss_db * root, LARGEST_STD_DB))
+    nothing = np.zeros(len(walls))
+    return (
+        np.stack([p_outage, p_los, 1.0 - p_los - p_outage]),
+        np.stack([nothing + GAIN_FLOOR_DB, los_db, mean_db]),
+        np.stack([nothing, los_std_db, std_db]),
+    )

@@ -9,7 +9,6 @@ distribution.
 
 import functools
 import io
-import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +23,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, context_of
+from sionna_partial.prediction.map_networks import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer, tf
 from sionna_partial.prediction.windows import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
@@ -45,10 +45,9 @@ _POINTS, _LENGTH_M = 96, 3.0
 _FIRST, _LEAST = -1.5, -4.0
 """What walls per metre begin with in training, and the least number of walls, as logits of a softplus."""
 
-_BORDER_CELLS, _POOLED = 8, 8
+_BORDER_CELLS, _POOLED = 8, 2 ** (len(_WIDTHS) - 1)
 _LINES_AT_ONCE = 16_384
 _MAX_BYTES = 10_000_000
-_STATISTICS_MOMENTUM = 0.9
 
 
 class WallDensity(NamedTuple):
@@ -91,11 +90,7 @@ class UnseenWalls(NamedTuple):
     @classmethod
     def untrained(cls, seed: int = 0) -> Self:
         """Build the networks with random weights."""
-        keras, seeds = import_keras(), itertools.count(1000 * seed + 1)
-
-        def start() -> Any:
-            return keras.initializers.GlorotUniform(seed=next(seeds))
-
+        keras, start = import_keras(), kernel_starts(seed)
         return cls(_cell_network(keras, start), _line_network(keras, start))
 
     @classmethod
@@ -129,22 +124,8 @@ class UnseenWalls(NamedTuple):
 
 
 def _cell_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
-    def convolved(x: Any, units: int, name: str) -> Any:
-        options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
-        x = layer(keras, "Conv2D", name, units, 3, **options)(x)
-        x = layer(keras, "BatchNormalization", f"{name}_normal", momentum=_STATISTICS_MOMENTUM)(x)
-        return layer(keras, "ReLU", f"{name}_active")(x)
-
     image = keras.Input((None, None, 3), name="image", dtype="float32")
-    x, levels = convolved(image, _WIDTHS[0], "down_0"), []
-    for depth, units in enumerate(_WIDTHS[1:], 1):
-        levels.append(x)
-        x = layer(keras, "MaxPooling2D", f"pool_{depth}")(x)
-        x = convolved(convolved(x, units, f"down_{depth}"), units, f"down_{depth}_again")
-    for depth in reversed(range(len(levels))):
-        x = layer(keras, "UpSampling2D", f"grow_{depth}")(x)
-        x = convolved(layer(keras, "Concatenate", f"join_{depth}")([x, levels[depth]]), _WIDTHS[depth], f"up_{depth}")
-        x = convolved(x, _WIDTHS[depth], f"up_{depth}_again") if depth else x
+    x = u_net(keras, start, image, _WIDTHS)
     options = {"kernel_initializer": start(), "bias_initializer": keras.initializers.Constant(_FIRST)}
     return keras.Model(image, layer(keras, "Conv2D", "per_m", 2, 1, activation="softplus", **options)(x), name="cells")
 
