@@ -63,8 +63,8 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
-	@$(BIN)/python -m sionna_partial.path_training sionna_partial/predictors/paths.npz
-	@$(BIN)/python -m sionna_partial.wall_training sionna_partial/predictors/unseen_walls.npz
+	@$(BIN)/python -m sionna_partial.training.paths sionna_partial/predictors/paths.npz
+	@$(BIN)/python -m sionna_partial.training.walls sionna_partial/predictors/unseen_walls.npz
 	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 

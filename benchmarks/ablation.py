@@ -28,7 +28,7 @@ from sionna_partial.evaluation.metrics import DEFINITIONS, Metrics, measure
 from sionna_partial.files import atomic_write
 from sionna_partial.reports import markdown_table
 from sionna_partial.settings import NetworkKind
-from sionna_partial.training import split_homes
+from sionna_partial.training.predictor import split_homes
 
 SEED = 0
 """Of the split of the homes, and of the trainings."""

@@ -36,7 +36,7 @@ from sionna_partial.files import atomic_files
 from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.style import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.simulation.homes import HomeKind
+from sionna_partial.worlds.homes import HomeKind
 
 Homes = dict[str, sp.PartialMap]
 

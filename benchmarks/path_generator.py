@@ -20,8 +20,8 @@ from channel_samples import METHODS, given_homes, score_home
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.path_training import MOST_PATHS, Example, made_examples
 from sionna_partial.prediction.path_model import STATES, PathModel, wrapped
+from sionna_partial.training.paths import MOST_PATHS, Example, made_examples
 
 UNITS, MIXTURES, PASSES, BATCH, RATE = 96, 8, 12, 256, 3e-3
 CONDITIONS, COLUMNS = 8, 6

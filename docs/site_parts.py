@@ -52,7 +52,7 @@ ROOMS = {
     "coverage": "Coverage",
     "export": "Coverage",
     "plots": "Pictures",
-    "simulation": "Homes and robots",
+    "worlds": "Homes and robots",
     "calibration": "Calibration and placement",
     "placement": "Calibration and placement",
     "exploration": "Homes and robots",

@@ -21,8 +21,8 @@ from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.settings import Material, SceneSettings
-from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.worlds.homes import make_home
 
 STEPS = (50, 100, 150, 200)
 

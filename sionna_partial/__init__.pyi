@@ -8,7 +8,8 @@ from sionna_partial.channels.samples import ChannelSamples as ChannelSamples
 from sionna_partial.channels.samples import sample_channels as sample_channels
 from sionna_partial.constants import CellState as CellState
 from sionna_partial.constants import LinkState as LinkState
-from sionna_partial.coverage import predict_map as predict_map
+from sionna_partial.coverage.network import network_map as network_map
+from sionna_partial.coverage.predict import predict_map as predict_map
 from sionna_partial.datasets.dataset import build_dataset as build_dataset
 from sionna_partial.datasets.shards import read_dataset as read_dataset
 from sionna_partial.differentiable.scene import DifferentiableScene as DifferentiableScene
@@ -41,7 +42,6 @@ from sionna_partial.measurements.measurements import Measurements as Measurement
 from sionna_partial.measurements.measurements import load_measurements as load_measurements
 from sionna_partial.measurements.recordings import measurements_from_bag as measurements_from_bag
 from sionna_partial.measurements.recordings import poses_from_bag as poses_from_bag
-from sionna_partial.network import network_map as network_map
 from sionna_partial.placement.placement import TransmitterPlacement as TransmitterPlacement
 from sionna_partial.placement.placement import place_transmitter as place_transmitter
 from sionna_partial.placement.several import NetworkPlacement as NetworkPlacement
@@ -67,7 +67,6 @@ from sionna_partial.settings import PredictorSettings as PredictorSettings
 from sionna_partial.settings import SceneSettings as SceneSettings
 from sionna_partial.settings import SensorSettings as SensorSettings
 from sionna_partial.settings import TraceSettings as TraceSettings
-from sionna_partial.simulation.homes import make_home as make_home
 from sionna_partial.tracing.antennas import Antenna as Antenna
 from sionna_partial.tracing.antennas import AntennaPattern as AntennaPattern
 from sionna_partial.tracing.antennas import dft_codebook as dft_codebook
@@ -77,6 +76,7 @@ from sionna_partial.tracing.gradients import gain_gradients as gain_gradients
 from sionna_partial.tracing.links import TracedLinks as TracedLinks
 from sionna_partial.tracing.simulation import Simulation as Simulation
 from sionna_partial.tracing.simulation import trace_links as trace_links
-from sionna_partial.training import train as train
+from sionna_partial.training.predictor import train as train
+from sionna_partial.worlds.homes import make_home as make_home
 
 __version__: str

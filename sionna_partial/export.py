@@ -13,11 +13,11 @@ from rasterio import Affine
 from rasterio.io import MemoryFile
 
 from sionna_partial.constants import NO_RECEIVER
-from sionna_partial.coverage_map import ANTENNA, ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
+from sionna_partial.coverage.dataset import ANTENNA, ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
+from sionna_partial.coverage.network import VARIABLES, require_network
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5, write_netcdf
 from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
-from sionna_partial.network import VARIABLES, require_network
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
 from sionna_partial.plots.coverage_viewer import coverage_page
 from sionna_partial.plots.style import figure_png

@@ -26,7 +26,7 @@ from sionna_partial.checks import (
     require_names,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
-from sionna_partial.coverage_map import (
+from sionna_partial.coverage.dataset import (
     ANTENNA,
     Receivers,
     coverage_map,

@@ -12,11 +12,11 @@ from predictor_links import arrays
 from scipy.stats import norm
 
 from sionna_partial.constants import NO_RECEIVER, CellState, LinkState
-from sionna_partial.coverage import predict_map
-from sionna_partial.coverage_map import ATTRIBUTES, WALL_PARTS, require_coverage
+from sionna_partial.coverage.dataset import ATTRIBUTES, WALL_PARTS, require_coverage
+from sionna_partial.coverage.link_budget import schemes
+from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.export import load_coverage
-from sionna_partial.link_budget import schemes
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap

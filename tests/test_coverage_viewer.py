@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage_map import ATTRIBUTES, probability_above
+from sionna_partial.coverage.dataset import ATTRIBUTES, probability_above
 from sionna_partial.export import save_coverage
 from sionna_partial.plots.style import STATE_COLOURS
 

@@ -18,8 +18,8 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
-from sionna_partial.simulation.homes import make_home
-from sionna_partial.simulation.robot import FORWARD_M, TURN_DEG
+from sionna_partial.worlds.homes import make_home
+from sionna_partial.worlds.robot import FORWARD_M, TURN_DEG
 
 GIBSON = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson"
 

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from sionna_partial import cli
 from sionna_partial.constants import CellState
+from sionna_partial.coverage.network import network_map
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage, save_network
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.network import network_map
 from sionna_partial.plots.coverage_plot import plot_coverage
 from sionna_partial.plots.style import figure_png
 

@@ -7,7 +7,7 @@ import pytest
 
 from sionna_partial.datasets.home_sources import HomeSource, home_sources
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.simulation.homes import make_home
+from sionna_partial.worlds.homes import make_home
 
 
 @pytest.fixture

@@ -14,8 +14,8 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.simulation.buildings import LARGEST_M
-from sionna_partial.simulation.homes import DOOR_M, LARGE_RESOLUTION_M, STYLES, make_home
+from sionna_partial.worlds.buildings import LARGEST_M
+from sionna_partial.worlds.homes import DOOR_M, LARGE_RESOLUTION_M, STYLES, make_home
 
 SEEDS = 30
 SCENES = Path(__file__).resolve().parents[1] / "scenes"

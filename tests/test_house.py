@@ -40,7 +40,7 @@ ROOMS = {
         ),
         *("drawings", "ifc", "bags", "map_files"),
     ),
-    "simulation": ("furniture", "buildings", "homes", "camera", "robot"),
+    "worlds": ("furniture", "buildings", "homes", "camera", "robot"),
     "scene": ("lines", "outlines", "floor_plan", "scene"),
     "tracing": (
         *("interactions", "slab", "bounds", "paths", "links", "engine"),
@@ -55,12 +55,12 @@ ROOMS = {
         *("paper_networks", "map_networks", "unseen_walls", "predictor_files", "predictor", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
-    "coverage": ("link_budget", "coverage_map", "link_model", "coverage"),
+    "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.predict"),
     "channels": (
         *("responses", "beams", "files"),
         *("joint", "samples"),
     ),
-    "networks": ("network",),
+    "networks": ("coverage.network",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("area", "placement", "several"),
@@ -68,7 +68,7 @@ ROOMS = {
     "live": ("coverage", "topics", "bags", "dds", "rosbridge"),
     "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
     "evaluation": ("metrics", "baselines", "evaluate"),
-    "training": ("training", "path_training", "wall_training"),
+    "training": ("predictor", "paths", "walls"),
     "plots": (
         *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
         *("material_plot", "placement_plot", "evaluation_plot"),
@@ -80,8 +80,8 @@ ROOMS = {
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "networks", "training", "results", "command"}
-"""Rooms whose modules are files of the package itself."""
+FILES = {"foundations", "coverage", "networks", "results", "command"}
+"""Rooms whose modules are given by their full names."""
 
 MODULES = tuple(
     module if room in FILES else f"{room}.{module}" for room, modules in ROOMS.items() for module in modules
@@ -99,7 +99,7 @@ HEAVY = IN_FUNCTIONS | {
 
 HOMES = {
     **dict.fromkeys(["drjit", "mitsuba", "sionna"], ("tracing.", "llvm")),
-    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable.", "training")),
+    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable.", "training.")),
     "matplotlib": ("plots.",),
     "bokeh": ("plots.", "app."),
 }

@@ -18,8 +18,8 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, link_features
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings, TraceSettings
-from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.worlds.homes import make_home
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 DEPTH = 4

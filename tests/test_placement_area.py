@@ -7,7 +7,7 @@ from placement_cases import TWO_ROOMS, home
 from predictor_links import QUIET, make_links
 
 from sionna_partial.constants import CellState
-from sionna_partial.coverage import predict_map
+from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area

@@ -30,7 +30,7 @@ from sionna_partial.scene.scene import (
     write_scene,
 )
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
-from sionna_partial.simulation.homes import make_home
+from sionna_partial.worlds.homes import make_home
 
 ROOM = """
     ????????????

@@ -13,7 +13,7 @@ from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
-from sionna_partial.training import split_homes, train
+from sionna_partial.training.predictor import split_homes, train
 
 pytestmark = QUIET
 

@@ -7,7 +7,7 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
-from sionna_partial.wall_training import Lines, fit_unseen_walls, lines_of
+from sionna_partial.training.walls import Lines, fit_unseen_walls, lines_of
 
 WALLS_PER_M = 0.37
 WIFI = sp.TraceSettings(5e9, max_depth=1)

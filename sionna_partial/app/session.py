@@ -32,7 +32,8 @@ from sionna_partial.constants import (
     POINT_SUFFIXES,
     CellState,
 )
-from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION
+from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
+from sionna_partial.coverage.network import network_map
 from sionna_partial.errors import MapError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
@@ -42,7 +43,6 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import read_ros_map
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, load_measurements
-from sionna_partial.network import network_map
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.prediction.predictor import LinkPrediction

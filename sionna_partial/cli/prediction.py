@@ -203,7 +203,7 @@ def network(
     memory: opt.Memory = MEMORY_GB,
 ) -> None:
     """Predict best server, SINR and rate of several transmitters on a partial map."""
-    from sionna_partial.link_budget import LinkBudget, transmit_powers_dbm
+    from sionna_partial.coverage.link_budget import LinkBudget, transmit_powers_dbm
 
     positions = [(*opt.parse_position(each), DEFAULT_HEIGHT_M)[:3] for each in tx]
     powers_dbm = transmit_powers_dbm(tx_power[0] if len(tx_power) == 1 else tx_power, len(positions))
@@ -306,7 +306,7 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     """Return positions (N, 3) in free cells [m]."""
     import numpy as np
 
-    from sionna_partial.coverage_map import grid_axes
+    from sionna_partial.coverage.dataset import grid_axes
 
     x_m, y_m = np.meshgrid(*grid_axes(partial, spacing_m))
     grid_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, height_m)])

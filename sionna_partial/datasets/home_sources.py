@@ -11,7 +11,7 @@ from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import HOME_KINDS, HomeKind
-from sionna_partial.simulation.homes import make_home
+from sionna_partial.worlds.homes import make_home
 
 Home = int | tuple[int, HomeKind | None] | str | os.PathLike[str]
 """Seed of `make_home`, seed and kind, or path of a complete map or of a folder of them."""

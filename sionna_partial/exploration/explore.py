@@ -21,7 +21,7 @@ from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.progress import reporting
 from sionna_partial.settings import Policy, SensorSettings
-from sionna_partial.simulation.robot import Choice, Robot
+from sionna_partial.worlds.robot import Choice, Robot
 
 MAX_STEPS = 100_000
 """Largest number of actions: many times what a large building takes."""

@@ -27,7 +27,7 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage_map import ANTENNA, TX_COORDINATES, probability_above
+from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, probability_above
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
@@ -39,8 +39,9 @@ from sionna_partial.planar import largest_part
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
-from sionna_partial.simulation.camera import unknown_in_view
-from sionna_partial.simulation.robot import (
+from sionna_partial.tracing.simulation import Simulation, clear_of_walls
+from sionna_partial.worlds.camera import unknown_in_view
+from sionna_partial.worlds.robot import (
     FORWARD_M,
     ROBOT_RADII_M,
     Choice,
@@ -49,7 +50,6 @@ from sionna_partial.simulation.robot import (
     find_frontiers,
     wide_frontiers,
 )
-from sionna_partial.tracing.simulation import Simulation, clear_of_walls
 
 GOALS = ("coverage", "state", "area")
 """What is to become known; the first is the default."""

@@ -28,7 +28,7 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage_map import probability_above
+from sionna_partial.coverage.dataset import probability_above
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel

@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.coverage_map import (
+from sionna_partial.coverage.dataset import (
     TX_COORDINATES,
     WALL_PARTS,
     probability_above,
@@ -28,8 +28,8 @@ from sionna_partial.coverage_map import (
     transmitter_text,
     transmitters_of,
 )
+from sionna_partial.coverage.network import require_network
 from sionna_partial.measurements.localisation import likely_region
-from sionna_partial.network import require_network
 from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, server_colours, shade, sheet_columns
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")

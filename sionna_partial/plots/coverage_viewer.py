@@ -12,7 +12,7 @@ import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, Normalize, to_hex
 
-from sionna_partial.coverage_map import COMPONENTS, DISTRIBUTION, transmitters_of
+from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION, transmitters_of
 from sionna_partial.plots.coverage_plot import (
     Layer,
     coverage_layers,

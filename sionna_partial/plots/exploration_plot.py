@@ -20,7 +20,7 @@ from PIL import Image
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
-from sionna_partial.coverage import predict_map
+from sionna_partial.coverage.predict import predict_map
 from sionna_partial.exploration.explore import Exploration
 from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path
@@ -41,7 +41,7 @@ from sionna_partial.plots.style import (
     sheet_columns,
     window_m,
 )
-from sionna_partial.simulation.camera import view_corners_m
+from sionna_partial.worlds.camera import view_corners_m
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
 """Time of a frame of an animation, and of its last one [ms]."""

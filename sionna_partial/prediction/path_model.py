@@ -3,7 +3,7 @@
 A small network gives the probability that a path traced on a partial map exists in the building. What the trace lacks
 is taken from similar links of the same link state in homes of `make_home`: their paths that a
 partial map did not show, turned to the direct line of the link (the method of analogues; Lorenz, Atmospheric
-Predictability as Revealed by Naturally Occurring Analogues, 1969). `path_training` makes both.
+Predictability as Revealed by Naturally Occurring Analogues, 1969). `training.paths` makes both.
 """
 
 import io

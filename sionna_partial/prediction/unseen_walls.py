@@ -3,7 +3,7 @@
 A U-Net (Ronneberger, Fischer and Brox 2015) reads the map and estimates the walls of each unknown cell: how many a line
 along x, and one along y, meets on a metre. The integral over the unknown part of a line is what a second network
 corrects by the lengths of the line and its known walls. They were trained on lines in procedural buildings, in which
-walls are counted without tracing anything further (`wall_training`). The number of walls has about a Poisson
+walls are counted without tracing anything further (`training.walls`). The number of walls has about a Poisson
 distribution.
 """
 

@@ -20,9 +20,9 @@ from sionna_partial.checks import (
     require_whole,
 )
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.coverage_map import ANTENNA, COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
+from sionna_partial.coverage.dataset import ANTENNA, COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
+from sionna_partial.coverage.link_budget import LinkBudget, transmit_powers_dbm
 from sionna_partial.errors import SettingsError
-from sionna_partial.link_budget import LinkBudget, transmit_powers_dbm
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
 

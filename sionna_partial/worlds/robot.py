@@ -19,7 +19,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
 from sionna_partial.planar import grid_edges, largest_part
 from sionna_partial.settings import SensorSettings
-from sionna_partial.simulation.camera import Camera
+from sionna_partial.worlds.camera import Camera
 
 WIDE_M = 0.35
 """Length of a frontier that is about as wide as a robot [m]."""

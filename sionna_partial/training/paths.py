@@ -22,10 +22,10 @@ from sionna_partial.prediction.path_model import (
     survival_inputs,
     wrapped,
 )
-from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.antennas import directions
 from sionna_partial.tracing.links import TracedLinks, path_gain_db
 from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.worlds.homes import make_home
 
 ANALOGUES_OF_STATE = 3_000
 """Number of links with LOS, and of links without, whose paths are kept."""

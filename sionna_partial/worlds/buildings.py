@@ -10,7 +10,7 @@ import shapely
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split
 
-from sionna_partial.simulation.furniture import Rng, log_uniform, parts_of, union_of
+from sionna_partial.worlds.furniture import Rng, log_uniform, parts_of, union_of
 
 LARGEST_M = (100.0, 60.0)
 """Length and width of the largest building [m]."""

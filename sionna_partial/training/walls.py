@@ -22,8 +22,8 @@ from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
 from sionna_partial.process import core_count
 from sionna_partial.settings import DatasetSettings, HomeKind, Material, SceneSettings, TraceSettings
-from sionna_partial.simulation.homes import make_home
 from sionna_partial.tracing.simulation import Simulation, nearest_m
+from sionna_partial.worlds.homes import make_home
 
 CAMERA, ROBOTS, LARGE = (500_000, 350), (530_000, 200), (520_000, 60)
 """First seeds and numbers of homes explored by a camera, by robots of their own, and of floors and halls likewise."""

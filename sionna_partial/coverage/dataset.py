@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import number_of, real_array, require, require_names, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
+from sionna_partial.coverage.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
