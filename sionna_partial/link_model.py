@@ -25,7 +25,7 @@ from sionna_partial.checks import (
     require_memory,
     require_names,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState, LinkState
 from sionna_partial.coverage.dataset import (
     ANTENNA,
     Receivers,
@@ -41,10 +41,10 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
-    SAME_TX_M,
     Measurements,
     measurements_of_each,
     measurements_of_others,
+    nearest_transmitters,
 )
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
@@ -95,11 +95,21 @@ _log = logging.getLogger(__name__)
 
 
 class PredictedLinks(NamedTuple):
-    """Features and prediction of links to N receivers that are indoors, and P(indoor) (N,)."""
+    """Features and prediction of links to N receivers that are indoors, and P(indoor) (N,).
+
+    `prediction` lacks the gain `antenna_db` (N,) of the transmitter's antenna: measurements are compared without it.
+    """
 
     phi: LinkFeatures
     prediction: LinkPrediction
+    antenna_db: Floats
     p_indoor: Floats
+
+    def amplified(self, gain_db: float) -> PredictedLinks:
+        """Return the links of an antenna with that gain in all directions [dB]."""
+        has_path = self.phi.link_state != LinkState.OUTAGE
+        traced_db = np.where(has_path, np.maximum(self.phi.gain_db + gain_db, GAIN_FLOOR_DB), self.phi.gain_db)
+        return self._replace(phi=replace(self.phi, gain_db=traced_db), antenna_db=self.antenna_db + gain_db)
 
 
 class LinkModel:
@@ -153,7 +163,7 @@ class LinkModel:
         if isinstance(scene, Simulation):
             self._settings = scene.trace_settings, scene.scene_settings
         self.asked = predictor
-        self._latest: dict[tuple[bytes, bytes, Antenna], PredictedLinks] = {}
+        self._latest: dict[tuple[bytes, bytes, Antenna, bool], PredictedLinks] = {}
         self._windows: dict[bytes, NDArray[np.uint8]] = {}
         if predictor is not None:
             warm_predictor(predictor)
@@ -275,27 +285,39 @@ class LinkModel:
         return self.predictor.predict(phi).where(complete, trace)
 
     def links(
-        self, tx_m: Floats, rx_m: Floats, report: Progress = no_progress, antenna: Antenna | None = None
+        self,
+        tx_m: Floats,
+        rx_m: Floats,
+        report: Progress = no_progress,
+        antenna: Antenna | None = None,
+        *,
+        at_rx: bool = False,
     ) -> PredictedLinks:
-        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept."""
+        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept.
+
+        With `at_rx` the antenna is at the receivers.
+        """
         antenna = Antenna.of(antenna)
-        key = tx_m.tobytes(), rx_m.tobytes(), antenna
+        if antenna.uniform_gain_dbi:
+            return self.links(tx_m, rx_m, report).amplified(antenna.uniform_gain_dbi)
+        key = tx_m.tobytes(), rx_m.tobytes(), antenna, at_rx
         if key not in self._latest:
-            self._latest[key] = self._new_links(tx_m, rx_m, report, antenna)
+            self._latest[key] = self._new_links(tx_m, rx_m, report, antenna, at_rx)
             _drop_oldest(self._latest)
         return self._latest[key]
 
-    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna) -> PredictedLinks:
-        if antenna.is_isotropic:
+    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna, at_rx: bool) -> PredictedLinks:
+        if antenna.uniform_gain_dbi is not None:
             phi, prediction, complete = self.predict_each([(tx_m, rx_m)], report)
+            antenna_db = np.zeros(len(phi))
         else:
-            sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m)
+            sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m, at_rx=at_rx)
             paths = sums.added(self._every_path.blocks(tx_m, rx_m, report, polarisations=2))
             phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
-            phi, prediction = sums.predict(phi, prediction, complete)
+            phi, prediction, antenna_db = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         known = self.partial.state_at(rx_m) != CellState.UNKNOWN
-        return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor))
+        return PredictedLinks(phi, prediction, antenna_db, np.where(known, 1.0, p_indoor))
 
     def coverage(
         self,
@@ -321,6 +343,8 @@ class LinkModel:
         to_be_found = tx is None and measurements is not None
         names, positions_m = (None, np.empty((0, 3))) if to_be_found else transmitter_positions(self.partial, tx)
         antennas = antennas_of(tx_antenna, names)
+        for antenna in {*antennas}:
+            antenna.warn_of_frequency(frequency_hz)
         sources_m = [positions_m] if to_be_found else [each[None] for each in positions_m]
         grids = [grid_receivers(self.partial, tx_m, rx_height_m, spacing_m, frequency_hz) for tx_m in sources_m]
         at_once = _receivers_at_once(self.partial, grids[0], memory_gb)
@@ -331,14 +355,16 @@ class LinkModel:
         maps = []
         with reporting(progress) as report:
             report(0.0, "building the scene")
-            others = [] if to_be_found or measurements is None else _others(self, sources_m, measurements, at_once)
+            others: list[list[Assimilation]] = [[] for _ in sources_m]
+            if measurements is not None and not to_be_found:
+                others = _others(self, sources_m, antennas, measurements, at_once)
             for number, (tx_m, grid, measured) in enumerate(zip(sources_m, grids, measured_of_each, strict=True)):
                 antenna = antennas[number]
                 part = part_of(report, number / len(grids), (number + 1) / len(grids))
                 posterior = (
                     _located(self, measured, at_once, antenna, part) if to_be_found and measured is not None else None
                 )
-                source = _transmitter_of(self, posterior or tx_m[0], measured, at_once, antenna, others)
+                source = _transmitter_of(self, posterior or tx_m[0], measured, at_once, antenna, others[number])
                 if posterior is not None:
                     positions_m = source.tx_m
                     grid = grid_receivers(self.partial, positions_m, rx_height_m, spacing_m, frequency_hz)
@@ -456,24 +482,29 @@ def _averaged(
                 report(min(0.99, begin + (1.0 - begin) * done), message)
 
             links = model.links(each_m, block_m, within, transmitter.antenna)
+            predicted = links.prediction
             if transmitter.assimilations:
-                updated = transmitter.assimilations[index].update(block_m, links.prediction)
-                links = links._replace(prediction=updated)
-            found.append(links)
+                predicted = transmitter.assimilations[index].update(block_m, predicted)
+            found.append(
+                links._replace(
+                    prediction=predicted.amplified(links.antenna_db) if links.antenna_db.any() else predicted
+                )
+            )
         mixture = LinkPrediction.mixture([links.prediction for links in found], transmitter.weights)
         p_indoor = transmitter.weights @ [links.p_indoor for links in found]
         yield found[nearest]._replace(prediction=mixture, p_indoor=p_indoor)
 
 
 def _prior(
-    model: LinkModel, tx_m: Floats, rx_m: Floats, at_once: int, antenna: Antenna
-) -> tuple[LinkPrediction, Floats]:
-    """Predict the links to any number of receivers (N, 3) [m], and the probability that each is indoors."""
+    model: LinkModel, tx_m: Floats, rx_m: Floats, at_once: int, antenna: Antenna, *, at_rx: bool = False
+) -> tuple[LinkPrediction, Floats, Floats]:
+    """Predict the links to any number of receivers (N, 3) [m] without the antenna, its gain, and P(indoor) of each."""
     blocks = [
-        model.links(tx_m, rx_m[start : start + at_once], no_progress, antenna) for start in range(0, len(rx_m), at_once)
+        model.links(tx_m, rx_m[start : start + at_once], no_progress, antenna, at_rx=at_rx)
+        for start in range(0, len(rx_m), at_once)
     ]
-    p_indoor = np.concatenate([links.p_indoor for links in blocks])
-    return LinkPrediction.concatenate([links.prediction for links in blocks]), p_indoor
+    antenna_db, p_indoor = (np.concatenate(parts) for parts in zip(*(links[2:] for links in blocks), strict=True))
+    return LinkPrediction.concatenate([links.prediction for links in blocks]), antenna_db, p_indoor
 
 
 def _located(
@@ -485,8 +516,8 @@ def _located(
     def allowed(points_m: Floats) -> Bools:
         return clear_of_walls(model.partial, points_m) & (measured_at.query(points_m)[0] >= limit_m)
 
-    def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:
-        return _prior(model, tx_m, rx_m, at_once, antenna)
+    def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats, Floats]:
+        return _prior(model, tx_m, rx_m, at_once, antenna, at_rx=True)
 
     return locate_transmitter(model.partial, measured, allowed, predict, part_of(report, 0.0, _LOCATING))
 
@@ -501,7 +532,7 @@ def _transmitter_of(
 ) -> _Transmitter:
     """Assimilate the measurements for a position (3,) [m], or for several that are drawn from a posterior.
 
-    Of the others in the building, what their measurements have in common is known.
+    `others` are other transmitters of the building: their measurements give the prior of offset and shadow scale.
     """
     if isinstance(where, TransmitterPosterior):
         (tx_m, weights, p_powers), position_m = where.draw(POSITIONS), where.position_m
@@ -516,9 +547,8 @@ def _transmitter_of(
     assimilations = []
     if measured is not None:
         for each_m, each_p in zip(tx_m, p_powers, strict=True):
-            elsewhere = [each for each in others if np.linalg.norm(each.tx_m - each_m) > SAME_TX_M]
             assimilations.append(
-                _assimilated(model, each_m, measured, at_once, antenna, p_powers=each_p, others=elsewhere)
+                _assimilated(model, each_m, measured, at_once, antenna, p_powers=each_p, others=others)
             )
     return _Transmitter(tx_m, weights, assimilations, position_m, antenna)
 
@@ -527,26 +557,44 @@ def _assimilated(
     model: LinkModel, tx_m: Floats, measured: Measurements, at_once: int, antenna: Antenna, **options: Any
 ) -> Assimilation:
     """Predict the measured links of a transmitter (3,) [m], and fit the process to them."""
-    prior, _ = _prior(model, tx_m, measured.rx, at_once, antenna)
+    prior, antenna_db, _ = _prior(model, tx_m, measured.rx, at_once, antenna)
     settings = model.simulation.trace_settings
     return Assimilation.fit(
         model.partial,
         tx_m,
         measured,
         prior,
+        antenna_db=antenna_db,
         frequency_hz=settings.frequency_hz,
         through_walls=settings.through_walls,
         **options,
     )
 
 
-def _others(model: LinkModel, sources_m: Sequence[Floats], measurements: Any, at_once: int) -> list[Assimilation]:
-    """Assimilate what was measured of other transmitters, each alone; where walls are opaque it teaches nothing."""
+def _others(
+    model: LinkModel, sources_m: Sequence[Floats], antennas: Sequence[Antenna], measurements: Any, at_once: int
+) -> list[list[Assimilation]]:
+    """Assimilate the measurements of other transmitters, each alone, for each transmitter at (1, 3) [m].
+
+    They are not used where walls are opaque. A transmitter that is predicted has its own antenna. The antenna of any
+    other one is taken to be like the antenna of the transmitter that it is used for, in an unknown orientation.
+    """
+    of_each: list[list[Assimilation]] = [[] for _ in sources_m]
     if not model.simulation.trace_settings.through_walls:
-        return []
+        return of_each
     frequency_hz = model.simulation.trace_settings.frequency_hz
     others = measurements_of_others(model.partial, sources_m, measurements, frequency_hz)
-    return [_assimilated(model, each.tx[0], each, at_once, Antenna()) for each in others]
+    owned = nearest_transmitters(np.reshape([each.tx[0] for each in others], (-1, 3)), sources_m)
+    averaged = {antenna: antenna.averaged(frequency_hz) for antenna in {*antennas}} if others else {}
+    fitted: dict[tuple[int, Antenna], Assimilation] = {}
+    for number, (found, antenna) in enumerate(zip(of_each, antennas, strict=True)):
+        for at in np.flatnonzero(~owned[number]).tolist():
+            its_antenna = antennas[owned[:, at].argmax()] if owned[:, at].any() else averaged[antenna]
+            key = at, its_antenna
+            if key not in fitted:
+                fitted[key] = _assimilated(model, others[at].tx[0], others[at], at_once, its_antenna)
+            found.append(fitted[key])
+    return of_each
 
 
 def _measurement_attributes(measured: Measurements, source: _Transmitter) -> dict[str, Any]:
