@@ -2,6 +2,7 @@
 
 import inspect
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,18 @@ def test_a_warm_model_keeps_antennas_apart() -> None:
     model.update(_half_seen_room())
     fresh = sp.predict_map(_half_seen_room(), TX, spacing_m=1.0, tx_antenna=SECTOR, trace_settings=settings)
     xr.testing.assert_identical(model.coverage(TX, spacing_m=1.0, tx_antenna=SECTOR), fresh)
+
+
+def test_links_are_traced_from_either_end() -> None:
+    """Localisation traces from the measured positions: the antenna is then where paths arrive."""
+    model = sp.LinkModel(_room(), trace_settings=sp.TraceSettings(max_depth=DEPTH, diffraction=False))
+    tx_m, rx_m = np.array(TX), np.array([[1.6, 1.2, 1.5], [4.2, 3.3, 1.2]])
+    there = model.links(tx_m, rx_m, antenna=SECTOR)
+    back = [model.links(each_m, tx_m[None], antenna=SECTOR, at_rx=True) for each_m in rx_m]
+    for name in ("phi.gain_db", "antenna_db"):
+        found, expected = (list(map(attrgetter(name), each)) for each in (back, [there]))
+        np.testing.assert_allclose(np.ravel(found), expected[0], atol=1e-3)
+    assert np.ptp(there.antenna_db) > 4.0
 
 
 def test_one_antenna_for_each_transmitter(tmp_path: Path) -> None:
