@@ -18,7 +18,7 @@ one transmitter in each home, the coverage averaged over the posterior is compar
 
 import argparse
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,11 +29,10 @@ import sionna_partial as sp
 from sionna_partial.evaluation.baselines import Baselines, nothing_seen
 from sionna_partial.evaluation.metrics import measure
 from sionna_partial.measurements.assimilation import Assimilation
-from sionna_partial.measurements.localisation import likely_region, locate_transmitter
+from sionna_partial.measurements.localisation import Predict, likely_region, locate_transmitter
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.tracing.simulation import clear_of_walls
 
-Predict = Callable[[NDArray[np.float64], NDArray[np.float64]], tuple[sp.LinkPrediction, NDArray[np.float64]]]
 Links = tuple[sp.LinkPrediction, NDArray[np.uint8], NDArray[np.float64]]
 
 FIRST_SEED = 300_000
@@ -246,7 +245,7 @@ def prediction_from(partial: sp.PartialMap) -> Predict:
         if key not in kept:
             phi = sp.link_features(partial, sp.trace_links(partial, place_m, points_m, progress=False))
             free = partial.state_at(points_m) == sp.CellState.FREE
-            kept[key] = model.predict(phi), np.where(free, 1.0, model.predict_indoor(phi))
+            kept[key] = model.predict(phi), np.zeros(len(phi)), np.where(free, 1.0, model.predict_indoor(phi))
         return kept[key]
 
     return predict

@@ -212,8 +212,11 @@ def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
 
 def read_columns(
     path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Mapping[str, str], remedy: str
-) -> dict[str, list[float]]:
-    """Return columns of a CSV by name, or raise an `error`; `names` has a name for each header, in lower case."""
+) -> tuple[dict[str, list[float]], list[str]]:
+    """Return columns of a CSV by name, and the other headers, or raise an `error`.
+
+    `names` has a name for each known header, in lower case.
+    """
     given = f"{field} = '{path}'"
     try:
         text = read_bytes(path, field, error, MAX_CSV_BYTES, "leave lines out.").decode("utf-8-sig")
@@ -233,7 +236,7 @@ def read_columns(
 
 def _columns(
     given: str, rows: Any, error: type[SionnaPartialError], names: Mapping[str, str]
-) -> dict[str, list[float]]:
+) -> tuple[dict[str, list[float]], list[str]]:
     header = [name.strip() for name in next(rows, [])]
     commas = "separate columns by commas, and write decimal points."
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
@@ -256,7 +259,9 @@ def _columns(
                 raise error(
                     f"{given}, line {rows.line_num}: {name} = {text[:80]!r} is not a number: {meant}"
                 ) from cause
-    return found
+    if found and not any(found.values()):
+        raise error(f"{given} has a header and no rows: check that it was written completely.")
+    return found, [name for name in header if name.lower() not in names]
 
 
 @contextmanager

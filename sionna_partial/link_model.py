@@ -20,7 +20,7 @@ from sionna_partial.checks import (
     no_progress,
     require,
 )
-from sionna_partial.constants import CellState
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import later
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
@@ -52,13 +52,21 @@ _log = logging.getLogger(__name__)
 class PredictedLinks(NamedTuple):
     """Features and prediction of links to N receivers that are indoors, P(indoor), and whether each is complete (N,).
 
-    A complete link meets nothing unknown: its trace is its prediction.
+    A complete link meets nothing unknown: its trace is its prediction. `prediction` lacks the gain `antenna_db` (N,) of
+    the transmitter's antenna, because measurements are compared without it.
     """
 
     phi: LinkFeatures
     prediction: LinkPrediction
+    antenna_db: Floats
     p_indoor: Floats
     complete: Bools
+
+    def amplified(self, gain_db: float) -> PredictedLinks:
+        """Return the links of an antenna with that gain in all directions [dB]."""
+        has_path = self.phi.link_state != LinkState.OUTAGE
+        traced_db = np.where(has_path, np.maximum(self.phi.gain_db + gain_db, GAIN_FLOOR_DB), self.phi.gain_db)
+        return self._replace(phi=replace(self.phi, gain_db=traced_db), antenna_db=self.antenna_db + gain_db)
 
 
 class LinkModel:
@@ -109,7 +117,7 @@ class LinkModel:
     ) -> None:
         self.simulation = simulation_of(scene, trace_settings, scene_settings)
         self.asked = predictor
-        self._latest: dict[tuple[bytes, bytes, Antenna], PredictedLinks] = {}
+        self._latest: dict[tuple[bytes, bytes, Antenna, bool], PredictedLinks] = {}
         self._windows: dict[bytes, NDArray[np.uint8]] = {}
         if predictor is not None:
             warm_predictor(predictor)
@@ -236,27 +244,39 @@ class LinkModel:
         return self.predictor.predict(phi).where(complete, trace)
 
     def links(
-        self, tx_m: Floats, rx_m: Floats, report: Progress = no_progress, antenna: Antenna | None = None
+        self,
+        tx_m: Floats,
+        rx_m: Floats,
+        report: Progress = no_progress,
+        antenna: Antenna | None = None,
+        *,
+        at_rx: bool = False,
     ) -> PredictedLinks:
-        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept."""
+        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept.
+
+        With `at_rx` the antenna is at the receivers.
+        """
         antenna = Antenna.of(antenna)
-        key = tx_m.tobytes(), rx_m.tobytes(), antenna
+        if antenna.uniform_gain_dbi:
+            return self.links(tx_m, rx_m, report).amplified(antenna.uniform_gain_dbi)
+        key = tx_m.tobytes(), rx_m.tobytes(), antenna, at_rx
         if key not in self._latest:
-            self._latest[key] = self._new_links(tx_m, rx_m, report, antenna)
+            self._latest[key] = self._new_links(tx_m, rx_m, report, antenna, at_rx)
             _drop_oldest(self._latest)
         return self._latest[key]
 
-    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna) -> PredictedLinks:
-        if antenna.is_isotropic:
+    def _new_links(self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna, at_rx: bool) -> PredictedLinks:
+        if antenna.uniform_gain_dbi is not None:
             phi, prediction, complete = self.predict_each([(tx_m, rx_m)], report)
+            antenna_db = np.zeros(len(phi))
         else:
-            sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m)
+            sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m, at_rx=at_rx)
             paths = sums.added(self._every_path.blocks(tx_m, rx_m, report, polarisations=2))
             phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
-            phi, prediction = sums.predict(phi, prediction, complete)
+            phi, prediction, antenna_db = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         known = self.partial.state_at(rx_m) != CellState.UNKNOWN
-        return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor), complete)
+        return PredictedLinks(phi, prediction, antenna_db, np.where(known, 1.0, p_indoor), complete)
 
     def coverage(self, tx: ArrayLike | Mapping[str, ArrayLike] | None = None, **options: Any) -> xr.Dataset:
         """Predict links everywhere on the map: `predict_map` of this model, with the same options."""

@@ -2,6 +2,7 @@
 
 import inspect
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,8 @@ TX, DEPTH = (1.03, 2.93, 1.4), 2
 SECTOR = sp.Antenna("tr38901", azimuth_deg=-70.0, downtilt_deg=25.0)
 PANEL = sp.Antenna("tr38901", azimuth_deg=200.0, downtilt_deg=-10.0, rows=2, columns=4, beam=5)
 LINES = "".join(f"{angle} {min(30.0, 12 * (min(angle, 360 - angle) / 65) ** 2):.2f}\n" for angle in range(360))
-MSI = f"NAME made\nGAIN 12.0 dBd\nTILT ELECTRICAL\nHORIZONTAL 360\n{LINES}VERTICAL 360\n{LINES}"
+QUARTER = "".join(LINES.splitlines(keepends=True)[:91])
+MSI = f"NAME made\nGAIN 5.0 dBd\nTILT ELECTRICAL\nHORIZONTAL 360\n{LINES}VERTICAL 360\n{LINES}"
 
 
 def coverage_of(partial: sp.PartialMap, antenna: Any = None, **options: Any) -> xr.Dataset:
@@ -88,6 +90,18 @@ def test_a_warm_model_keeps_antennas_apart() -> None:
     xr.testing.assert_identical(model.coverage(TX, spacing_m=1.0, tx_antenna=SECTOR), fresh)
 
 
+def test_links_are_traced_from_either_end() -> None:
+    """Localisation traces from the measured positions: the antenna is then where paths arrive."""
+    model = sp.LinkModel(_room(), trace_settings=sp.TraceSettings(max_depth=DEPTH, diffraction=False))
+    tx_m, rx_m = np.array(TX), np.array([[1.6, 1.2, 1.5], [4.2, 3.3, 1.2]])
+    there = model.links(tx_m, rx_m, antenna=SECTOR)
+    back = [model.links(each_m, tx_m[None], antenna=SECTOR, at_rx=True) for each_m in rx_m]
+    for name in ("phi.gain_db", "antenna_db"):
+        found, expected = (list(map(attrgetter(name), each)) for each in (back, [there]))
+        np.testing.assert_allclose(np.ravel(found), expected[0], atol=1e-3)
+    assert np.ptp(there.antenna_db) > 4.0
+
+
 def test_one_antenna_for_each_transmitter(tmp_path: Path) -> None:
     antennas = {"a": SECTOR, "b": None}
     tx = {"a": TX, "b": (4.5, 1.0, 1.4)}
@@ -105,9 +119,9 @@ def test_one_antenna_for_each_transmitter(tmp_path: Path) -> None:
 
 def test_an_msi_file_is_the_pattern_that_it_lists(tmp_path: Path) -> None:
     path = tmp_path / "made.msi"
-    path.write_text(MSI.replace("GAIN 12.0 dBd", "GAIN 12.0").replace("\n90 23.01\n", "\n90 5.0\n"), encoding="ascii")
-    read, sector = sp.load_antenna(path), sp.AntennaPattern.sector(14.15)
-    assert (read.name, read.gain_dbi) == ("made", 14.15)
+    path.write_text(MSI.replace("GAIN 5.0 dBd", "GAIN 5.0").replace("\n90 23.01\n", "\n90 5.0\n"), encoding="ascii")
+    read, sector = sp.load_antenna(path), sp.AntennaPattern.sector(7.15)
+    assert (read.name, read.gain_dbi) == ("made", 7.15)
     expected_db = sector.horizontal_db.copy()
     expected_db[270] = 5.0
     np.testing.assert_allclose(read.horizontal_db, expected_db, atol=0.006)  # clockwise in the file
@@ -115,28 +129,74 @@ def test_an_msi_file_is_the_pattern_that_it_lists(tmp_path: Path) -> None:
     antenna = sp.Antenna(read, azimuth_deg=30.0, downtilt_deg=20.0)
     at_rad = np.radians([[110.0, 30.0], [90.0, 30.0], [110.0, -60.0]])
     gain_dbi = 10 * np.log10(antenna.gain(at_rad, 28e9))
-    assert gain_dbi[:2] == pytest.approx([14.15, 14.15 - 12 * (20 / 65) ** 2], abs=0.02)
+    assert gain_dbi[:2] == pytest.approx([7.15, 7.15 - 12 * (20 / 65) ** 2], abs=0.02)
 
 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("GAIN 12.0 dBd", "GAIN nan", "GAIN = 'nan'"),
-        ("GAIN 12.0 dBd", "GAIN 1 furlong", "dBd or dBi"),
-        ("GAIN 12.0 dBd", "GAIN 999 dBi", "gain_dbi = 999"),
-        ("GAIN 12.0 dBd\n", "", r"without = \['GAIN'\]"),
+        ("GAIN 5.0 dBd", "GAIN nan", "GAIN = 'nan'"),
+        ("GAIN 5.0 dBd", "GAIN 1 furlong", "dBd or dBi"),
+        ("GAIN 5.0 dBd", "GAIN 999 dBi", "gain_dbi = 999"),
+        ("GAIN 5.0 dBd\n", "", r"without = \['GAIN'\]"),
         ("VERTICAL 360", "VERTICAL 999999999", "2 to 3600"),
         ("VERTICAL 360", "VERTICAL 361", "361 lines"),
         ("\n10 0.28", "\n10 -3", "vertical_db|horizontal_db"),
         ("\n10 0.28", "\n10 inf", "increasing"),
         ("\n10 0.28", "\n9 0.28", "increasing"),
         ("HORIZONTAL", "\0\x1b[31m", "HORIZONTAL"),
+        ("GAIN 5.0 dBd", "GAIN 25.0 dBi", "gain_dbi = 25.0 .* would radiate 32.9 times the power that it is fed"),
+        ("GAIN 5.0 dBd\n", "GAIN 5.0 dBd\nGAIN 3.0 dBd\n", "GAIN is there twice: keep one"),
+        ("VERTICAL 360", f"VERTICAL 360\n{LINES}VERTICAL 360", "VERTICAL is there twice"),
+        ("TILT", "POLARIZATION H\nTILT", "POLARIZATION = 'H' .* horizontally polarised"),
+        ("TILT", "POLARISATION Horizontal\nTILT", "horizontally polarised"),
+        (f"VERTICAL 360\n{LINES}", f"VERTICAL 91\n{QUARTER}", "0 to 90 degrees, with a gap of 270 degrees"),
     ],
 )
 def test_hostile_files_are_refused_by_name(old: str, new: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "odd.msi").write_text(MSI.replace(old, new), encoding="ascii")
     with pytest.raises(SettingsError, match=message):
         sp.load_antenna(tmp_path / "odd.msi")
+
+
+def test_a_file_with_tabs_band_and_slant_is_read_with_a_message(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    header = "GAIN\t5.0 dBd\nFREQUENCY\t824-960\nPOLARIZATION\t+45"
+    (tmp_path / "slant.pln").write_text(MSI.replace("GAIN 5.0 dBd", header), encoding="ascii")
+    read = sp.load_antenna(tmp_path / "slant.pln")
+    assert (read.gain_dbi, round(read.frequency_hz / 1e6)) == (7.15, 889)
+    assert "POLARIZATION +45 is computed as vertical" in caplog.text
+    sp.Antenna(read).warn_of_frequency(1.0e9)
+    assert "GHz, where its pattern is another one" not in caplog.text
+    coverage_of(_room(), read)
+    assert "was measured at 0.889404 GHz, and is used at 28 GHz" in caplog.text
+
+
+def test_antennas_radiate_no_more_than_they_are_fed(caplog: pytest.LogCaptureFixture) -> None:
+    """The pattern of TR 38.901 radiates two thirds; beamwidths and gain that contradict each other are refused."""
+    angle_deg = (np.arange(360.0) + 180.0) % 360.0 - 180.0
+    dipole_db = -20.0 * np.log10(np.maximum(np.cos(np.radians(angle_deg)), 1e-3))
+    assert sp.AntennaPattern("short dipole", 1.76, np.zeros(360), dipole_db).radiated == pytest.approx(1.0, abs=0.01)
+    assert sp.AntennaPattern.sector().radiated == pytest.approx(0.657, abs=0.002)
+    assert not caplog.records
+    for refused in (
+        lambda: sp.AntennaPattern.sector(30.0, 65.0, 65.0),
+        lambda: sp.AntennaPattern.sector(7.0, 360.0, 360.0, 0.0),
+        lambda: sp.AntennaPattern("made", 12.0, dipole_db, np.zeros(360)),
+    ):
+        with pytest.raises(SettingsError, match=r"gain_dbi = .* would radiate .* times .*, or at most \d+"):
+            refused()
+    sp.AntennaPattern("amplified", 7.0, np.zeros(360), np.zeros(360))
+    assert "a gain of 7 dBi in all directions is no antenna" in caplog.text
+    assert sp.AntennaPattern.sector(9.0, 90.0, 90.0).radiated > 1.25
+    assert "radiates 1.43 times the power" in caplog.text
+
+
+def test_an_unknown_orientation_has_the_mean_gain() -> None:
+    assert sp.Antenna("dipole", downtilt_deg=20.0).averaged(28e9).uniform_gain_dbi == pytest.approx(0.0, abs=0.01)
+    assert sp.Antenna("tr38901").averaged(28e9).uniform_gain_dbi == pytest.approx(-1.83, abs=0.02)
+    assert sp.Antenna().averaged(28e9) == sp.Antenna()
 
 
 @pytest.mark.parametrize(
@@ -153,8 +213,8 @@ def test_odd_antennas_are_refused_by_name(values: dict[str, Any]) -> None:
 
 
 def test_a_tilted_isotropic_antenna_is_polarised_otherwise() -> None:
-    assert sp.Antenna("iso", azimuth_deg=30.0).is_isotropic
-    assert not replace(sp.Antenna(), downtilt_deg=30.0).is_isotropic
+    assert sp.Antenna("iso", azimuth_deg=30.0).uniform_gain_dbi == 0.0
+    assert replace(sp.Antenna(), downtilt_deg=30.0).uniform_gain_dbi is None
 
 
 def test_the_commands_take_antennas(tmp_path: Path) -> None:
@@ -165,7 +225,7 @@ def test_the_commands_take_antennas(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*command, *antenna, "--format", "nc"])
     assert result.exit_code == 0, result.output
     found = sp.load_coverage(tmp_path / "out/coverage.nc")
-    assert found.attrs["tx_antenna"] == "made, 14.15 dBi, azimuth -90 deg, downtilt 10 deg"
+    assert found.attrs["tx_antenna"] == "made, 7.15 dBi, azimuth -90 deg, downtilt 10 deg"
     several = ["network", str(tmp_path / "room.npz"), "--tx=1 3 1.4", "--tx=4 1 1.4", "--out", str(tmp_path / "net")]
     result = CliRunner().invoke(app, [*several, *antenna, "--azimuth", "90"])
     assert result.exit_code == 0, result.output

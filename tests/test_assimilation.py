@@ -291,3 +291,62 @@ def test_through_walls_nothing_far_from_the_measurements_becomes_certain():
         after = posterior.update(rx_m, prior(40, 0.0, std_db=std_db))
         assert after.gain_std_db.min() > 1.0
         assert after.gain_std_db[-1] >= np.hypot(std_db, 4.9)
+
+
+@functools.cache
+def wifi() -> sp.LinkModel:
+    """Predict the house through walls, warm."""
+    return sp.LinkModel(HOUSE, trace_settings=sp.TraceSettings(5e9))
+
+
+SOURCES = {"a": TX, "b": TX - [0.0, 0.8, 0.0]}
+
+
+def measured_links(offset_db: float = 0.0, **changes: object) -> dict[str, np.ndarray]:
+    """Gains of two transmitters of the map, and of a third one, that fall off with distance; every ninth is lost."""
+    tx = np.repeat([*SOURCES.values(), LEFT[0] + [0.0, 0.0, 0.5]], len(LEFT), axis=0)
+    rx = np.tile(LEFT, (3, 1))
+    gain_db = -62.0 - 25.0 * np.log10(np.linalg.norm(rx - tx, axis=1) + 0.1) + 3.0 * np.sin(9.0 * rx[:, 0]) + offset_db
+    return {"tx": tx, "rx": rx, "gain_db": np.where(np.arange(len(rx)) % 9 == 4, -150.0, gain_db), **changes}
+
+
+LIMITS_DB = {"sensitivity_db": -95.0}
+
+
+@pytest.mark.parametrize(
+    ("house", "kind", "gains_db"),
+    [
+        (model, "one", (-3.0, 7.0, 20.0)),
+        (model, "unknown position", (7.0,)),
+        (wifi, "one", (-3.0, 7.0, 20.0)),
+        (wifi, "several", (7.0, 20.0)),
+    ],
+)
+def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind, gains_db):
+    """With measurements that contain the gain, predictions rise by exactly the gain where there is a path."""
+    measured = measured_links(-25.0 if kind == "several" else 0.0, **LIMITS_DB if kind == "one" else {})
+    tx = SOURCES if kind == "several" else TX
+    if kind == "unknown position":
+        tx, measured = None, {name: values[:8] for name, values in measured.items() if name != "tx"}
+    before = house().coverage(tx, spacing_m=1.6, measurements=measured)
+    for gain_db in gains_db:
+        flat = sp.AntennaPattern("flat", gain_db, np.zeros(360), np.zeros(360))
+        louder = {name: values + gain_db if name.endswith("_db") else values for name, values in measured.items()}
+        after = house().coverage(tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
+        for name in ("p_los", "p_nlos", "p_outage", "p_indoor"):
+            np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+        for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
+            seen = (before["valid"] == 1) & (before[name] > -145.0)
+            np.testing.assert_allclose((after[name] - before[name]).to_numpy()[seen], gain_db, atol=2e-5)
+        for name in ("measured_offset_db", "measured_shadow_scale", "measured_noise_db"):
+            assert after.attrs.get(name) == pytest.approx(before.attrs.get(name), abs=1e-6)
+
+
+def test_the_antenna_of_another_transmitter_changes_nothing():
+    """Measurements of b contain the gain of its antenna: the map of a stays."""
+    flat = sp.AntennaPattern("flat", 15.0, np.zeros(360), np.zeros(360))
+    alone = wifi().coverage(SOURCES, spacing_m=1.6, measurements=measured_links())
+    table = measured_links()
+    table["gain_db"][len(LEFT) : 2 * len(LEFT)] += 15.0
+    other = wifi().coverage(SOURCES, spacing_m=1.6, measurements=table, tx_antenna={"a": None, "b": flat})
+    np.testing.assert_allclose(other.sel(tx="a")["gain_mean_db"], alone.sel(tx="a")["gain_mean_db"], atol=2e-5)

@@ -421,16 +421,18 @@ class TestAccessor:
         assert (several.radio.area(-400.0).fraction_mean < 1.0).all()  # an outage is never above
 
     @pytest.mark.parametrize(
-        ("standard", "bandwidth_hz", "slowest", "fastest"),
+        ("standard", "frequency_hz", "bandwidth_hz", "slowest", "fastest"),
         [
-            ("wifi6", 20e6, 8.6e6, 143.4e6),
-            ("wifi6", 80e6, 36.0e6, 600.5e6),
-            ("wifi7", 320e6, 144.1e6, 2882.4e6),
-            ("nr", 100e6, 0.2344 * 82e6, 5.5547 * 82e6),
+            ("wifi6", 2.4e9, 20e6, 8.6e6, 143.4e6),
+            ("wifi6", 5e9, 80e6, 36.0e6, 600.5e6),
+            ("wifi7", 6.2e9, 320e6, 144.1e6, 2882.4e6),
+            ("nr", 3.5e9, 100e6, 0.2344 * 86e6, 5.5547 * 86e6),
+            ("nr", 28e9, 100e6, 0.2344 * 82e6, 5.5547 * 82e6),
         ],
     )
-    def test_rates_are_those_of_the_standards(self, coverage, standard, bandwidth_hz, slowest, fastest):
-        table = schemes(standard, bandwidth_hz, 28e9)
+    def test_rates_are_those_of_the_standards(self, coverage, standard, frequency_hz, bandwidth_hz, slowest, fastest):
+        coverage = coverage.assign_attrs(frequency_hz=frequency_hz)
+        table = schemes(standard, bandwidth_hz, frequency_hz)
         assert [table[0].rate_bit_s, table[-1].rate_bit_s] == pytest.approx([slowest, fastest], rel=0.003)
         assert all(low.snr_db < high.snr_db and low[1] < high[1] for low, high in pairwise(table))
         rate = coverage.radio.rate(standard, bandwidth_hz=bandwidth_hz, eirp_dbm=200.0)
@@ -443,13 +445,35 @@ class TestAccessor:
             (lambda radio: radio.power(rx_gain_db=np.nan), "rx_gain_db = nan"),
             (lambda radio: radio.snr(bandwidth_hz=0.0), "bandwidth_hz = 0"),
             (lambda radio: radio.rate("wifi5"), "standard = 'wifi5'"),
-            (lambda radio: radio.rate("wifi6", bandwidth_hz=320e6), "channels of wifi6 are 2e.07, 4e.07"),
+            (lambda radio: radio.snr(bandwidth_hz=1e-300), "bandwidth_hz = 1e-300"),
             (lambda radio: radio.area(-67.0, probability=1.1), "probability = 1.1"),
         ],
     )
     def test_link_budgets_are_checked(self, coverage, call, message):
         with pytest.raises(SettingsError, match=message):
             call(coverage.radio)
+
+    @pytest.mark.parametrize(
+        ("standard", "frequency_hz", "bandwidth_hz", "message"),
+        [
+            (
+                "wifi6",
+                28e9,
+                80e6,
+                "frequency_hz = 28000000000.0 is not allowed: wifi6 is defined at 1 to 7.125 GHz: choose",
+            ),
+            ("wifi7", 60e9, 80e6, "wifi7 is defined at 1 to 7.25 GHz"),
+            ("nr", 10e9, 100e6, "nr is defined at 0.41 to 7.125 and 24.25 to 71 GHz"),
+            ("wifi6", 5e9, 320e6, "channels of wifi6 at 5 GHz are 2e.07, 4e.07, 8e.07, 1.6e.08 Hz wide"),
+            ("wifi6", 2.4e9, 80e6, "channels of wifi6 at 2.4 GHz are 2e.07, 4e.07 Hz wide"),
+            ("wifi7", 5.2e9, 320e6, "channels of wifi7 at 5.2 GHz"),
+            ("nr", 28e9, 1.0, "channels of nr at 28 GHz are 5e.07 to 2e.09 Hz wide"),
+        ],
+    )
+    def test_standards_have_bands_and_channels(self, coverage, standard, frequency_hz, bandwidth_hz, message):
+        radio = coverage.assign_attrs(frequency_hz=frequency_hz).radio
+        with pytest.raises(SettingsError, match=message):
+            radio.rate(standard, bandwidth_hz=bandwidth_hz)
 
     def test_at_is_the_nearest_receiver(self, coverage):
         here = coverage.radio.at(0.7, 3.1)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.errors import MeasurementError
-from sionna_partial.measurements.measurements import Measurements, measurements_of, merged
+from sionna_partial.measurements.measurements import Measurements, measurements_of, merged, nearest_transmitters
 
 TX = np.array([[1.0, 2.0, 1.5], [1.0, 2.0, 1.5], [3.0, 4.0, 2.0]])
 RX = np.array([[2.0, 2.0, 1.5], [4.0, 1.0, 1.5], [5.0, 5.0, 1.0]])
@@ -238,3 +238,55 @@ class TestSurveys:
         (tmp_path / "survey.csv").write_text("rx_x,rx_y,x,gain_db\n3.0,2.0,1,-52\n")
         with pytest.raises(MeasurementError, match=r"2 columns of rx_x \(rx_x, x\): keep one"):
             sp.load_measurements(tmp_path / "survey.csv")
+
+    @pytest.mark.parametrize(
+        ("header", "columns", "gain_db"),
+        [
+            ("rssi", None, -72.0),
+            ("power_dbm", None, -72.0),
+            ("level", {"gain_db": "level"}, -72.0),
+            ("level", {"power_dbm": "level"}, -72.0),
+            ("gain_db", None, -52.0),
+            ("Gain", {"gain_db": "Gain"}, -52.0),
+        ],
+    )
+    def test_the_transmit_power_is_subtracted_from_powers_only(self, tmp_path, caplog, header, columns, gain_db):
+        path = csv_file(tmp_path, f"x,y,{header}\n3.0,2.0,-52\n")
+        measured = sp.load_measurements(path, columns=columns, tx_power_dbm=20.0)
+        assert measured.gain_db.tolist() == [gain_db]
+        assert ("tx_power_dbm = 20 is not subtracted" in caplog.text) == (gain_db == -52.0)
+
+    @pytest.mark.parametrize(
+        ("text", "columns", "message"),
+        [
+            (
+                "x,y,rssi\n1,2,-52\n",
+                ["rssi"],
+                "columns = ['rssi'] is no mapping: name the headers of a file, as columns",
+            ),
+            ("x,y,rssi\n", None, "has a header and no rows"),
+            ("x,y,rssi,gain_db\n1,2,-52,-60\n", None, "has 2 columns of gain_db (a gain and a power)"),
+            ("east,north,level\n1,2,-52\n", None, "(its other headers are east, north, level): name the headers"),
+            (
+                "x,y,level\n1,2,-52\n",
+                None,
+                "as columns={'gain_db': 'HEADER'} of load_measurements or --column gain_db=H",
+            ),
+        ],
+    )
+    def test_files_that_cannot_be_used(self, tmp_path, text, columns, message):
+        with pytest.raises(MeasurementError, match=re.escape(message)):
+            sp.load_measurements(csv_file(tmp_path, text), columns=columns)
+
+    def test_unused_columns_and_positions_are_named(self, tmp_path, caplog):
+        path = csv_file(tmp_path, "tx_x,tx_y,rx_x,rx_y,gain_db,ssid\n1,2,3,2,-52,1\n")
+        assert sp.load_measurements(path, tx=(5.0, 5.0, 1.5)).tx.tolist() == [[5.0, 5.0, 1.5]]
+        assert "columns that are not known are not used (ssid)" in caplog.text
+        assert "tx is used instead of the columns tx_x and tx_y" in caplog.text
+
+
+def test_each_measurement_belongs_to_the_nearest_transmitter() -> None:
+    sources_m = [np.array([[x, 1.0, 1.5]]) for x in (1.0, 1.3, 9.0, 9.0)]
+    tx = np.array([[1.0, 1.0, 1.5], [1.2, 1.0, 1.5], [1.6, 1.0, 1.5], [5.0, 1.0, 1.5], [9.1, 1.0, 1.5]])
+    expected = [[1, 0, 0, 0, 0], [0, 1, 1, 0, 0], [0, 0, 0, 0, 1], [0, 0, 0, 0, 1]]
+    np.testing.assert_array_equal(nearest_transmitters(tx, sources_m), expected)

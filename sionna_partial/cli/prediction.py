@@ -316,7 +316,7 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
 def _read_positions(path: Path) -> list[tuple[float, ...]]:
     """Read positions [m] from a CSV."""
     remedy = "give a CSV with the columns x,y,z in metres."
-    found = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy)
+    found, _ = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy)
     names = next((names for names in COLUMNS if found.keys() >= {*names}), None)
     if names is None:
         raise PositionError(f"--rx = '{path}' has no positions: {remedy}")

@@ -435,12 +435,14 @@ class CoverageAccessor:
             5.1.3.1-1, each from the SNR at which it is 0.6 of the Shannon bound (TR 36.942, annex A), less the overhead
             of TS 38.306.
         bandwidth_hz : float
-            Channel bandwidth [Hz]; for Wi-Fi 20, 40, 80, 160 and (802.11be) 320 MHz.
+            Bandwidth of the channel: in Wi-Fi 20, 40, 80, 160 and (802.11be, from 5.925 GHz) 320 MHz, up to 40 MHz
+            below 3 GHz; in NR 5 to 100 MHz (FR1) or 50 MHz to 2 GHz (FR2).
 
         Raises
         ------
         SettingsError
-            For another standard, or a channel that it does not have.
+            For another standard, a channel that it does not have, or a map at a frequency outside its bands: 1 to 7.125
+            GHz (802.11ax), 1 to 7.25 GHz (802.11be), 0.41 to 7.125 and 24.25 to 71 GHz (NR).
         """
         budget = LinkBudget(noise_figure_db, bandwidth_hz)
         offset_db = self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm

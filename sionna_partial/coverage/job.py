@@ -30,10 +30,10 @@ from sionna_partial.maps.partial_map import PartialMap, with_height
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
-    SAME_TX_M,
     Measurements,
     measurements_of_each,
     measurements_of_others,
+    nearest_transmitters,
 )
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.progress import part_of
@@ -75,6 +75,8 @@ class Transmitter:
     antenna: Antenna
     grid: Receivers
     measured: Measurements | None = None
+    others: Sequence[Assimilation] = ()
+    """Other transmitters of the building: their measurements give the prior of offset and shadow scale."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,6 @@ class CoverageJob:
     spacing_m: float
     receivers: str
     block: int
-    others: Sequence[Assimilation] = ()
 
     def coverage(self, transmitter: Transmitter, report: Progress) -> xr.Dataset:
         """Predict the coverage map of a transmitter."""
@@ -127,20 +128,30 @@ class CoverageJob:
         coverage = coverage_map(model.partial, grid, values, attributes)
         return coverage if posterior is None else with_posterior(coverage, posterior)
 
-    def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> CoverageJob:
-        """Return the job with the measurements of other transmitters assimilated, each alone.
+    def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> list[Transmitter]:
+        """Return the transmitters with the measurements of the others in the building assimilated, each alone.
 
-        They give the prior of offset and loss of walls. Where walls are opaque, or where the transmitter is unknown,
-        they are not used.
+        They are not used where walls are opaque, or where the transmitter is unknown. A transmitter that is predicted
+        has its own antenna. Any other antenna is taken to be like the antenna of the transmitter that it is used for,
+        in an unknown orientation.
         """
         settings = self.model.simulation.trace_settings
-        known_m = [each.position_m for each in transmitters if each.position_m is not None]
-        if measurements is None or not known_m or not settings.through_walls:
-            return self
-        others = measurements_of_others(
-            self.model.partial, [at_m[None] for at_m in known_m], measurements, settings.frequency_hz
-        )
-        return replace(self, others=[self._assimilated(other.tx[0], other, Antenna()) for other in others])
+        sources_m = [each.position_m[None] for each in transmitters if each.position_m is not None]
+        if measurements is None or not sources_m or not settings.through_walls:
+            return [*transmitters]
+        others = measurements_of_others(self.model.partial, sources_m, measurements, settings.frequency_hz)
+        owned = nearest_transmitters(np.reshape([other.tx[0] for other in others], (-1, 3)), sources_m)
+        fitted: dict[tuple[int, Antenna], Assimilation] = {}
+        found = []
+        for number, transmitter in enumerate(transmitters):
+            keys, like = [], transmitter.antenna.averaged(settings.frequency_hz)
+            for at in np.flatnonzero(~owned[number]).tolist():
+                antenna = transmitters[int(owned[:, at].argmax())].antenna if owned[:, at].any() else like
+                keys.append((at, antenna))
+                if keys[-1] not in fitted:
+                    fitted[keys[-1]] = self._assimilated(others[at].tx[0], others[at], antenna)
+            found.append(replace(transmitter, others=[fitted[key] for key in keys]))
+        return found
 
     def _source(
         self,
@@ -160,8 +171,7 @@ class CoverageJob:
         assimilations = []
         if transmitter.measured is not None:
             for at_m, p in zip(tx_m, p_powers, strict=True):
-                elsewhere = [other for other in self.others if np.linalg.norm(other.tx_m - at_m) > SAME_TX_M]
-                options = {"p_powers": p, "others": elsewhere}
+                options = {"p_powers": p, "others": transmitter.others}
                 assimilations.append(self._assimilated(at_m, transmitter.measured, transmitter.antenna, **options))
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 
@@ -178,22 +188,29 @@ class CoverageJob:
                     report(min(0.99, begin + (1.0 - begin) * done), message)
 
                 links = self.model.links(at_m, block_m, within, source.antenna)
+                predicted = links.prediction
                 if source.assimilations:
-                    updated = source.assimilations[index].update(block_m, links.prediction)
-                    links = links._replace(prediction=updated)
-                found.append(links)
+                    predicted = source.assimilations[index].update(block_m, predicted)
+                if links.antenna_db.any():
+                    predicted = predicted.amplified(links.antenna_db)
+                found.append(links._replace(prediction=predicted))
             yield found[nearest]._replace(
                 prediction=LinkPrediction.mixture([links.prediction for links in found], source.weights),
                 p_indoor=source.weights @ [links.p_indoor for links in found],
                 complete=np.all([links.complete for links in found], axis=0),
             )
 
-    def _prior(self, tx_m: Floats, rx_m: Floats, antenna: Antenna) -> tuple[LinkPrediction, Floats]:
-        """Predict the links to any number of receivers (N, 3) [m], and the probability that each is indoors."""
-        starts = range(0, len(rx_m), self.block)
-        blocks = [self.model.links(tx_m, rx_m[start : start + self.block], no_progress, antenna) for start in starts]
-        p_indoor = np.concatenate([links.p_indoor for links in blocks])
-        return LinkPrediction.concatenate([links.prediction for links in blocks]), p_indoor
+    def _prior(
+        self, tx_m: Floats, rx_m: Floats, antenna: Antenna, *, at_rx: bool = False
+    ) -> tuple[LinkPrediction, Floats, Floats]:
+        """Predict the links to receivers (N, 3) [m] without the antenna, the antenna's gain, and P(indoor) of each."""
+        blocks = [
+            self.model.links(tx_m, rx_m[start : start + self.block], no_progress, antenna, at_rx=at_rx)
+            for start in range(0, len(rx_m), self.block)
+        ]
+        prediction = LinkPrediction.concatenate([links.prediction for links in blocks])
+        antenna_db = np.concatenate([links.antenna_db for links in blocks])
+        return prediction, antenna_db, np.concatenate([links.p_indoor for links in blocks])
 
     def _located(self, transmitter: Transmitter, report: Progress) -> TransmitterPosterior:
         """Find a transmitter from its measurements."""
@@ -204,17 +221,17 @@ class CoverageJob:
         def allowed(points_m: Floats) -> Bools:
             return clear_of_walls(partial, points_m) & (measured_at.query(points_m)[0] >= limit_m)
 
-        def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:
-            return self._prior(tx_m, rx_m, transmitter.antenna)
+        def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats, Floats]:
+            return self._prior(tx_m, rx_m, transmitter.antenna, at_rx=True)
 
         return locate_transmitter(partial, measured, allowed, predict, part_of(report, 0.0, LOCATING_FRACTION))
 
     def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:
         """Predict the measured links of a transmitter at (3,) [m], and fit the process to them."""
-        prior, _ = self._prior(tx_m, measured.rx, antenna)
+        prior, antenna_db, _ = self._prior(tx_m, measured.rx, antenna)
         settings = self.model.simulation.trace_settings
         options |= {"frequency_hz": settings.frequency_hz, "through_walls": settings.through_walls}
-        return Assimilation.fit(self.model.partial, tx_m, measured, prior, **options)
+        return Assimilation.fit(self.model.partial, tx_m, measured, prior, antenna_db=antenna_db, **options)
 
 
 def predict_coverage(
@@ -230,8 +247,8 @@ def predict_coverage(
     report(0.0, "building the scene")
     names, transmitters = _transmitters(model, tx, tx_antenna, measurements, grid["rx_height_m"], grid["spacing_m"])
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
-    job = CoverageJob(model, block=block, **grid).with_others(transmitters, measurements)
-    maps = []
+    job, maps = CoverageJob(model, block=block, **grid), []
+    transmitters = job.with_others(transmitters, measurements)
     for number, transmitter in enumerate(transmitters):
         part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
         maps.append(job.coverage(transmitter, part))
@@ -255,6 +272,8 @@ def _transmitters(
         names, known_m = transmitter_positions(partial, tx)
         positions_m = [*known_m]
     antennas = antennas_of(tx_antenna, names)
+    for antenna in {*antennas}:
+        antenna.warn_of_frequency(frequency_hz)
     sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
     grids = [receivers_of(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
     measured: list[Measurements | None] = [None] * len(sources_m)

@@ -38,6 +38,23 @@ which is no faster than 16, is left out."""
 _NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
 """Overhead of the downlink (3GPP TS 38.306, clause 4.1.2)."""
 
+
+class Band(NamedTuple):
+    """Frequencies of a band, and its channel bandwidths [Hz]: all of Wi-Fi, smallest and largest of NR."""
+
+    low_hz: float
+    high_hz: float
+    bandwidths_hz: tuple[float, ...]
+
+
+_WIFI_HZ = tuple(_SUBCARRIERS)
+BANDS = {
+    "wifi6": (Band(1e9, 3e9, _WIFI_HZ[:2]), Band(3e9, 7.125e9, _WIFI_HZ[:4])),
+    "wifi7": (Band(1e9, 3e9, _WIFI_HZ[:2]), Band(3e9, 5.925e9, _WIFI_HZ[:4]), Band(5.925e9, 7.25e9, _WIFI_HZ)),
+    "nr": (Band(410e6, 7.125e9, (5e6, 100e6)), Band(24.25e9, 71e9, (50e6, 2e9))),
+}
+"""Bands of each standard (IEEE 802.11ax: 1 to 7.125 GHz, 802.11be: up to 7.25 GHz; 3GPP TS 38.104: FR1 and FR2)."""
+
 _NR_SHANNON = 0.6
 """Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A, which is of LTE up to 4.4 bit/s/Hz)."""
 
@@ -47,7 +64,7 @@ class LinkBudget(Checked):
     """Receivers and traffic of a network; the fields are arguments of `network_map`."""
 
     noise_figure_db: Annotated[float, Within(0.0, 100.0)] = 7.0
-    bandwidth_hz: Annotated[float, Within(0.0, 1e12, open_low=True)] = 100e6
+    bandwidth_hz: Annotated[float, Within(1.0, 1e11)] = 100e6
     load: Annotated[float, Within(0.0, 1.0)] = 1.0
     sinr_threshold_db: Annotated[float, Within(-200.0, 200.0)] = 0.0
 
@@ -78,8 +95,14 @@ def schemes(standard: str, bandwidth_hz: float, frequency_hz: float) -> list[Sch
 
     Wi-Fi: the SNR of the standard's minimum sensitivity at a noise figure of 10 dB. NR, whose standard has none: the
     SNR at which 0.6 of the Shannon bound is the spectral efficiency.
+
+    Raises
+    ------
+    SettingsError
+        For another standard, or a frequency or bandwidth that it does not have.
     """
     require_choice("standard", standard, RATES)
+    _require_band(standard, bandwidth_hz, frequency_hz)
     if standard == "nr":
         overhead = _NR_OVERHEAD["FR1" if frequency_hz < 24e9 else "FR2"]
         coded = [(2, rate) for rate in _NR_QPSK] + [(4, rate) for rate in _NR_16QAM] + [(6, rate) for rate in _NR_64QAM]
@@ -88,12 +111,26 @@ def schemes(standard: str, bandwidth_hz: float, frequency_hz: float) -> list[Sch
             Scheme(10 * math.log10(2 ** (bits / _NR_SHANNON) - 1), bits * bandwidth_hz * (1 - overhead))
             for bits in each
         ]
-    channels = [each for each in _SUBCARRIERS if standard == "wifi7" or each < 320e6]
-    remedy = f"channels of {standard} are {', '.join(f'{each:g}' for each in channels)} Hz wide."
-    require(bandwidth_hz in channels, "bandwidth_hz", bandwidth_hz, remedy)
     noise_dbm = LinkBudget(_NOISE_FIGURE_DB, _SENSITIVITY_HZ).noise_dbm
     count = {"wifi6": 12, "wifi7": 14}[standard]
     return [
         Scheme(level_dbm - noise_dbm, _SUBCARRIERS[bandwidth_hz] * bits / _SYMBOL_S)
         for bits, level_dbm in zip(_BITS[:count], _SENSITIVITY_DBM[:count], strict=True)
     ]
+
+
+def _require_band(standard: str, bandwidth_hz: float, frequency_hz: float) -> None:
+    """Raise a SettingsError unless the standard has such channels at that frequency."""
+    bands = BANDS[standard]
+    ends = sorted({band.low_hz for band in bands} ^ {band.high_hz for band in bands})  # without ends that two share
+    spans = " and ".join(f"{low / 1e9:g} to {high / 1e9:g}" for low, high in zip(ends[::2], ends[1::2], strict=True))
+    band = next((band for band in bands if band.low_hz <= frequency_hz <= band.high_hz), None)
+    remedy = f"{standard} is defined at {spans} GHz: choose another standard, or predict the map at its frequency."
+    require(band is not None, "frequency_hz", frequency_hz, remedy)
+    widths_hz = band.bandwidths_hz  # type: ignore[union-attr]
+    if standard == "nr":
+        good, text = widths_hz[0] <= bandwidth_hz <= widths_hz[1], " to ".join(f"{width:g}" for width in widths_hz)
+    else:
+        good, text = bandwidth_hz in widths_hz, ", ".join(f"{width:g}" for width in widths_hz)
+    remedy = f"channels of {standard} at {frequency_hz / 1e9:g} GHz are {text} Hz wide."
+    require(good, "bandwidth_hz", bandwidth_hz, remedy)

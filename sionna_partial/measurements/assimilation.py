@@ -17,10 +17,10 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
 from sionna_partial.arrays import read_only
-from sionna_partial.checks import require_number, require_type
+from sionna_partial.checks import float_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
-from sionna_partial.errors import MeasurementError, PositionError
+from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.planar import grid_edges
@@ -192,19 +192,23 @@ class _Links:
 
 
 class _Sample(NamedTuple):
-    """M measurements in P groups of neighbours: positions (P, 3), whether received, sizes, group of each (M,)."""
+    """M measurements in P groups of neighbours: positions (P, 3), whether received, sizes, group of each (M,).
+
+    `level_db` (M,) are the gains without the antenna, or their upper limits [dB].
+    """
 
     measured: Measurements
+    level_db: Floats
     rx_m: Floats
     received: Bools
     size: NDArray[np.intp]
     group: NDArray[np.intp]
 
     @classmethod
-    def of(cls, measured: Measurements) -> _Sample:
-        received = measured.gain_db > measured.sensitivity_db
+    def of(cls, measured: Measurements, antenna_db: ArrayLike) -> _Sample:
+        level_db, received = measured.of_paths(antenna_db)
         first, group, size = grouped(measured.rx, received, MOST_POINTS)
-        return cls(measured, measured.rx[first], received[first], size, group)
+        return cls(measured, level_db, measured.rx[first], received[first], size, group)
 
     def averaged(self, values: Floats) -> Floats:
         return np.bincount(self.group, weights=values) / self.size
@@ -259,7 +263,7 @@ def _hypotheses(
 ) -> Iterator[_Hypothesis]:
     """Yield all hypotheses with the logarithms of their posterior probability, but for a constant."""
     measured, received = sample.measured, sample.received
-    above_db = np.maximum(measured.gain_db, measured.sensitivity_db) - prior.gain_mean_db
+    above_db = sample.level_db - prior.gain_mean_db
     below_db = prior.gain_mean_db - links.free_space_db(measured.rx)
     for kind, p_kind in zip(kinds, (1.0 - p_powers, p_powers), strict=True):
         scale_db = sample.averaged(np.hypot(prior.gain_std_db, kind.trace_std_db))
@@ -331,6 +335,7 @@ class Assimilation(Shown):
         measured: Measurements,
         prior: LinkPrediction,
         *,
+        antenna_db: ArrayLike = 0.0,
         frequency_hz: float = CARRIER_FREQUENCY_HZ,
         p_powers: float | None = None,
         through_walls: bool = False,
@@ -347,6 +352,9 @@ class Assimilation(Shown):
             M links of this transmitter, at least one.
         prior : LinkPrediction
             Of these links, without the measurements.
+        antenna_db : float or (M,) array-like
+            Gain of the transmitter's antenna in these links, which `measured` has and `prior` lacks [dB]. `update`
+            takes and returns predictions without it.
         frequency_hz : float
         p_powers : float, optional
             Prior probability that powers were measured, with an unknown offset, and no path gains.
@@ -381,7 +389,10 @@ class Assimilation(Shown):
         tx_m = position_array("tx_m", tx_m)
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
-        sample = _Sample.of(measured)
+        gains_db = float_array("antenna_db", antenna_db, SettingsError, "give one gain [dB], or one for each link.")
+        good = gains_db.shape in ((), (len(measured),)) and bool(np.isfinite(gains_db).all())
+        require(good, "antenna_db", antenna_db, f"give one finite gain [dB], or one for each of {len(measured)} links.")
+        sample = _Sample.of(measured, gains_db)
         kinds = [kind.learnt(others) for kind in KINDS_THROUGH_WALLS] if through_walls else KINDS
         longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in kinds))
         links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))

@@ -19,8 +19,9 @@ from sionna_partial.prediction.predictor import LinkPrediction
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats]]
-"""Links from a position (3,) to others (N, 3) [m] -> their prediction, and P(indoor) of the others (N,)."""
+Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
+"""Links from a position (3,) to others (N, 3) [m] -> their prediction without the antenna at the others, its gain
+(N,) [dB], and P(indoor) of the others (N,)."""
 
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 """Number of positions that are compared, least distance between them, and how far they go beyond free cells [m]."""
@@ -118,9 +119,9 @@ def locate_transmitter(
     p_indoor = np.zeros(len(possible))
     for index, each_m in enumerate(some.rx):
         report(index / len(some), "comparing positions of the transmitter")
-        prediction, indoor = predict(each_m, points_m[possible])
+        prediction, antenna_db, indoor = predict(each_m, points_m[possible])
         p_indoor += indoor / len(some)
-        log_p += _log_likelihood(prediction, some.take(np.array([index])))
+        log_p += _log_likelihood(prediction, some.take(np.array([index])), antenna_db)
     walks_m = Walks(partial, some.rx, 10.0 * CORRELATION_M).lengths_m(some.rx)
     log_p *= len(some) / np.exp(-walks_m / CORRELATION_M).sum()
     log_p += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
@@ -148,20 +149,18 @@ def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
     return TransmitterPosterior(x_m, y_m, float(height_m), np.zeros((len(y_m), len(x_m))))
 
 
-def _log_likelihood(prediction: LinkPrediction, measured: Measurements) -> Floats:
+def _log_likelihood(prediction: LinkPrediction, measured: Measurements, antenna_db: Floats) -> Floats:
     """Log-likelihood (O, N) of one measurement for each offset and predicted link."""
     probabilities, means_db, stds_db = prediction.by_state
     noise_db = LIKELY_NOISE_DB if measured.std_db is None else measured.std_db[0]
     spread_db = np.sqrt(stds_db**2 + noise_db**2 + TRACE_STD_DB**2)
-    received_db = max(measured.gain_db[0], measured.sensitivity_db)
-    z = (received_db - OFFSETS_DB[:, None, None] - means_db) / spread_db
-    if received_db > measured.sensitivity_db:
-        log_density, anything = -0.5 * (z**2 + math.log(2.0 * math.pi)) - np.log(spread_db), 1.0 / RANGE_DB
-    else:
-        log_density, anything = log_ndtr(z), 0.5
+    level_db, received = measured.of_paths(antenna_db)
+    z = (level_db - OFFSETS_DB[:, None, None] - means_db) / spread_db
+    log_density = -0.5 * (z**2 + math.log(2.0 * math.pi)) - np.log(spread_db)
+    log_density, anything = np.where(received, log_density, log_ndtr(z)), np.where(received, 1.0 / RANGE_DB, 0.5)
     with np.errstate(divide="ignore"):
         expected = logsumexp(log_density + np.log(probabilities), axis=1)
-    return np.logaddexp(math.log1p(-P_ANYTHING) + expected, math.log(P_ANYTHING * anything))
+    return np.logaddexp(math.log1p(-P_ANYTHING) + expected, np.log(P_ANYTHING * anything))
 
 
 def _log_offset_prior() -> Floats:

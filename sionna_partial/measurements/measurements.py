@@ -30,6 +30,8 @@ OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 SAME_M, MOST_LINKS = 0.01, 3000
 """Links whose ends lie in the same cubes are one link [m]; number of links that are evaluated at most."""
 
+_ROUNDING_DB = 1e-6
+
 LEAST_STD_DB, HIGHEST_STD_DB = 0.1, 30.0
 """What smaller standard deviations of a gain count as, and the largest [dB]."""
 
@@ -50,9 +52,15 @@ _log = logging.getLogger(__name__)
 _CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
 _OTHER_HEADERS = {
     **{f"{axis}{unit}": f"rx_{axis}" for axis in "xyz" for unit in ("", "_m")},
-    **dict.fromkeys(("rssi", "rssi_dbm", "rsrp", "rsrp_dbm", "power_dbm"), "gain_db"),
+    **dict.fromkeys(("rssi", "rssi_dbm", "rsrp", "rsrp_dbm", "power_dbm"), "power_dbm"),
 }
-"""What survey apps call the position of the receiver, and the received power."""
+"""Names that survey apps give to the position of the receiver, and to the received power."""
+
+_NAMES = (*_CSV_COLUMNS, "power_dbm")
+_NAME_COLUMNS = (
+    "name the headers of a file, as columns={{'{0}': 'HEADER'}} of load_measurements or --column {0}=HEADER on the "
+    "command line"
+)
 
 _STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
 _GIVE = (
@@ -133,6 +141,16 @@ class Measurements(Shown):
         std_db = None if self.std_db is None else self.std_db[index]
         return Measurements(self.tx[index], self.rx[index], self.gain_db[index], std_db, self.sensitivity_db)
 
+    def of_paths(self, antenna_db: ArrayLike) -> tuple[Floats, Bools]:
+        """Return the levels (N,) [dB] without an antenna's gain, one for all or (N,), and whether each was received.
+
+        Where nothing was received the level is an upper limit: the sensitivity, or the floor without one.
+        """
+        received = self.gain_db > self.sensitivity_db
+        limit_db = self.sensitivity_db - antenna_db if self.sensitivity_db > GAIN_FLOOR_DB else GAIN_FLOOR_DB
+        level_db = np.maximum(np.where(received, self.gain_db - antenna_db, limit_db), GAIN_FLOOR_DB)
+        return level_db, received & (level_db > GAIN_FLOOR_DB + _ROUNDING_DB)
+
     @property
     def tx_known(self) -> NDArray[np.bool_]:
         """Whether the position of each transmitter (N,) is known."""
@@ -204,15 +222,16 @@ def load_measurements(
     Parameters
     ----------
     path : path-like
-        Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], gain_db, std_db [dB]; x, y, z count as the receiver's,
-        and rssi, rsrp or power_dbm as gain_db. Heights that are missing are 1.5 m.
+        Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], gain_db, std_db [dB]; x, y, z count as the receiver's.
+        Instead of gain_db there may be a received power: power_dbm, rssi or rsrp. Heights that are missing are 1.5 m.
     columns : mapping, optional
-        Headers of the file for names of these columns, as ``{"rx_x": "east", "gain_db": "level"}``.
+        Headers of the file for names of these columns, as ``{"rx_x": "east", "power_dbm": "level"}``. A header for
+        gain_db that does not contain "gain" counts as a received power.
     tx : (3,) array-like, optional
-        Position of the transmitter of all links [m], in place of its columns.
+        Position of the transmitter of all links [m], instead of its columns.
     tx_power_dbm : float
-        What a receiver would report without path loss [dBm], to be subtracted from received powers. If it is not known,
-        leave it out: `predict_map` and `calibrate_materials` estimate a common offset.
+        Power that a receiver would report without path loss [dBm]. It is subtracted from received powers, never from
+        gain_db. If it is not known, leave it out: `predict_map` and `calibrate_materials` estimate a common offset.
 
     Returns
     -------
@@ -221,7 +240,7 @@ def load_measurements(
     Raises
     ------
     MeasurementError
-        If the file cannot be read, for a column that it lacks, or values that are no measurements.
+        If the file cannot be read, has no rows, lacks a column, or has values that are no measurements.
 
     Examples
     --------
@@ -233,24 +252,54 @@ def load_measurements(
     power_dbm = number_of(tx_power_dbm)
     if not math.isfinite(power_dbm):
         raise MeasurementError(f"tx_power_dbm = {shown(tx_power_dbm)} is not allowed: give a number of dBm.")
-    table = {name: np.array(values) for name, values in _read(path, columns).items()}
-    if "gain_db" in table:
-        table["gain_db"] = table["gain_db"] - power_dbm
+    table = _read(path, columns, power_dbm)
+    if tx is not None and {"tx_x", "tx_y"} & {*table}:
+        _log.warning("measurements '%s': tx is used instead of the columns tx_x and tx_y", path)
     return measurements_of(table if tx is None else table | {"tx": tx})
 
 
-def _read(path: str | os.PathLike[str], columns: Mapping[str, str] | None = None) -> dict[str, list[float]]:
-    """Read the columns of a CSV, by our names."""
-    names = {name: name for name in _CSV_COLUMNS} | _OTHER_HEADERS
-    for name, header in (columns or {}).items():
-        if name not in _CSV_COLUMNS or not isinstance(header, str):
-            raise MeasurementError(f"columns = {shown(columns)}: give a header for some of {', '.join(_CSV_COLUMNS)}.")
-        names = {key: value for key, value in names.items() if value != name} | {header.strip().lower(): name}
-    table = read_columns(path, "measurements", MeasurementError, names, _GIVE)
-    missing = [header for name, header in (columns or {}).items() if name not in table]
+def _read(
+    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None, tx_power_dbm: float = 0.0
+) -> dict[str, Floats]:
+    """Read the columns of a CSV by our names; `tx_power_dbm` is subtracted from received powers."""
+    names = _names_of_headers(columns)
+    found, others = read_columns(path, "measurements", MeasurementError, names, _GIVE)
+    absent = [header for header in (columns or {}).values() if not found.keys() & {names[header.strip().lower()]}]
+    if absent:
+        raise MeasurementError(f"measurements '{path}' has no column {absent[0]!r}: check columns.")
+    table = {name: np.array(values, dtype=np.float64) for name, values in found.items()}
+    if {"gain_db", "power_dbm"} <= {*table}:
+        raise MeasurementError(
+            f"measurements '{path}' has 2 columns of gain_db (a gain and a power): keep one of them."
+        )
+    if "power_dbm" in table:
+        table["gain_db"] = table.pop("power_dbm") - tx_power_dbm
+    elif tx_power_dbm and "gain_db" in table:
+        _log.warning("measurements '%s' are path gains: tx_power_dbm = %g is not subtracted", path, tx_power_dbm)
+    missing = [name for name in ("gain_db", "rx_x", "rx_y") if name not in table]
+    unused = f" (its other headers are {', '.join(others)[:200]})" if others else ""
     if missing:
-        raise MeasurementError(f"measurements '{path}' has no column {missing[0]!r}: check columns.")
+        what = f"{missing[0]} is missing from measurements '{path}'{unused}"
+        raise MeasurementError(f"{what}: {_NAME_COLUMNS.format(missing[0])}; {_GIVE}")
+    if others:
+        message = "measurements '%s': columns that are not known are not used (%s); " + _NAME_COLUMNS.format("rx_x")
+        _log.warning(message, path, ", ".join(others)[:200])
     return table
+
+
+def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
+    """Return our name for each header of a CSV, in lower case; `columns` has headers for some names."""
+    names = {name: name for name in _CSV_COLUMNS} | _OTHER_HEADERS
+    if not isinstance(columns, Mapping | None):
+        raise MeasurementError(f"columns = {shown(columns)} is no mapping: {_NAME_COLUMNS.format('rx_x')}.")
+    for name, header in (columns or {}).items():
+        if name not in _NAMES or not isinstance(header, str):
+            raise MeasurementError(f"columns = {shown(columns)}: give a header for some of {', '.join(_NAMES)}.")
+        key = header.strip().lower()
+        same = ("gain_db", "power_dbm") if name in ("gain_db", "power_dbm") else (name,)
+        name = "power_dbm" if name == "gain_db" and "gain" not in key else name
+        names = {other: value for other, value in names.items() if value not in same} | {key: name}
+    return names
 
 
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
@@ -346,16 +395,22 @@ def measurements_of_each(
 ) -> list[Measurements | None]:
     """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
     measured = measurements_of(measurements)
-    if len(sources_m) > 1:
-        apart_m = [np.linalg.norm(measured.tx - tx_m, axis=1) for tx_m in sources_m]
-        near = [bool((each <= SAME_TX_M).any()) for each in apart_m]
-    else:
-        near = [True]
-    near[0] |= not any(near)
+    nearest = nearest_transmitters(measured.tx, sources_m)
+    used = nearest.any(axis=1) | (len(sources_m) == 1)
+    used[0] |= not used.any()
     return [
-        _measured(partial, tx_m, measured, frequency_hz) if is_near else None
-        for tx_m, is_near in zip(sources_m, near, strict=True)
+        _measured(partial, tx_m, measured, near, frequency_hz) if is_used else None
+        for tx_m, near, is_used in zip(sources_m, nearest, used, strict=True)
     ]
+
+
+def nearest_transmitters(tx_m: Floats, sources_m: Sequence[Floats]) -> Bools:
+    """Return whether each of T transmitters at (1, 3) is the nearest to measured ones (N, 3) [m], and is one of them.
+
+    The array is (T, N). Transmitters at one position share their measurements; no position is near an unknown (0, 3).
+    """
+    apart_m = np.array([np.linalg.norm(tx_m - (each_m if len(each_m) else np.nan), axis=1) for each_m in sources_m])
+    return np.asarray((apart_m <= SAME_TX_M) & (apart_m <= apart_m.min(axis=0)))
 
 
 def measurements_of_others(
@@ -378,10 +433,10 @@ def measurements_of_others(
 
 
 def _measured(
-    partial: PartialMap, tx_m: NDArray[np.float64], measured: Measurements, frequency_hz: float
+    partial: PartialMap, tx_m: Floats, measured: Measurements, nearest: Bools, frequency_hz: float
 ) -> Measurements:
     """Choose the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
-    measured = _of_transmitter(measured, tx_m[0]) if len(tx_m) else _of_unknown(measured)
+    measured = _of_transmitter(measured, tx_m[0], nearest) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
             f"measurements has {len(measured):,} links of this transmitter, more than {MOST_MEASUREMENTS:,}: average "
@@ -409,18 +464,18 @@ def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: f
     return usable
 
 
-def _of_transmitter(measured: Measurements, tx_m: NDArray[np.float64]) -> Measurements:
-    """Return the measurements of a transmitter (3,) [m]."""
+def _of_transmitter(measured: Measurements, tx_m: Floats, nearest: Bools) -> Measurements:
+    """Return the measurements of a transmitter (3,) [m], to which it is the nearest (N,)."""
     measured.require_transmitters()
-    apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
-    if not (apart_m <= SAME_TX_M).any():
-        nearest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
+    if not nearest.any():
+        apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
+        closest = ", ".join(f"{x:g}" for x in measured.tx[apart_m.argmin()]) if len(measured) else "none"
         raise MeasurementError(
             f"measurements has {len(measured):,} links, and none within {SAME_TX_M:g} m of tx = "
-            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({nearest}). Give measurements of "
+            f"({', '.join(f'{x:g}' for x in tx_m)}): the nearest transmitter is at ({closest}). Give measurements of "
             "the transmitter that is predicted, in the frame of the map."
         )
-    return measured.take(apart_m <= SAME_TX_M)
+    return measured.take(nearest)
 
 
 def _of_unknown(measured: Measurements) -> Measurements:

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.maps.partial_map import PartialMap
@@ -51,7 +51,7 @@ _TURN_DEG = (6, 3)
 _RARE = 1e-4
 """Fraction of the power below which a direction does not count."""
 
-_WEAKEST_DB = -30.0
+_WEAKEST_DB, _TINY = -30.0, 1e-12
 _MAX_BYTES = 20_000_000
 
 
@@ -213,20 +213,20 @@ class PathModel:
 class AntennaLinks:
     """Links from (3,) to (N, 3) [m] with an antenna at the transmitter, while their paths are traced.
 
-    Traced paths count with the antenna's field where they depart, the direct line of a link in LOS with that in its
-    direction, and what else is predicted with the mean over the directions of analogues. `paths` are traced for both
-    polarisations.
+    Traced paths count with the antenna's field where they depart, the direct line of a link in LOS with the field in
+    its direction, and everything else with the mean over the directions of analogues. `paths` are traced for both
+    polarisations. With `at_rx` the antenna is at the other end of each link, where paths arrive.
     """
 
-    def __init__(self, antenna: Antenna, frequency_hz: float, tx_m: Floats, rx_m: Floats) -> None:
-        self.antenna, self.frequency_hz = antenna, frequency_hz
-        self._direct_rad = zenith_azimuth(rx_m - tx_m)
+    def __init__(self, antenna: Antenna, frequency_hz: float, tx_m: Floats, rx_m: Floats, *, at_rx: bool) -> None:
+        self.antenna, self.frequency_hz, self._at_rx = antenna, frequency_hz, at_rx
+        self._direct_rad = zenith_azimuth(tx_m - rx_m if at_rx else rx_m - tx_m)
         self._power, self._indirect, self._indirect_alone = np.zeros((3, len(rx_m)))
 
     def added(self, blocks: Iterable[SolvedPaths]) -> Iterator[SolvedPaths]:
         """Add paths as they are found, and pass them on."""
         for paths in blocks:
-            power, indirect = self.antenna.power(paths, self.frequency_hz), ~paths.is_direct
+            power, indirect = self.antenna.power(paths, self.frequency_hz, at_rx=self._at_rx), ~paths.is_direct
             np.add.at(self._power, paths.path_rx, power)
             np.add.at(self._indirect, paths.path_rx[indirect], power[indirect])
             np.add.at(self._indirect_alone, paths.path_rx[indirect], paths.power[indirect])
@@ -234,22 +234,30 @@ class AntennaLinks:
 
     def predict(
         self, phi: LinkFeatures, prediction: LinkPrediction, complete: Bools
-    ) -> tuple[LinkFeatures, LinkPrediction]:
-        """Return features and prediction with the antenna, from those without; the link states stay."""
-        phi = replace(phi, gain_db=path_gain_db(self._power))
-        trace = LinkPrediction.of_trace(phi)
+    ) -> tuple[LinkFeatures, LinkPrediction, Floats]:
+        """Return the features with the antenna, and the prediction as the sum of two terms; the link states stay.
+
+        The second term is the mean gain of the antenna (N,) over the states with a path [dB]. The first is the
+        prediction without it: only the differences between states are the antenna's.
+        """
+        traced_db, phi = phi.gain_db, replace(phi, gain_db=path_gain_db(self._power))
+        antenna_db = phi.gain_db - traced_db
         if complete.all():
-            return phi, trace
+            return phi, prediction, antenna_db
         probabilities, means_db, stds_db = prediction.by_state
+        change_db = np.zeros_like(means_db)
         free_space = 10.0 ** (free_space_gain_db(phi.distance_m, self.frequency_hz) / 10.0)
         direct, table = self.antenna.gain(self._direct_rad, self.frequency_hz), self._table()
         for state in STATES:
             sight = free_space * (state == LinkState.LOS)
             alone, known = sight + self._indirect_alone, sight * direct + self._indirect
             whole = np.maximum(10.0 ** (means_db[state] / 10.0), alone)
-            change_db = path_gain_db((known + (whole - alone) * self._spread(state, table)) / whole)
-            means_db[state] = np.maximum(means_db[state] + change_db, GAIN_FLOOR_DB)
-        return phi, LinkPrediction.of_parts(probabilities, means_db, stds_db).where(complete, trace)
+            change_db[state] = path_gain_db((known + (whole - alone) * self._spread(state, table)) / whole)
+        weights = np.where(np.arange(len(change_db))[:, None] == LinkState.OUTAGE, 0.0, probabilities + _TINY)
+        mean_db = (weights * change_db).sum(axis=0) / weights.sum(axis=0)
+        means_db += np.where(weights > 0.0, change_db - mean_db, 0.0)
+        relative = LinkPrediction.of_parts(probabilities, means_db, stds_db).where(complete, prediction)
+        return phi, relative, np.where(complete, antenna_db, mean_db)
 
     def _table(self) -> Floats:
         """Gain in all whole degrees of zenith and azimuth (181, 360)."""

@@ -237,6 +237,16 @@ class LinkPrediction(Shown):
             probability = probability + p_state * np.where(spread, normal, above_db > 0.0)
         return probability
 
+    def amplified(self, change_db: ArrayLike) -> LinkPrediction:
+        """Return the links with gains that are higher by `change_db`, one for all or (N,), where there are paths [dB].
+
+        Outages stay, and no gain falls below the floor.
+        """
+        probabilities, means_db, stds_db = self.by_state
+        has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
+        means_db = np.maximum(means_db + np.where(has_path, change_db, 0.0), GAIN_FLOOR_DB)
+        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
     def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
         return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))

@@ -1,6 +1,8 @@
 """Antennas: patterns, measured ones too, arrays of Sionna RT as NumPy arrays, and the transmit antenna of a map."""
 
+import logging
 import math
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,9 +38,20 @@ MAX_ANTENNAS = 4096
 MAX_GAIN_DBI, MAX_LOSS_DB = 60.0, 200.0
 """Largest gain of a pattern, and how far below it a direction may be."""
 
+MAX_RADIATED, NOTED_RADIATED = 2.0, 1.25
+"""Power that a pattern radiates as a fraction of the power that it is fed: patterns above the first are refused, and
+patterns above the second logged. No antenna exceeds 1, but two cuts give the power of a measured antenna to 2 dB."""
+
+FREQUENCY_RATIO = 1.3
+"""Ratio of frequencies from which on the pattern of an antenna differs."""
+
 _DIPOLE_DBI = 2.15
+_LARGEST_GAP_DEG = 90.0
+_READ_ONCE = ("GAIN", "FREQUENCY", "POLARIZATION", "HORIZONTAL", "VERTICAL")
 _FILE_BYTES, _FILE_ANGLES = 1_000_000, 3600
 _PHASES_AT_ONCE = 2_000_000
+
+_log = logging.getLogger(__name__)
 
 
 def planar_array(rows: int, columns: int, pattern: str = "iso", polarization: str = "V") -> Any:
@@ -162,11 +175,16 @@ class AntennaPattern(Shown):
     horizontal_db, vertical_db : (360,) array-like
         How far below it the gain is at 0, 1, ... 359 degrees [dB]: counterclockwise from the main direction seen from
         above, and downwards from the horizon.
+    frequency_hz : float, optional
+        Frequency at which it was measured. Traces at a frequency that differs by a factor of more than 1.3 log a
+        warning.
 
     Raises
     ------
     SettingsError
-        For a gain above 60 dBi, or cuts of another shape or with values outside 0 to 200 dB.
+        For a gain above 60 dBi, cuts of another shape or with values outside 0 to 200 dB, or a pattern that radiates
+        more than twice the power that it is fed. A gain that is the same in all directions is no pattern: one above
+        0 dBi stands for an amplifier, and logs a warning.
 
     Examples
     --------
@@ -180,6 +198,7 @@ class AntennaPattern(Shown):
     gain_dbi: float
     horizontal_db: Floats
     vertical_db: Floats
+    frequency_hz: float | None = None
 
     def __post_init__(self) -> None:
         named = isinstance(self.name, str) and 0 < len(self.name) <= 100 and self.name.isprintable()
@@ -192,6 +211,35 @@ class AntennaPattern(Shown):
             good = (values >= 0.0) & (values <= MAX_LOSS_DB)
             require(bool(good.all()), name, values[~good][:1], remedy)
             object.__setattr__(self, name, values)
+        if self.frequency_hz is not None:
+            require_number("frequency_hz", self.frequency_hz, 0.0, 1e12, open_low=True)
+        if self.uniform_gain_dbi is None:
+            self._require_passive()
+        elif self.radiated > NOTED_RADIATED:
+            message = "antenna %r: a gain of %g dBi in all directions is no antenna, unless an amplifier is part of it"
+            _log.warning(message, self.name, self.gain_dbi)
+
+    def _require_passive(self) -> "AntennaPattern":
+        """Raise a SettingsError if it radiates too much, otherwise return it."""
+        radiated = self.radiated
+        most_dbi = self.gain_dbi - 10.0 * math.log10(radiated)
+        remedy = (
+            f"antenna {self.name!r} with these cuts would radiate {radiated:.3g} times the power that it is fed: give "
+            f"narrower cuts, or at most {most_dbi:.1f} dBi."
+        )
+        require(radiated <= MAX_RADIATED, "gain_dbi", self.gain_dbi, remedy)
+        if radiated > NOTED_RADIATED:
+            message = (
+                "antenna %r radiates %.2f times the power that it is fed: its gain is too high, or its cuts too wide"
+            )
+            _log.warning(message, self.name, radiated)
+        return self
+
+    @property
+    def radiated(self) -> float:
+        """Power that it radiates in all directions, as a fraction of the power that it is fed."""
+        angles_rad, weights = _sphere()
+        return float(weights @ np.abs(self.amplitude(angles_rad)) ** 2)
 
     @classmethod
     def sector(
@@ -201,7 +249,13 @@ class AntennaPattern(Shown):
         vertical_beamwidth_deg: float = 65.0,
         front_to_back_db: float = 30.0,
     ) -> "AntennaPattern":
-        """Return the pattern of 3GPP TR 38.901, table 7.3-1, whose values are the defaults, or one like it."""
+        """Return the pattern of 3GPP TR 38.901, table 7.3-1, with its values as defaults.
+
+        Raises
+        ------
+        SettingsError
+            For values out of range, or a gain that the beamwidths do not allow.
+        """
         require_number("front_to_back_db", front_to_back_db, 0.0, MAX_LOSS_DB)
         angle_deg, cuts = (np.arange(360.0) + 180.0) % 360.0 - 180.0, []
         widths = {
@@ -211,7 +265,14 @@ class AntennaPattern(Shown):
         for name, width_deg in widths.items():
             require_number(name, width_deg, 0.0, 360.0, open_low=True)
             cuts.append(np.minimum(12.0 * (angle_deg / width_deg) ** 2, front_to_back_db))
-        return cls(f"sector of {horizontal_beamwidth_deg:g} x {vertical_beamwidth_deg:g} deg", gain_dbi, *cuts)
+        name = f"sector of {horizontal_beamwidth_deg:g} x {vertical_beamwidth_deg:g} deg"
+        return cls(name, gain_dbi, *cuts)._require_passive()
+
+    @property
+    def uniform_gain_dbi(self) -> float | None:
+        """Gain of a pattern that is the same in all directions [dBi]; None of any other pattern."""
+        cuts = self.horizontal_db, self.vertical_db
+        return None if any(np.ptp(cut) for cut in cuts) else self.gain_dbi - max(float(cut[0]) for cut in cuts)
 
     def amplitude(self, local_rad: Floats) -> NDArray[np.complex128]:
         """Square root (P,) of the gain towards zenith and azimuth (P, 2)."""
@@ -226,12 +287,15 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     r"""Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
 
     A gain without unit is in dBd, as the format has it. Horizontal angles are clockwise from the main direction,
-    vertical ones from the horizon downwards. An electrical tilt is in the cuts.
+    vertical ones from the horizon downwards. An electrical tilt is in the cuts. Antennas are computed with vertical
+    polarisation: other polarisations than vertical and horizontal log a warning.
 
     Raises
     ------
     SettingsError
-        If the file cannot be read, is larger than 1 MB, or lacks its gain or one of the cuts.
+        If the file cannot be read, is larger than 1 MB, lacks its gain or one of the cuts, has one of them twice, has a
+        cut with a gap of more than 90 degrees, is of a horizontally polarised antenna, or of one that radiates more
+        than twice the power that it is fed.
 
     Examples
     --------
@@ -248,16 +312,19 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     header: dict[str, str] = {}
     rows = iter(enumerate(lines, start=1))
     for number, line in rows:
-        key, _, value = line.strip().partition(" ") if " " in line.strip() else line.strip().partition("\t")
-        if key.upper() in ("HORIZONTAL", "VERTICAL"):
-            count = int(value) if value.strip().isascii() and value.strip().isdigit() and len(value.strip()) < 5 else 0
+        words = [*line.split(maxsplit=1), "", ""]
+        key, value = words[0].upper().replace("POLARISATION", "POLARIZATION"), words[1].strip()
+        repeated = key in _READ_ONCE and key in {*header, *cuts}
+        require(not repeated, f"antenna, line {number}", line, f"{key} is there twice: keep one of them.")
+        if key in ("HORIZONTAL", "VERTICAL"):
+            count = int(value) if value.isascii() and value.isdigit() and len(value) < 5 else 0
             where = f"antenna, line {number}"
             require(
                 2 <= count <= _FILE_ANGLES, where, line, f"give {key} and the number of angles, 2 to {_FILE_ANGLES}."
             )
-            cuts[key.upper()] = _cut([text for _, (_, text) in zip(range(count), rows, strict=False)], count, where)
+            cuts[key] = _cut([text for _, (_, text) in zip(range(count), rows, strict=False)], count, where)
         else:
-            header.setdefault(key.upper(), value.strip())
+            header.setdefault(key, value)
     missing = {"GAIN", "HORIZONTAL", "VERTICAL"} - {*header, *cuts}
     require(not missing, f"antenna '{path}' without", sorted(missing), remedy)
     gain, unit = ([*header["GAIN"].split(), "dBd"])[:2] if header["GAIN"] else ("", "dBd")
@@ -265,9 +332,33 @@ def load_antenna(path: str | Path) -> AntennaPattern:
         unit.lower() in ("dbd", "dbi") and _is_finite(gain), "GAIN", header["GAIN"], "give a number and dBd or dBi."
     )
     name = "".join(each for each in header.get("NAME", Path(path).stem) if each.isprintable())[:100] or "antenna"
-    clockwise = cuts["HORIZONTAL"]
-    left = np.roll(clockwise[::-1], 1)
-    return AntennaPattern(name, float(gain) + (_DIPOLE_DBI if unit.lower() == "dbd" else 0.0), left, cuts["VERTICAL"])
+    _require_vertical(name, header.get("POLARIZATION", ""))
+    left, gain_dbi = np.roll(cuts["HORIZONTAL"][::-1], 1), float(gain) + _DIPOLE_DBI * (unit.lower() == "dbd")
+    frequency_hz = _frequency_hz(header.get("FREQUENCY", ""))
+    return AntennaPattern(name, gain_dbi, left, cuts["VERTICAL"], frequency_hz)._require_passive()
+
+
+def _require_vertical(name: str, polarisation: str) -> None:
+    """Raise a SettingsError for horizontal polarisation; log that any other one is computed as vertical."""
+    text = re.sub(r"[^a-z0-9]", "", polarisation.lower()).removesuffix("polarization").removesuffix("pol")
+    horizontal = text in ("h", "hor", "horz") or ("horiz" in text and "vert" not in text)
+    remedy = (
+        f"antenna {name!r} is horizontally polarised, and receivers are vertical: it has next to no gain towards them. "
+        "Write V if receivers are polarised like the antenna."
+    )
+    require(not horizontal, "POLARIZATION", polarisation, remedy)
+    if text not in ("", "v") and not ("vert" in text and "horiz" not in text):
+        message = (
+            "antenna %r: POLARIZATION %s is computed as vertical; a vertical receiver gets less of a slanted field"
+        )
+        _log.warning(message, name, polarisation[:40])
+
+
+def _frequency_hz(text: str) -> float | None:
+    """Return the frequency of a header in MHz, the geometric mean of a band; None if there is none."""
+    numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", text[:40])[:2]]
+    frequency_hz = (1e9 if "ghz" in text.lower() else 1e6) * math.sqrt(numbers[0] * numbers[-1]) if numbers else 0.0
+    return frequency_hz if 0.0 < frequency_hz <= 1e12 else None
 
 
 def _cut(lines: list[str], count: int, where: str) -> Floats:
@@ -278,6 +369,10 @@ def _cut(lines: list[str], count: int, where: str) -> Floats:
     angle_deg, loss_db = np.array(pairs, dtype=np.float64).T if good else np.zeros((2, 1))
     rising = bool((np.diff(angle_deg) > 0.0).all()) and angle_deg[0] >= 0.0 and angle_deg[-1] <= 360.0
     require(good and rising, where, lines[:2], remedy)
+    gaps_deg = np.sort(np.diff(angle_deg, append=angle_deg[0] + 360.0))
+    span = f"the cut covers {angle_deg[0]:g} to {angle_deg[-1]:g} degrees, with a gap of {gaps_deg[-1]:g} degrees"
+    closed = gaps_deg[-1] <= max(_LARGEST_GAP_DEG, 2.0 * gaps_deg[(count - 1) // 2])
+    require(bool(closed), where, lines[-1], f"{span}: give it all around.")
     return np.interp(np.arange(360.0), angle_deg, loss_db, period=360.0)
 
 
@@ -349,9 +444,13 @@ class Antenna(Checked):
         return ", ".join(parts)
 
     @property
-    def is_isotropic(self) -> bool:
-        """Whether it is one upright isotropic antenna, as of links without any."""
-        return str(self) == "iso"
+    def uniform_gain_dbi(self) -> float | None:
+        """Gain of an upright antenna that is the same in all directions [dBi]; None of any other antenna."""
+        if self.rows * self.columns > 1 or self.downtilt_deg:
+            return None
+        if isinstance(self.pattern, AntennaPattern):
+            return self.pattern.uniform_gain_dbi
+        return 0.0 if self.pattern == "iso" else None
 
     def fields(self, angles_rad: Floats, frequency_hz: float) -> NDArray[np.complex128]:
         """Field (P, 2) along the world's theta and phi, in directions of zenith and azimuth (P, 2)."""
@@ -370,14 +469,39 @@ class Antenna(Checked):
             found[here] = antennas.fields(angles_rad[here], one)[:, 0] * phases[:, None]
         return found
 
+    def warn_of_frequency(self, frequency_hz: float) -> None:
+        """Log a warning if its pattern was measured at a frequency that is far from the frequency of the trace."""
+        measured_hz = getattr(self.pattern, "frequency_hz", None)
+        if measured_hz and abs(math.log(frequency_hz / measured_hz)) > math.log(FREQUENCY_RATIO):
+            message = "antenna '%s' was measured at %g GHz, and is used at %g GHz, where its pattern is another one"
+            _log.warning(message, self, measured_hz / 1e9, frequency_hz / 1e9)
+
     def gain(self, angles_rad: Floats, frequency_hz: float) -> Floats:
         """Gain (P,) of vertical polarisation towards zenith and azimuth (P, 2)."""
         return np.asarray(np.abs(self.fields(angles_rad, frequency_hz)[:, 0]) ** 2)
 
-    def power(self, paths: SolvedPaths, frequency_hz: float) -> Floats:
-        """Power (P,) of paths that were traced for both polarisations, at isotropic, vertical receivers."""
-        fields = self.fields(paths.departure_rad, frequency_hz)
-        return np.asarray(np.abs(np.einsum("pi,pi->p", paths.transfer[:, 0], fields)) ** 2)
+    def power(self, paths: SolvedPaths, frequency_hz: float, *, at_rx: bool = False) -> Floats:
+        """Power (P,) of paths that were traced for both polarisations, with an isotropic, vertical antenna opposite."""
+        fields = self.fields(paths.arrival_rad if at_rx else paths.departure_rad, frequency_hz)
+        transfer = paths.transfer[:, :, 0] if at_rx else paths.transfer[:, 0]
+        return np.asarray(np.abs(np.einsum("pi,pi->p", transfer, fields)) ** 2)
+
+    def averaged(self, frequency_hz: float) -> "Antenna":
+        """Return the antenna for an unknown orientation: its mean gain in every direction."""
+        if self.uniform_gain_dbi is not None:
+            return self
+        angles_rad, weights = _sphere()
+        power = weights @ (np.abs(self.fields(angles_rad, frequency_hz)) ** 2).sum(axis=1)
+        gain_dbi = max(10.0 * math.log10(power), -MAX_GAIN_DBI)
+        return Antenna(AntennaPattern("mean over all directions", gain_dbi, np.zeros(360), np.zeros(360)))
+
+
+def _sphere() -> tuple[Floats, Floats]:
+    """Return zenith and azimuth (P, 2) of a grid on the sphere, and the fraction (P,) of the sphere around each."""
+    zenith_rad, azimuth_rad = np.radians(np.arange(0.5, 180.0)), np.radians(np.arange(360.0))
+    angles_rad = np.stack(np.meshgrid(zenith_rad, azimuth_rad, indexing="ij"), axis=-1).reshape(-1, 2)
+    weights = np.sin(angles_rad[:, 0])
+    return angles_rad, weights / weights.sum()
 
 
 def _evaluated(pattern: Any, local_rad: Floats) -> list[NDArray[np.complex128]]:
