@@ -80,7 +80,7 @@ def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
 def require_room(partial: PartialMap) -> None:
     assert states(partial, INSIDE, IN_WALL, OUTSIDE, (3.27, 1.27)) == [FREE, WALL, UNKNOWN, UNKNOWN]
     assert states(partial, (1.4, 1.3), (3.03, 1.3)) == [FREE, WALL]  # under the table; the pillar
-    assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.02)
     assert partial.is_complete
     assert (partial.state == FREE).sum() * 0.05**2 == pytest.approx(5 * 3 - 0.25, rel=0.05)
 
@@ -106,6 +106,16 @@ def test_heights_count_from_the_floor(floor_m: float) -> None:
     require_room(map_from_points(room(floor_m)))
 
 
+@pytest.mark.parametrize("noise_m", [0.0, 0.003, 0.02])
+@pytest.mark.parametrize(("floor_m", "height_m"), [(0.0, 2.5), (0.024, 2.6), (-1.23, 2.62), (7.0, 2.75)])
+def test_wall_height(floor_m: float, height_m: float, noise_m: float) -> None:
+    """A flat surface without noise fills one layer of voxels, with noise two."""
+    rng = np.random.default_rng(1)
+    points = shell((0.02, 0.02, 0), (5.02, 4.02, height_m), rng)
+    points[:, 2] += rng.normal(floor_m, noise_m, len(points))
+    assert map_from_points(points).wall_height_m == pytest.approx(height_m, abs=0.02)
+
+
 def test_map_coordinates(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 4_500_000.0, 0.0])
     far = load_map(write(tmp_path / "room.laz", ROOM + shift))
@@ -126,7 +136,7 @@ def test_two_storeys() -> None:
     require_room(map_from_points(both, observed=[(0, 0), (5.1, 0), (5.1, 3.1), (0, 3.1)]))
     partial = map_from_points(both, height_band_m=(3.9, 4.7))
     assert states(partial, INSIDE, (12.0, 1.5)) == [UNKNOWN, FREE]
-    assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.02)
 
 
 def test_walls_alone() -> None:

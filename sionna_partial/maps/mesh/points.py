@@ -9,7 +9,7 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -288,7 +288,7 @@ def _cloud_map(
     cell = DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m
     cell = PartialMap(np.full((1, 1), CellState.UNKNOWN), cell).resolution_m
     sensors = _sensors(sensor_positions_m, reading.up)
-    voxels, count = _occupied_voxels(what, parts, cell, reading.up)
+    voxels, count, heights_m = _occupied_voxels(what, parts, cell, reading.up)
     size = np.array([cell, cell, LAYER_M])
     bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
     require_metres(what, bounds - [[0.0], [1.0]] * size, reading.height_band_m)
@@ -304,7 +304,7 @@ def _cloud_map(
             raise MapError(f"sensor_positions_m has {at}, more than {MAX_SENSOR_M:g} m from the points: give metres.")
     column, row = (voxels[:, :2] - np.rint(np.array(empty.origin_m) / cell).astype(np.int64)).T
     z = (voxels[:, 2] + 0.5) * LAYER_M
-    floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], reading.height_band_m)
+    floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], heights_m, reading.height_band_m)
     low, high = reading.height_band_m or (floor_m + DEFAULT_BAND_M[0], floor_m + DEFAULT_BAND_M[1])
     band = (z > low) & (z < high)
     wall = _walls(np.ravel_multi_index((row[band], column[band]), empty.shape), count[band], empty.shape)
@@ -341,8 +341,12 @@ def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
 
 def _occupied_voxels(
     what: str, parts: Iterable[NDArray[Any]], cell_m: float, up: str | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return indices x, y, z (V, 3) of the voxels with points, on multiples of their size, and how many these are."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]]]:
+    """Return indices x, y, z (V, 3) of the voxels with points, on multiples of their size, and their numbers of points.
+
+    The third value has the number of points, and the sum of their heights [m], of each layer.
+    """
+    heights_m: dict[int, tuple[int, float]] = {}
     base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for part in parts:
         points = part[np.isfinite(part).all(axis=1)].astype(np.float64)
@@ -354,6 +358,12 @@ def _occupied_voxels(
             points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
         index = np.floor(points / (cell_m, cell_m, LAYER_M) + 1e-9).astype(np.int64)
         base = index[0].copy() if base is None else base
+        layers, inverse = np.unique(index[:, 2], return_inverse=True)
+        for layer, points_in, sum_m in zip(
+            layers.tolist(), np.bincount(inverse).tolist(), np.bincount(inverse, points[:, 2]).tolist(), strict=True
+        ):
+            old = heights_m.get(layer, (0, 0.0))
+            heights_m[layer] = old[0] + points_in, old[1] + sum_m
         index += _HALF - base
         if index.min() < 0 or index.max() >= 2 * _HALF:
             raise MapError(f"{what} spans more than {_HALF * cell_m:,.0f} m: remove stray points, or cut it.")
@@ -365,7 +375,7 @@ def _occupied_voxels(
         raise MapError(f"{what} holds no finite point: give a cloud with x, y, z in metres.")
     keys, counts = _merged(pending)
     mask = (1 << _BITS) - 1
-    return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts
+    return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts, heights_m
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -387,13 +397,23 @@ def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, 
     return np.asarray((layers >= max(1, math.ceil(WALL_FRACTION * fuller))) & ~is_noise)
 
 
-def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | None) -> tuple[float, float | None]:
-    """Heights of the floor below a band, the lowest by default, and of the ceiling above it, if there is one [m]."""
+def _floor_and_ceiling(
+    layer: NDArray[np.int64], heights_m: Mapping[int, tuple[int, float]], band_m: tuple[float, float] | None
+) -> tuple[float, float | None]:
+    """Return the heights of the floor below a band, the lowest by default, and of the ceiling above it, if any [m].
+
+    Each is the mean height of the points in its two fullest layers: a flat surface with noise is spread over two.
+    """
     first = int(layer.min())
-    pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # what is flat and measured is spread over two layers
+    pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # pairs[k] counts the layers k and k + 1
     full = np.nonzero(pairs >= FLOOR_FRACTION * pairs.max())[0]
     runs = np.split(full, np.nonzero(np.diff(full) > 1)[0] + 1)
-    slabs_m = [(run[np.argmax(pairs[run])] + first + 1) * LAYER_M for run in runs if len(run) * LAYER_M <= SLAB_M]
+    slabs_m = []
+    for run in runs:
+        if len(run) * LAYER_M <= SLAB_M:
+            lower = int(run[np.argmax(pairs[run])]) + first
+            counts, sums_m = zip(*(heights_m.get(each, (0, 0.0)) for each in (lower, lower + 1)), strict=True)
+            slabs_m.append(round(sum(sums_m) / sum(counts), 3))
     low = math.inf if band_m is None else height_pair("height_band_m", band_m)[0]
     below = [slab for slab in slabs_m if slab < low] or [first * LAYER_M]
     floor_m = below[0] if band_m is None else below[-1]
