@@ -67,6 +67,16 @@ def test_nodes_are_placed_by_their_transforms(tmp_path: Path) -> None:
     np.testing.assert_allclose(mesh.bounds_m, [[-3, -1, -1.5], [13, 1, 1.5]], atol=1e-6)
 
 
+def test_projective_nodes(tmp_path: Path) -> None:
+    path = written(tmp_path, "gltf")
+    sheet = json.loads(path.read_text())
+    node = next(node for node in sheet["nodes"] if "mesh" in node)
+    node["matrix"] = [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    path.write_text(json.dumps(sheet))
+    with pytest.raises(MapError, match="is damaged or no GLTF mesh .a transform is projective, with the last row"):
+        read_mesh(path)
+
+
 def test_far_meshes_keep_their_digits(tmp_path: Path) -> None:
     shift = (500_000.123456789, 4_500_000.7, 0.0)
     scene = room()

@@ -141,7 +141,7 @@ def _placed_parts(path: Path, scene: Any) -> Iterator[Triangles]:
         if wrong.any():
             count = f"vertex {triangles[wrong][0]}, but {len(vertices)} vertices"
             raise MapError(f"path = '{path}' has a triangle with {count}: export the mesh again.")
-        yield vertices @ transform[:3, :3].T + transform[:3, 3], triangles
+        yield vertices @ _affine(transform)[:3, :3].T + transform[:3, 3], triangles
 
 
 def _concatenated(parts: list[Triangles]) -> Triangles:
@@ -247,12 +247,24 @@ def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
         vertices, triangles = _read_triangles(file, kind)
     for step in (step for node in shape.findall("transform[@name='to_world']") for step in node):
         try:
-            matrix = _step(step) @ matrix
+            one = _affine(_step(step))
+            if np.linalg.matrix_rank(one[:3, :3]) < 3:
+                raise ValueError("it flattens the shape")
         except (KeyError, ValueError) as error:
             what = f"shape {_name(shape)!r} has a to_world with <{step.tag} {step.attrib}>"
-            remedy = "give matrix, translate, scale or rotate."
-            raise MapError(f"path = '{path}': {what}, which cannot be read: {remedy}") from error
+            remedy = "give matrix, translate, scale or rotate, finite, not 0 in scale, and with 0 0 0 1 as last row."
+            raise MapError(f"path = '{path}': {what}, which cannot be read ({error}): {remedy}") from error
+        matrix = one @ matrix
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles
+
+
+def _affine(matrix: Floats) -> Floats:
+    """Return a matrix (4, 4), or raise a ValueError if it is projective or not finite."""
+    if not np.isfinite(matrix).all():
+        raise ValueError("a transform is not finite")
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0, atol=1e-9):
+        raise ValueError(f"a transform is projective, with the last row {matrix[3].tolist()}")
+    return matrix
 
 
 def _step(step: ET.Element) -> Floats:
