@@ -73,7 +73,7 @@ def test_projective_nodes(tmp_path: Path) -> None:
     node = next(node for node in sheet["nodes"] if "mesh" in node)
     node["matrix"] = [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
     path.write_text(json.dumps(sheet))
-    with pytest.raises(MapError, match="is damaged or no GLTF mesh .a transform is projective, with the last row"):
+    with pytest.raises(MapError, match=r"is damaged or no GLTF mesh \(a transform is projective, with the last row"):
         read_mesh(path)
 
 

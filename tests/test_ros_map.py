@@ -256,8 +256,8 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
         ("origin", ([0, 0, 90],), r"the yaw in radians, one turn at most \(not degrees\)"),
         ("negate", (2, -1, 0.0, "maybe", None), "give 0 .dark is wall. or 1 .bright is wall."),
         ("mode", ("ternary", 3, None), "choose one of trinary, scale, raw"),
-        ("image", ("", None, 3, ["map.pgm"], "a\0b"), "give the file name of the map image"),
-        ("image", ("gone.pgm", ".", "a" * 300), "there is no file '.*'; put the image there"),
+        ("image", ("", None, 3, ["map.pgm"], "a\0b", "a\ud800b"), "give the file name of the map image"),
+        ("image", ("gone.pgm", ".", "a" * 300, "loop"), "there is no file '.*'; put the image there"),
         ("wall_height", (0, -3, math.nan, "tall"), r"give a number of metres in \[0.1, 100\]"),
         (
             "material",
@@ -270,12 +270,13 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
 def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], message: str) -> None:
     """The error names the file, the field, the value and the remedy."""
     (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
+    (tmp_path / "loop").symlink_to("loop")
     for value in values:
         path = write_sheet(tmp_path, **{key: value})
         with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}") as caught:
             load_map(path)
         shown = str(value)
-        assert len(shown) > 100 or shown in str(caught.value) or "\0" in shown
+        assert len(shown) > 100 or shown in str(caught.value) or {"\0", "\ud800"} & {*shown}
 
 
 def test_origin_too_far(tmp_path: Path) -> None:

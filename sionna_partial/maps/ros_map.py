@@ -20,7 +20,7 @@ from sionna_partial.arrays import States
 from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
-from sionna_partial.files import atomic_write, open_regular, read_bytes
+from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import MAX_CELLS, MAX_INTERIOR_CELLS, MapWarning, PartialMap, frontier_cells
 from sionna_partial.settings import Material
@@ -381,11 +381,10 @@ def _origin(path: Path, value: object) -> tuple[float, float, float]:
 
 
 def _image_path(path: Path, value: object, *, confined: bool) -> Path:
-    if not isinstance(value, str) or not value or "\0" in value:
+    if not isinstance(value, str) or not value or not is_path(value):
         raise _refuse(path, "image", value, "give the file name of the map image.")
     image = path.parent / value
-    outside = Path(value).is_absolute() or not image.resolve().is_relative_to(path.parent.resolve())
-    if confined and (outside or ".." in Path(value).parts):
+    if confined and not lies_in(path.parent, value):
         raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
     if not os.path.isfile(image):
         raise _refuse(path, "image", value, f"there is no file '{image}'; put the image there or correct the name.")

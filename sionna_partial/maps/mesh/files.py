@@ -24,7 +24,7 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.files import decoding, read_bytes
+from sionna_partial.files import decoding, lies_in, read_bytes
 from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
@@ -84,8 +84,7 @@ def read_mesh(path: Path, up: str | None = None) -> SceneMesh:
 
 def confined_path(folder: Path, name: str, what: str) -> Path:
     """Return the path of a file that another one names, or raise a MapError (`what` ...) if it is not in the folder."""
-    inside = bool(name) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts
-    if not inside or not (folder / name).resolve().is_relative_to(folder.resolve()):
+    if not lies_in(folder, name):
         raise MapError(f"{what} {name!r}, which is not allowed: put it into '{folder}' and give its relative path.")
     if not (folder / name).is_file():
         raise MapError(f"{what} {name!r}, which is not there: put it into '{folder}', or correct the name.")
