@@ -250,10 +250,13 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             area = real_array("where", where, MapError, "give cells (ny, nx) as booleans, or a polygon.", "biuf")
             if area.dtype == np.bool_ and area.shape == self.shape:
                 return area
-            if area.dtype == np.bool_ or area.ndim != 2 or area.shape[1] != 2 or len(area) < 3:
+            if area.dtype == np.bool_:
                 what = f"where has shape {area.shape}"
                 raise MapError(f"{what}: give booleans {self.shape}, or corners (M, 2) of a polygon in metres.")
-            where = shapely.Polygon(area.astype(np.float64))
+            where = area_polygon("where", area)
+        elif not where.is_valid:
+            remedy = "give a geometry without crossings, of finite coordinates, or repair it with shapely.make_valid."
+            raise MapError(f"where is no area ({shapely.is_valid_reason(where)}): {remedy}")
         rows, columns = np.indices(self.shape)
         centres = cell_centres_m(self, np.stack([rows, columns], axis=-1))
         return np.asarray(shapely.contains_xy(where, centres[..., 0], centres[..., 1]))
@@ -423,6 +426,22 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
             (walled, "is inside a wall", "move it to a free or unknown cell."),
         ]
+
+
+def area_polygon(name: str, corners_m: ArrayLike) -> shapely.Polygon:
+    """Return the polygon with corners (M, 2) in x and y [m], or raise a MapError that names the argument."""
+    remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres"
+    corners = float_array(name, corners_m, MapError, f"{remedy}.")
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise MapError(f"{name} has shape {corners.shape}: {remedy}.")
+    if not np.isfinite(corners).all():
+        wrong = corners[~np.isfinite(corners).all(axis=1)][0].tolist()
+        raise MapError(f"{name} has the corner {wrong}: {remedy}, all finite.")
+    polygon = shapely.Polygon(corners)
+    if not polygon.is_valid or not polygon.area:
+        what = f"{name} = {shown(corners.tolist())} is no polygon ({shapely.is_valid_reason(polygon)})"
+        raise MapError(f"{what}: {remedy}.")
+    return polygon
 
 
 def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:

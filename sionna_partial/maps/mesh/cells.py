@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.checks import float_array, shown
+from sionna_partial.checks import shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.environment import Mesh
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
 from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
@@ -154,7 +154,8 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
         row, column = (np.clip(index + 1, 0, size - 1) for index, size in zip((row, column), known.shape, strict=True))
         cells, is_empty = known[np.ix_(row, column)], not known.any()
     else:
-        polygon, is_empty = _polygon(observed), False
+        polygon, is_empty = area_polygon("observed", observed), False
+        shapely.prepare(polygon)
         cells = np.stack([shapely.contains_xy(polygon, x, height) for height in y])
     if not cells.any() and not is_empty:
         x0, y0, x1, y1 = empty.bounds_m
@@ -163,18 +164,6 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
             "the world axes of the mesh, in metres."
         )
     return cells
-
-
-def _polygon(observed: ArrayLike) -> Any:
-    remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres, or a PartialMap."
-    corners = float_array("observed", observed, MapError, remedy)
-    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
-        raise MapError(f"observed has shape {corners.shape} or values that are not finite: {remedy}")
-    polygon = shapely.Polygon(corners)
-    if not polygon.is_valid or not polygon.area:
-        raise MapError(f"observed is no polygon ({shapely.is_valid_reason(polygon)}): {remedy}")
-    shapely.prepare(polygon)
-    return polygon
 
 
 def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:
