@@ -32,6 +32,8 @@ ROOMS = {
             "mesh.mesh",
             "environment",
             "wall_cells",
+            "rooms",
+            "import_report",
             "partial_map",
             "mesh.cells",
             "mesh.points",
