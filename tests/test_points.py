@@ -116,6 +116,23 @@ def test_wall_height(floor_m: float, height_m: float, noise_m: float) -> None:
     assert map_from_points(points).wall_height_m == pytest.approx(height_m, abs=0.02)
 
 
+def test_feet() -> None:
+    points = shell((0, 0, 0), (40, 30, 9), np.random.default_rng(0))[::3]
+    message = (
+        r"points spans 40.1 x 30.1 m, with a storey of 9 m, as if it were in feet: give unit_m=0.3048 for feet, or"
+    )
+    with pytest.warns(MapWarning, match=message):
+        map_from_points(points)
+    assert map_from_points(points, unit_m=1).wall_height_m == pytest.approx(9.0, abs=0.02)
+    partial = map_from_points(points, unit_m=0.3048, resolution_m=0.1)
+    assert partial.wall_height_m == pytest.approx(9 * 0.3048, abs=0.02)
+    report = partial.import_report
+    assert report is not None
+    assert (report.unit_m, report.unit_source, report.rooms) == (0.3048, "unit_m", 1)
+    assert report.extent_m == pytest.approx((40 * 0.3048, 30 * 0.3048), abs=0.3)
+    assert [(row.name, row.count) for row in report.used] == [("points", len(points))]
+
+
 def test_map_coordinates(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 4_500_000.0, 0.0])
     far = load_map(write(tmp_path / "room.laz", ROOM + shift))
@@ -196,8 +213,8 @@ def test_shipped_scene_comes_back() -> None:
         ({"points": np.zeros((0, 3))}, "points holds no finite point: give a cloud with x, y, z in metres"),
         ({"points": np.full((5, 3), np.nan)}, "points holds no finite point"),
         ({"points": [["a"] * 3]}, "points = [['a', 'a', 'a']] is not numeric: give x, y, z in metres, (N, 3)"),
-        ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: scale it to metres"),
-        ({"points": ROOM * 1000}, "scale it to metres (0.01 for centimetres"),
+        ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: give unit_m, the length of its unit in metres"),
+        ({"points": ROOM * 1000}, "give unit_m, the length of its unit in metres, 0.01 for centimetres"),
         ({"points": [(0, 0, 0), (1e5, 0, 0)]}, "points spans more than 52,429 m: remove stray points, or cut it"),
         ({"points": [(0, 0, 0), (1e9, 0, 0)]}, "points holds coordinates above 1e+08 m: give a cloud in metres"),
         ({"points": [(0, 0, 0), (9e3, 9e3, 0)]}, "more than 100,000,000: give"),
@@ -206,6 +223,7 @@ def test_shipped_scene_comes_back() -> None:
         ({"sensor_positions_m": [(1.0, 2.0)], "up": "y"}, 'with up = "y": give x, y, z of the cloud, (M, 3)'),
         ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high)"),
         ({"up": "x"}, "up = 'x' is not allowed"),
+        ({"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres, such as 0.3048 for feet"),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed"),
     ],
 )

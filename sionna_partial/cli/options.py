@@ -43,7 +43,7 @@ WallLayers = Annotated[
     typer.Option("--wall-layer", metavar="LAYER", help="Of a drawing: a layer with walls.", show_default=False),
 ]
 Unit = Annotated[
-    float | None, typer.Option(help="Of a drawing: length of its unit [m], 0.001 for mm.", show_default=False)
+    float | None, typer.Option(help="Of a drawing or scan: length of its unit [m], 0.001 for mm.", show_default=False)
 ]
 ObstacleHeight = Annotated[
     float | None,

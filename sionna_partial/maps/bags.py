@@ -36,7 +36,7 @@ _MCAP_MAGIC, _MCAP_SCHEMA, _MCAP_CHUNK = b"\x89MCAP0\r\n", 3, 6
 MAX_TILT_RAD = 0.01
 """Largest roll and pitch of a map's origin that pass for level [rad]."""
 
-OCCUPIED_PERCENT, FREE_PERCENT = 65.0, 25.0
+OCCUPIED_PERCENT, FREE_PERCENT = 65, 25
 """Occupancy from which a cell is wall, and up to which it is free (the defaults of nav2's map_saver) [percent]."""
 
 GRID = "OccupancyGrid"
@@ -276,13 +276,15 @@ def map_of_percent(
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
         raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
-    free = FREE_PERCENT if free_percent is None else number_of(free_percent)
-    occupied = OCCUPIED_PERCENT if occupied_percent is None else number_of(occupied_percent)
+    is_given = free_percent is not None or occupied_percent is not None
+    free_percent = FREE_PERCENT if free_percent is None else free_percent
+    occupied_percent = OCCUPIED_PERCENT if occupied_percent is None else occupied_percent
+    free, occupied = number_of(free_percent), number_of(occupied_percent)
     if not 0 <= free < occupied <= 100 or occupied <= 1:
         given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
         raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
     notes = ImportNotes("data", 1.0, "resolution_m")
-    if free_percent is None and occupied_percent is None:
+    if not is_given:
         count = np.bincount(values[(values >= 0) & (values <= 100)], minlength=101)
         remedy = "Give free_percent and occupied_percent to choose others."
         found = fitted_threshold(np.arange(101.0), count, free, occupied, notes, remedy)

@@ -111,8 +111,8 @@ def load_map(
         Edge of the cells of the map of a mesh, cloud, drawing or building model [m], 0.05 by default. They lie on
         multiples of it.
     up : {"z", "y"} or None
-        Axis of a mesh or cloud that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB
-        files.
+        Axis of a mesh or cloud that points up. By default y of glTF (.glb, .gltf), as its specification says, and z of
+        other files, with a `MapWarning` if that looks wrong.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers of a drawing, or their names as of `Material.named` (see `map_from_drawing`).
         Of a building model, by types such as "IfcWall", in place of those that its materials name. Doors that are given
@@ -120,7 +120,8 @@ def load_map(
     wall_layers : sequence of str or None
         Layers of a drawing with the walls, `*` and `?` as in file names (see `map_from_drawing`).
     unit_m : float or None
-        Length of a unit of a drawing [m], 0.001 for millimetres. By default that of its header.
+        Length of a unit of a drawing, mesh or cloud [m], 0.001 for millimetres, 0.3048 for feet. By default that of
+        the header of a drawing, and 1 for meshes and clouds.
     storey : str or None
         Name of a storey of a building model; it may be left out where one alone has walls.
     obstacle_height_m : float or None
@@ -395,7 +396,9 @@ def _read_mesh(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.files import read_mesh
 
     reading = MeshReading(**options)
-    return mesh_map(read_mesh(source, reading.up), reading)
+    is_gltf = source.suffix.lower() in (".glb", ".gltf")
+    notes = reading.notes(source, "specification of glTF") if is_gltf else reading.notes(source)
+    return reading.attached(notes, mesh_map(read_mesh(source, reading.up, notes), reading))
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:
@@ -408,7 +411,9 @@ def _read_mitsuba(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
     from sionna_partial.maps.mesh.files import read_mitsuba_scene
 
-    return mesh_map(read_mitsuba_scene(source), MeshReading(**options))
+    reading = MeshReading(**options)
+    notes = reading.notes(source, "Mitsuba scene")
+    return reading.attached(notes, mesh_map(read_mitsuba_scene(source, notes), reading))
 
 
 def _read_drawing(source: Path, **options: Any) -> PartialMap:
@@ -474,11 +479,12 @@ class _Reader(NamedTuple):
 _OPTIONS_OF = {
     "layer_materials": "drawings and building models",
     "storey": "building models",
-    **dict.fromkeys(("wall_layers", "unit_m"), "drawings"),
+    "wall_layers": "drawings",
+    "unit_m": "drawings and scans",
 }
 """Files that options are for, other than scans."""
 
-_OF_SCANS = ("height_band_m", "observed", "resolution_m", "up")
+_OF_SCANS = ("height_band_m", "observed", "resolution_m", "up", "unit_m")
 _BAG = _Reader("a rosbag", _read_bag)
 _MITSUBA = _Reader("a Mitsuba scene", _read_mitsuba, _OF_SCANS)
 _CALIBRATED = _Reader("the map of a calibration", _read_npz)
