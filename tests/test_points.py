@@ -118,9 +118,7 @@ def test_wall_height(floor_m: float, height_m: float, noise_m: float) -> None:
 
 def test_feet() -> None:
     points = shell((0, 0, 0), (40, 30, 9), np.random.default_rng(0))[::3]
-    message = (
-        r"points spans 40.1 x 30.1 m, with a storey of 9 m, as if it were in feet: give unit_m=0.3048 for feet, or"
-    )
+    message = r"points spans 40.1 x 30.1 m, with a storey of 9 m, as if it were in feet: give unit_m=0.3048 for"
     with pytest.warns(MapWarning, match=message):
         map_from_points(points)
     assert map_from_points(points, unit_m=1).wall_height_m == pytest.approx(9.0, abs=0.02)
