@@ -23,15 +23,15 @@ UNITS_M = {
 }
 """Units in which plans are drawn [m]."""
 
-RARE = {"decimetres", "inches", "feet"}
-"""Units that are only taken if the header has them, or if they fit far better than the others."""
+RARE = {"decimetres": 8.0, "inches": 3.0, "feet": 3.0}
+"""Misfit that units have in addition which are rare, unless the header has them."""
 
 POSSIBLE_M = (1.0, 2000.0)
 """Longer side of any building [m]."""
 
-MARGIN, UNIQUE_MARGIN, RARE_MISFIT = 2.5, 1.0, 4.0
-"""Difference of misfits from which the header's unit is not taken, from which one unit is better than all others, and
-misfit that rare units have in addition."""
+MARGIN, DOUBT, UNIQUE_MARGIN = 5.0, 2.5, 1.0
+"""Differences of misfits from which the unit of the header is not taken; from which it is taken with a warning, or not
+taken if it is inches or feet and the drawing metric; and from which one unit is better than all others."""
 
 RASTER_CELLS = 1000
 """Number of cells along the longer side of the plan in which openings are found."""
@@ -50,46 +50,46 @@ class _Scale(NamedTuple):
 
 SCALES = {
     "an extent": _Scale(20.0, 5.0, 20.0),
-    "openings": _Scale(0.9, 1.7, 4.0),
-    "gaps in walls": _Scale(0.9, 1.7, 4.0),
-    "walls": _Scale(0.2, 3.0, 4.0),
+    "openings": _Scale(0.9, 1.7, 3.0),
+    "gaps in walls": _Scale(0.9, 1.7, 3.0),
+    "walls": _Scale(0.2, 3.0, 3.0),
     "texts": _Scale(0.2, 4.0, 3.0),
 }
 """Lengths in drawings by which a unit is checked."""
 
 
-def unit_of(path: Path, code: int, segments: Floats, texts: Floats) -> tuple[float, str]:
+def unit_of(path: Path, code: int, is_metric: bool, segments: Floats, texts: Floats) -> tuple[float, str]:
     """Return the length of a unit of a drawing [m] and where it comes from.
 
-    `code` is `$INSUNITS`; `segments` (N, 2, 2) are the lines of the walls and `texts` (T,) the heights of texts. The
-    unit of the header is taken unless another one fits the lengths in the drawing far better.
+    `code` is `$INSUNITS`, and `is_metric` is `$MEASUREMENT`. `segments` (N, 2, 2) are the lines of the walls, `texts`
+    (T,) the heights of texts. The unit of the header is taken unless one other unit fits the lengths in the drawing
+    far better. Raises a MapError if there is no unit that fits better than all others.
     """
-    lengths = lengths_of(segments, texts)
-    header_m = _header_unit(code)
-    misfits = {name: misfit(lengths, unit_m) + RARE_MISFIT * (name in RARE) for name, unit_m in UNITS_M.items()}
+    lengths, header_m = lengths_of(segments, texts), _header_unit(code)
+    misfits = {name: misfit(lengths, unit_m) + RARE.get(name, 0.0) for name, unit_m in UNITS_M.items()}
     best, second, *_ = sorted(misfits, key=misfits.__getitem__)
-    is_clear = misfits[second] - misfits[best] >= UNIQUE_MARGIN
-    x, y = np.ptp(segments.reshape(-1, 2), axis=0)
+    unit_m, is_clear = UNITS_M[best], misfits[second] - misfits[best] >= UNIQUE_MARGIN
+    extent, source = lengths["an extent"], f"$INSUNITS = {code} of the header"
+    what = f"path = '{path}' has no unit ($INSUNITS = {code}), and walls of {extent:g} units"
     if header_m is not None:
-        source = f"$INSUNITS = {code} of the header"
-        is_possible = POSSIBLE_M[0] <= max(x, y) * header_m <= POSSIBLE_M[1]
-        fits = misfit(lengths, header_m) - misfits[best] < MARGIN
-        if fits or (is_possible and len(lengths) == 1):
+        what = f"path = '{path}' has the unit {header_m:g} m ({source}), and with it {_described(lengths, header_m)}"
+        excess = misfit(lengths, header_m) - misfits[best]
+        is_possible = POSSIBLE_M[0] <= extent * header_m <= POSSIBLE_M[1]
+        if is_possible and (excess < DOUBT or len(lengths) == 1):
             return header_m, source
-        what = (
-            f"path = '{path}' has the unit {header_m:g} m ({source}), with which it has {_described(lengths, header_m)}"
-        )
-    else:
-        what = f"path = '{path}' has no unit ($INSUNITS = {code}), and walls of {max(x, y):g} units"
-    if not is_clear or misfits[best] >= len(lengths) * 4.0:
+        needed = DOUBT if is_metric and header_m in (0.0254, 0.3048) else MARGIN
+        if is_possible and (excess < needed or not is_clear):
+            message = f"{what}; in {best} it would have {_described(lengths, unit_m)}"
+            warnings.warn(f"{message}: give unit_m, {header_m:g} or {unit_m:g}.", MapWarning, stacklevel=4)
+            return header_m, source
+    if not is_clear:
         remedy = "give unit_m, 0.001 if they are millimetres, 0.01 for centimetres, 1 for metres, 0.0254 for inches."
         raise MapError(f"{what}: {remedy}")
-    unit_m = UNITS_M[best]
     which = "which are read as" if header_m is None else "so it is read in"
-    message = f"{what}, {which} {best}, with {_described(lengths, unit_m)}: give unit_m, {unit_m:g} if that is right."
+    message = f"{what}, {which} {best}, with {_described(lengths, unit_m)}: give unit_m, {unit_m:g} if that is right"
+    message += "." if header_m is None else f", {header_m:g} for the unit of the header."
     warnings.warn(message, MapWarning, stacklevel=4)
-    found = ", ".join(lengths)
-    return unit_m, f"guess by {found}" if header_m is None else f"guess by {found}, not {source}"
+    return unit_m, f"guess by {', '.join(lengths)}{'' if header_m is None else f', not {source}'}"
 
 
 def misfit(lengths: dict[str, float], unit_m: float) -> float:
@@ -111,11 +111,10 @@ def lengths_of(segments: Floats, texts: Floats) -> dict[str, float]:
     openings = rooms_of(*_raster((segments - low) / extent)).openings_m
     if len(openings):
         found["openings"] = float(np.median(openings)) * extent
-    thickness = _line_distance(segments) if len(segments) > 1 else math.nan
-    is_double = thickness < extent / 40
-    if is_double:
+    thickness = wall_thickness(segments)
+    if thickness:
         found["walls"] = thickness
-    gap = _usual_gap(segments, extent, 1.5 * thickness if is_double else 0.0)
+    gap = _usual_gap(segments, extent, 1.5 * thickness)
     if gap:
         found["gaps in walls"] = gap
     texts = texts[texts > 0]
@@ -129,7 +128,7 @@ def _header_unit(code: int) -> float | None:
     from ezdxf.enums import InsertUnits
 
     known = code in range(1, 25)
-    return float(units.conversion_factor(InsertUnits(code), InsertUnits.Meters)) if known else None
+    return float(f"{units.conversion_factor(InsertUnits(code), InsertUnits.Meters):.9g}") if known else None
 
 
 def _described(lengths: dict[str, float], unit_m: float) -> str:
@@ -161,15 +160,16 @@ def _longest(segments: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     return angle, offset, np.minimum(first, last), np.maximum(first, last)
 
 
-def _line_distance(segments: Floats) -> float:
-    """Return the usual distance of a line from the next parallel one beside it; infinite if hardly any has one."""
+def wall_thickness(segments: Floats) -> float:
+    """Return the usual distance of a line from the next parallel one beside it, 0 for walls of single lines."""
     angle, offset, first, last = _longest(segments)
     length = last - first
     beside = np.minimum.outer(last, last) - np.maximum.outer(first, first) > 0.5 * np.minimum.outer(length, length)
     apart = np.abs(np.subtract.outer(offset, offset))
     parallel = np.abs(np.subtract.outer(angle, angle)) < 0.01
     apart[~(beside & parallel) | (apart < 1e-4 * np.ptp(segments))] = np.inf
-    return float(np.quantile(apart.min(axis=1), 0.4, method="lower"))
+    found = float(np.quantile(apart.min(axis=1), 0.4, method="lower"))
+    return found if found < np.ptp(segments.reshape(-1, 2), axis=0).max() / 40 else 0.0
 
 
 def _usual_gap(segments: Floats, extent: float, least: float) -> float:

@@ -20,7 +20,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
 from sionna_partial.maps.drawing_layers import NO_WALL, PARTIAL_HEIGHT, skip_reason
 from sionna_partial.maps.drawing_lines import LINE_TYPES, XREF, DrawnLines, Segments, opened
-from sionna_partial.maps.drawing_units import POSSIBLE_M, lengths_of, unit_of
+from sionna_partial.maps.drawing_units import POSSIBLE_M, unit_of, wall_thickness
 from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
@@ -109,7 +109,7 @@ def map_from_drawing(
         segments, on_layer = plan.segments(layers)
         notes = ImportNotes(source, unit or 0.0, "unit_m")
         if unit is None:
-            notes.unit_m, notes.unit_source = unit_of(source, plan.unit_code, segments, plan.text_heights())
+            notes.unit_m, notes.unit_source = plan.unit(segments)
         state, empty = _cells(source, segments * notes.unit_m, notes.unit_m, resolution_m)
         if names is None and _enclosed(state) < ENCLOSED_FRACTION:
             added = _closing_layer(plan, reasons, segments, notes.unit_m, resolution_m)
@@ -136,35 +136,35 @@ def map_from_drawing(
 
 
 class _Plan(NamedTuple):
-    """A drawing: its layers (in lower case) and whether they are visible, and its lines."""
+    """A drawing: its layers (in lower case) and whether they are visible, its lines, and the names of layers."""
 
     path: Path
     drawing: Any
     visible: dict[str, bool]
     lines: DrawnLines
+    names: dict[str, str]
 
     @classmethod
     def of(cls, path: Path, drawing: Any) -> "_Plan":
         lines = DrawnLines(path, drawing)
         visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF)}
         visible |= {layer.dxf.name.lower(): layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
-        return cls(path, drawing, visible, lines)
+        return cls(path, drawing, visible, lines, {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers})
 
-    @property
-    def unit_code(self) -> int:
-        """`$INSUNITS` of the header."""
-        return int(self.drawing.header.get("$INSUNITS", 0))
-
-    def text_heights(self) -> NDArray[np.float64]:
-        """Return the heights of texts in the model space, in units of the drawing."""
-        texts = self.drawing.modelspace().query("TEXT MTEXT")
-        return np.array([text.dxf.get("height" if text.dxftype() == "TEXT" else "char_height", 0.0) for text in texts])
+    def unit(self, segments: Segments) -> tuple[float, str]:
+        """Return the length of a unit [m] and where it comes from; see `unit_of`."""
+        header, texts = self.drawing.header, self.drawing.modelspace().query("TEXT MTEXT")
+        names = {"TEXT": "height", "MTEXT": "char_height"}
+        heights = np.array([float(text.dxf.get(names[text.dxftype()], 0.0)) for text in texts])
+        code, is_metric = int(header.get("$INSUNITS", 0)), header.get("$MEASUREMENT", 1) == 1
+        return unit_of(self.path, code, is_metric, segments, heights)
 
     def listed(self) -> str:
         """Return the names of the layers with their numbers of lines."""
         counts = self.lines.line_counts()
         names = sorted(self.visible, key=lambda layer: (-counts[layer], layer))
-        return f"{len(names)} layers: {', '.join(f'{name} ({counts[name]:,} lines)' for name in names[:40])}"
+        texts = (f"{self.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
+        return f"{len(names)} layers: {', '.join(texts)}"
 
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
         """Return the reason for which each layer is no wall, "" for those with walls."""
@@ -195,12 +195,13 @@ class _Plan(NamedTuple):
     def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
         """Note which elements are used, and which are skipped."""
         for (name, kind), count in self.lines.counts.items():
+            layer = self.names.get(name, name)
             if kind == XREF:
-                notes.skip(name, count, "external reference: bind it, or load its file")
+                notes.skip(name, count, "external reference: bind it in the drawing")
             elif kind in LINE_TYPES:
-                notes.skip(name, count, reasons.get(name, NO_WALL))
+                notes.skip(layer, count, reasons.get(name, NO_WALL))
             elif kind != "INSERT" and not reasons.get(name, NO_WALL):
-                notes.skip(f"{kind} on {name}", count, "type without lines")
+                notes.skip(f"{kind} on {layer}", count, "type without lines")
 
 
 def _cells(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> tuple[States, PartialMap]:
@@ -246,8 +247,8 @@ def _closing_layer(
 
 def _warn_of_close_lines(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> None:
     """Warn of walls whose faces are closer to each other than a cell."""
-    thickness_m = lengths_of(segments, np.zeros(0)).get("walls", math.inf) * unit_m
-    if thickness_m < resolution_m:
+    thickness_m = wall_thickness(segments) * unit_m
+    if 0 < thickness_m < resolution_m:
         what = f"path = '{path}' has lines {thickness_m:.2g} m apart, closer than resolution_m = {resolution_m:g}"
         remedy = f"give a resolution_m of {thickness_m / 2:.1g}, or the unit_m in which it is drawn."
         warnings.warn(f"{what}, with unit_m = {unit_m:g}: {remedy}", MapWarning, stacklevel=3)
