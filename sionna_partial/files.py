@@ -7,6 +7,7 @@ import os
 import shutil
 import stat
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -278,18 +279,56 @@ def decoding(
         raise error(f"path = '{path}' is damaged or {fault} ({reason}): {remedy}") from cause
 
 
+def is_path(path: object) -> bool:
+    """Return whether a file can have this path: names have no NUL and no surrogates that stand for no byte."""
+    try:
+        return isinstance(path, (str, os.PathLike)) and b"\0" not in os.fsencode(path)
+    except UnicodeEncodeError:
+        return False
+
+
 def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:
     """Return a path to read from, or raise an `error` if it is none."""
-    if not isinstance(path, (str, os.PathLike)):
-        raise error(f"{field} = {shown(path)} is not a path: {remedy}")
-    return Path(path)
+    if not is_path(path):
+        given = os.fspath(path) if isinstance(path, os.PathLike) else path
+        raise error(f"{field} = {shown(given)} is not a path: {remedy}")
+    return Path(path)  # type: ignore[arg-type]
 
 
 def output_path(path: object) -> Path:
     """Return a path to write to, or raise an OutputError if it is none."""
-    if not isinstance(path, (str, os.PathLike)) or "\0" in os.fspath(path):
+    if not is_path(path):
         raise OutputError(f"path = {path!r} is not a path: give the name of a file or folder.")
-    return Path(path)
+    return Path(path)  # type: ignore[arg-type]
+
+
+def lies_in(folder: Path, name: str) -> bool:
+    """Return whether a relative path of another file leads, links followed, to a place in a folder."""
+    inside = bool(name) and is_path(name) and not Path(name).is_absolute() and ".." not in Path(name).parts
+    return inside and Path(os.path.realpath(folder / name)).is_relative_to(os.path.realpath(folder))
+
+
+def require_plain_folder(folder: Path) -> None:
+    """Raise a ValueError for a folder with links, pipes or devices: readers of whole folders would follow or wait."""
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            mode = os.lstat(os.path.join(parent, name)).st_mode
+            if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                raise ValueError(f"{name!r} is a link, a pipe or a device")
+
+
+def unzipped(content: bytes, most: int) -> dict[str, bytes]:
+    """Return the files of a zip archive by name; a ValueError if it is damaged or unpacks to more than `most` bytes."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
+            size = sum(entry.file_size for entry in entries)
+            found = {entry.filename: archive.read(entry) for entry in entries} if size <= most else {}
+    except Exception as error:  # each compression has errors of its own
+        raise ValueError(f"it is damaged: {error or type(error).__name__}") from error
+    if size > most or len(found) != len(entries):
+        raise ValueError(f"it unpacks to more than {most:,} bytes" if size > most else "it has a name twice")
+    return found
 
 
 @contextmanager

@@ -67,6 +67,12 @@ class Building:
             layer.LayerThickness = thickness
         api.run("material.assign_material", self.model, products=[part], material=materials)
 
+    def of_list(self, part: Any, *names: str) -> None:
+        """Give a part one material, or a list of several."""
+        materials = [api.run("material.add_material", self.model, name=name) for name in names]
+        whole = materials[0] if len(names) == 1 else self.model.createIfcMaterialList(materials)
+        self.model.createIfcRelAssociatesMaterial(ifcopenshell.guid.new(), None, None, None, [part], whole)
+
     def rooms(self, level_m: float, level: int) -> list[Any]:
         """Two rooms with a door between them, a window, and a thick column; the outer walls and the inner."""
         z = level_m, level_m + 2.8

@@ -13,13 +13,17 @@ from ezdxf.document import Drawing
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps import drawings
+from sionna_partial.maps import drawing_lines
 from sionna_partial.maps.drawings import map_from_drawing
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.resources import scenes_folder
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
+
+
+CORNERS = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
+"""A room of 5 x 4 m in millimetres, or 50 x 40 m in centimetres."""
 
 
 def drawing(units: int = 6, unit_m: float = 1.0, layer: str = "A-WALL") -> Drawing:
@@ -163,6 +167,11 @@ def endless_block(doc: Drawing) -> None:
     doc.modelspace().add_blockref("A", (0, 0)).grid((10_000, 10_000))
 
 
+def room_alone(doc: Drawing) -> None:
+    doc.modelspace().delete_all_entities()
+    doc.modelspace().add_lwpolyline(CORNERS, close=True, dxfattribs={"layer": "A-WALL"})
+
+
 @pytest.mark.parametrize(
     ("write", "given", "message"),
     [
@@ -176,14 +185,14 @@ def endless_block(doc: Drawing) -> None:
         (spoiled(lambda doc: None), {"wall_layers": []}, "wall_layers = [] is not allowed"),
         (spoiled(lambda doc: None), {"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres"),
         (spoiled(lambda doc: None), {"unit_m": 0.001}, "has walls that span 0.0082 x 0.0052 m with unit_m = 0.001:"),
-        (spoiled(lambda doc: None, 0, 0.002), {}, "has no unit ($INSUNITS = 0), and walls of 4100 units: give unit_m"),
+        (spoiled(room_alone, 0), {}, "has no unit ($INSUNITS = 0), and walls of 5000 units: give unit_m"),
         (spoiled(lambda doc: doc.modelspace().delete_all_entities()), {}, "has no lines on ['a-glaz', 'a-wall']"),
         (spoiled(blocks_in_blocks), {}, "has more than 1,000 entities in blocks, or 1,000,000 pieces of lines: save"),
         (spoiled(endless_block), {}, "has more than 1,000 entities in blocks"),
     ],
 )
 def test_refused(tmp_path: Path, write: Callable, given: Any, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawings, "MAX_PARTS", 1000)
+    monkeypatch.setattr(drawing_lines, "MAX_PARTS", 1000)
     write(tmp_path / "plan.dxf")
     with pytest.raises(MapError, match=re.escape(message)):
         map_from_drawing(tmp_path / "plan.dxf", **given)

@@ -1,15 +1,18 @@
 """Input is a regular file of bounded size; output is written whole or not at all."""
 
 import errno
+import io
 import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import h5py
 import pytest
 
+from sionna_partial.app.session import stored_map
 from sionna_partial.channels.files import load_channels
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.export import load_coverage
@@ -18,10 +21,13 @@ from sionna_partial.files import (
     atomic_folder,
     atomic_path,
     atomic_write,
+    lies_in,
     locked_folder,
+    output_path,
     read_bytes,
     require_writable,
     temporary_folder,
+    unzipped,
 )
 
 
@@ -40,7 +46,8 @@ def tree(folder: Path) -> dict[str, bytes | None]:
         ("large", "has more than 3 bytes: give a smaller file"),
         (".", "cannot be read (Is a directory): check the path"),
         ("nowhere", "cannot be read (No such file or directory): check the path"),
-        ("a\0b", "cannot be read (embedded null byte): check the path"),
+        ("a\0b", "is not a path: give the name of a file."),
+        ("a\ud800b", "is not a path: give the name of a file."),
         ("/proc/self/mem", "cannot be read (Input/output error): check the disk"),
     ],
 )
@@ -52,6 +59,40 @@ def test_only_small_regular_files_are_read(tmp_path: Path, name: str, message: s
     with pytest.raises(MapError, match=re.escape(message)) as caught:
         read_bytes(tmp_path / name, "map", MapError, 3)
     assert str(caught.value).startswith("map = '")
+
+
+def test_paths_that_no_file_can_have(tmp_path: Path) -> None:
+    for name in ("a\0b.yaml", "a\ud800b.yaml"):
+        with pytest.raises(OutputError, match="is not a path: give the name of a file or folder"):
+            output_path(name)
+        assert not lies_in(tmp_path, name)
+    (tmp_path / "loop").symlink_to("loop")
+    assert lies_in(tmp_path, "loop")
+
+
+def broken_zip() -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("map.yaml", b"image: map.pgm\n" * 100)
+    content = bytearray(stream.getvalue())
+    content[content.index(b"map.yaml") + 8] ^= 0xFF
+    return bytes(content)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\3\4", broken_zip()])
+def test_damaged_zip(content: bytes) -> None:
+    """A wrong type of a block of deflate raises a zlib.error, which is no error of zipfile."""
+    with pytest.raises(ValueError, match="it is damaged: "):
+        unzipped(content, 10_000)
+    with pytest.raises(MapError, match=r"the zip cannot be read \(it is damaged: .*: give a zip of a ROS map's YAML"):
+        stored_map([("map.zip", content)], Path("nowhere"))
+
+
+def test_channels_with_a_pipe(tmp_path: Path) -> None:
+    (tmp_path / "a.zarr").mkdir()
+    os.mkfifo(tmp_path / "a.zarr" / "zarr.json")
+    with pytest.raises(SettingsError, match=r"cannot be read \('zarr.json' is a link, a pipe or a device\): give"):
+        load_channels(tmp_path / "a.zarr")
 
 
 def test_write_bytes_and_text(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """IFC models as maps: storeys, types, materials, units and placement, and what is refused."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,11 @@ def material_at(partial: sp.PartialMap, x: float, y: float) -> sp.Material | Non
     return partial.wall_materials[number - 1] if number else None
 
 
+def thick(name: str, thickness_m: float | None = None) -> sp.Material:
+    material = sp.Material.named(name)
+    return material if thickness_m is None else replace(material, thickness_m=thickness_m)
+
+
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     building, path = Building(0.0, 3.2), tmp_path_factory.mktemp("ifc") / "building.ifc"
@@ -48,8 +54,8 @@ def test_rooms(path: Path) -> None:
 
 def test_materials(path: Path) -> None:
     partial = sp.load_map(path, storey="Level 0")
-    expected = {(2.0, 0.0): "concrete", (8.0, 2.5): "glass", (6.4, 2.5): "concrete"}
-    assert {at: material_at(partial, *at) for at in expected} == {k: sp.Material.named(v) for k, v in expected.items()}
+    expected = {(2.0, 0.0): thick("concrete", 0.15), (8.0, 2.5): thick("glass"), (6.4, 2.5): thick("concrete")}
+    assert {at: material_at(partial, *at) for at in expected} == expected
     assert material_at(partial, 0.0, 2.0) is None
     given = sp.load_map(path, storey="Level 0", layer_materials={"ifcwall*": "brick", "IfcDoor": "metal"})
     assert [material_at(given, *at) for at in ((2.0, 0.0), (4.0, 2.5), (8.0, 2.5))] == [
@@ -66,6 +72,92 @@ def test_one_storey_with_walls_placed_and_turned(tmp_path: Path) -> None:
     building.model.write(str(tmp_path / "a.ifc"))
     partial = sp.load_map(tmp_path / "a.ifc", resolution_m=0.1)
     assert states(partial, (99.0, 52.0), (96.0, 56.0), (100.0, 52.0), (97.5, 58.0)) == [FREE, FREE, WALL, WALL]
+
+
+@pytest.mark.parametrize("name", ["control", "inner_in_layers", "outer_in_layers", "sub_walls"])
+def test_bodies_in_parts(name: str) -> None:
+    """At 28 GHz a wall with two layers of its own bodies is opaque, as one with a single body is."""
+    partial = sp.load_map(Path(__file__).parent / "reports" / "ifc_layers" / f"{name}.ifc")
+    assert sp.trace_links(partial, (2.0, 3.0, 1.5), [(6.0, 3.2, 1.5)]).link_state.tolist() == [sp.LinkState.OUTAGE]
+    report = partial.import_report
+    assert report is not None
+    assert report.rooms == 2
+    assert report.extent_m == pytest.approx((8.0, 6.0), abs=0.06)
+    parts = {row.name: row.count for row in report.used}.get("IfcBuildingElementPart", 0)
+    assert parts == {"inner_in_layers": 2, "outer_in_layers": 8}.get(name, 0)
+
+
+@pytest.mark.parametrize(
+    ("layers", "expected"),
+    [
+        ([("Concrete C30", 240.0)], thick("concrete", 0.24)),
+        ([("Plaster", 15.0), ("Stahlbeton", 300.0), ("Wood", 20.0)], thick("reinforced concrete", 0.3)),
+        ([("Brick", 115.0), ("Air", 40.0), ("Brick", 115.0), ("Gypsum board", 12.5)], thick("brick", 0.23)),
+        ([("Gypsum board", 12.5), ("Air", 75.0), ("Gypsum board", 12.5)], thick("drywall")),
+        ([("Beton", None)], thick("concrete", 0.1)),
+        ([("Plaster", 15.0)], None),
+    ],
+)
+def test_thickness_of_layers(tmp_path: Path, layers: list[tuple[str, float]], expected: sp.Material | None) -> None:
+    building = Building(0.0)
+    inner = building.rooms(0.0, 0)[-1]
+    if layers[0][1] is None:
+        building.of_list(inner, layers[0][0])
+    else:
+        building.made_of(inner, *layers)
+    building.model.write(str(tmp_path / "a.ifc"))
+    assert material_at(sp.load_map(tmp_path / "a.ifc"), 4.0, 1.0) == expected
+
+
+def test_loss_of_layers(tmp_path: Path) -> None:
+    """ITU-R P.2040 has 29.3 dB for 24 cm of concrete at 5 GHz, and 36.3 dB for 30 cm."""
+    for thickness, loss_db in ((240.0, 29.3), (300.0, 36.3)):
+        building = Building(0.0)
+        for wall in building.rooms(0.0, 0):
+            building.made_of(wall, ("Concrete", thickness))
+        building.model.write(str(tmp_path / "a.ifc"))
+        settings = sp.TraceSettings(frequency_hz=5e9, max_depth=0, diffraction=False)
+        found = sp.trace_links(
+            sp.load_map(tmp_path / "a.ifc"), (2.0, 1.0, 1.5), [(5.5, 1.0, 1.5)], trace_settings=settings
+        )
+        free_db = 20 * np.log10(299792458 / 5e9 / (4 * np.pi * 3.5))
+        assert free_db - found.gain_db[0] == pytest.approx(loss_db, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("materials", "expected"),
+    [
+        (["Aluminium"], "glass"),
+        (["Holz", "Isolierverglasung"], "glass"),
+        (["Aluminium", "Low-E coated glass"], "coated glass"),
+    ],
+)
+def test_windows_are_of_their_panes(tmp_path: Path, materials: list[str], expected: str) -> None:
+    building = Building(0.0)
+    building.rooms(0.0, 0)
+    building.of_list(building.model.by_type("IfcWindow")[0], *materials)
+    building.model.write(str(tmp_path / "a.ifc"))
+    assert material_at(sp.load_map(tmp_path / "a.ifc"), 8.0, 2.5) == sp.Material.named(expected)
+
+
+def test_report(path: Path) -> None:
+    report = sp.load_map(path, storey="Level 0").import_report
+    assert report is not None
+    assert (report.unit_m, report.unit_source, report.rooms) == (0.001, "units of the IfcProject", 2)
+    assert {row.name: row.count for row in report.used} == {
+        "IfcWall": 6,
+        "IfcWallStandardCase": 1,
+        "IfcWindow": 1,
+        "IfcColumn": 1,
+    }
+    assert {(row.name, row.count, row.reason) for row in report.skipped} == {
+        ("IfcWall", 6, "nothing 1.2 m above the storey"),
+        ("IfcWallStandardCase", 1, "nothing 1.2 m above the storey"),
+        ("IfcWindow", 1, "nothing 1.2 m above the storey"),
+        ("IfcColumn", 1, "nothing 1.2 m above the storey"),
+        ("IfcDoor", 2, "open; layer_materials for IfcDoor closes it"),
+        ("IfcFurniture", 2, "no wall"),
+    }
 
 
 def wallless(path: Path) -> None:

@@ -35,9 +35,14 @@ end_header
 """
 
 
+TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
+
+
 def written(folder: Path, suffix: str, scene: trimesh.Scene | None = None) -> Path:
     """Write the room as a mesh file."""
     scene = scene or room()
+    if suffix in ("glb", "gltf"):
+        scene.apply_transform(TO_Y_UP)
     path = folder / f"room.{suffix}"
     if suffix == "gltf":
         for name, content in trimesh.exchange.gltf.export_gltf(scene).items():
@@ -62,9 +67,20 @@ def test_nodes_are_placed_by_their_transforms(tmp_path: Path) -> None:
     for shift in (0.0, 10.0):
         moved = trimesh.transformations.translation_matrix((shift, 0, 0)) @ turn
         scene.add_geometry(trimesh.creation.box((2, 6, 3)), geom_name="box", transform=moved)
-    mesh = read_mesh(written(tmp_path, "glb", scene))
+    scene.export(tmp_path / "boxes.glb")
+    mesh = read_mesh(tmp_path / "boxes.glb", "z")
     assert len(mesh.triangles) == 24
     np.testing.assert_allclose(mesh.bounds_m, [[-3, -1, -1.5], [13, 1, 1.5]], atol=1e-6)
+
+
+def test_projective_nodes(tmp_path: Path) -> None:
+    path = written(tmp_path, "gltf")
+    sheet = json.loads(path.read_text())
+    node = next(node for node in sheet["nodes"] if "mesh" in node)
+    node["matrix"] = [1, 0, 0, 0.1, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]
+    path.write_text(json.dumps(sheet))
+    with pytest.raises(MapError, match=r"is damaged or no GLTF mesh \(a transform is projective, with the last row"):
+        read_mesh(path)
 
 
 def test_far_meshes_keep_their_digits(tmp_path: Path) -> None:
@@ -82,15 +98,31 @@ def test_colours_and_textures_are_ignored(tmp_path: Path) -> None:
     assert read_mesh(written(tmp_path, "ply", scene)) == read_mesh(written(tmp_path, "ply"))
 
 
-@pytest.mark.parametrize("suffix", ["glb", "ply"])
-def test_y_up(tmp_path: Path, suffix: str) -> None:
+@pytest.mark.parametrize(
+    ("suffix", "up", "message"),
+    [
+        ("ply", "y", 'looks as if y pointed up: give up="y" to turn it, or up="z" to read it'),
+        ("glb", "z", 'looks as if z pointed up, against the specification of glTF: give up="z" to turn it'),
+    ],
+)
+def test_other_axis_up(tmp_path: Path, suffix: str, up: str, message: str) -> None:
     lying = room()
-    lying.apply_transform([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    lying.apply_transform(TO_Y_UP if up == "y" else np.linalg.inv(TO_Y_UP))
     path = written(tmp_path, suffix, lying)
-    with pytest.warns(MapWarning, match='looks as if y pointed up: give up="y" to turn it, or up="z" to read it'):
+    with pytest.warns(MapWarning, match=message):
         read_mesh(path)
-    np.testing.assert_allclose(read_mesh(path, "y").bounds_m, [[0, 0, 0], [5, 4, 3]], atol=1e-6)
-    np.testing.assert_allclose(read_mesh(path, "z").bounds_m, [[0, 0, -4], [5, 3, 0]], atol=1e-6)
+    np.testing.assert_allclose(read_mesh(path, up).bounds_m, [[0, 0, 0], [5, 4, 3]], atol=1e-6)
+
+
+ROOMS = {"corridor": (20, 2, 2.6), "cellar": (8, 6, 2.1), "flat": (9, 6, 2.7), "hall": (12, 8, 9)}
+
+
+@pytest.mark.parametrize("name", ROOMS)
+def test_rooms_of_both_axes(name: str) -> None:
+    """By its specification, y of glTF points up; a hall may be higher than wide."""
+    for file in (f"{name}.glb", f"{name}_zup.ply"):
+        mesh = read_mesh(Path(__file__).parent / "reports" / "gltf_up" / file)
+        np.testing.assert_allclose(np.ptp(mesh.bounds_m, axis=0), ROOMS[name], atol=1e-6)
 
 
 def empty_zip() -> bytes:

@@ -16,7 +16,7 @@ from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import MapWarning, PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 ROOM = scene_mesh(*room().geometry.values())
@@ -169,10 +169,10 @@ class TestKnown:
         ({"height_band_m": 2}, "height_band_m = 2 is not allowed: give (low, high), z in metres"),
         ({"height_band_m": (0, np.inf)}, "height_band_m = (0, inf) is not allowed"),
         ({"observed": "all"}, "observed = 'all' is not numeric: give the corners (M, 2) of a polygon without"),
-        ({"observed": [(0, 0), (1, 1)]}, "observed has shape (2, 2) or values that are not finite: give the corners"),
-        ({"observed": [(0, 0), (1, 1), (np.nan, 1)]}, "observed has shape (3, 2) or values that are not finite"),
-        ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "observed is no polygon (Self-intersection"),
-        ({"observed": [(0, 0), (1, 1), (2, 2)]}, "observed is no polygon ("),
+        ({"observed": [(0, 0), (1, 1)]}, "observed has shape (2, 2): give the corners"),
+        ({"observed": [(0, 0), (1, 1), (np.nan, 1)]}, "observed has the corner [nan, 1.0]: give the corners"),
+        ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "] is no polygon (Self-intersection"),
+        ({"observed": [(0, 0), (1, 1), (2, 2)]}, "] is no polygon ("),
         ({"observed": [(9, 9), (10, 9), (9, 10)]}, "observed holds no cell of the map, which spans x -0.05 to 5.1 m"),
     ],
 )
@@ -188,13 +188,24 @@ def test_observed_map_elsewhere() -> None:
     assert (mesh_map(ROOM, MeshReading(observed=nothing)).state == UNKNOWN).all()
 
 
-@pytest.mark.parametrize(("factor", "end"), [(100, "or give the height_band_m of the walls"), (0.001, ")")])
+@pytest.mark.parametrize(("factor", "end"), [(100, "or give the height_band_m of the walls"), (0.001, "kilometres")])
 def test_other_units_than_metres(factor: float, end: str) -> None:
     scaled = SceneMesh(ROOM.vertices_m * factor, ROOM.triangles, ROOM.material)
-    with pytest.raises(MapError, match=r"the mesh spans .* m: scale it to metres .*" + re.escape(end)):
+    with pytest.raises(MapError, match=r"the mesh spans .* m: give unit_m, the length of its unit.*" + re.escape(end)):
         mesh_map(scaled, MeshReading(resolution_m=1.0))
     if factor > 1:
         assert mesh_map(scaled, MeshReading(resolution_m=1.0, height_band_m=(1.0, 2.0))).state.any()
+
+
+def test_feet() -> None:
+    """A house of two storeys in feet, and a hall of the same height in metres."""
+    house = scene_mesh(box((0, 0, 0), (40, 30, 8.5)), box((0, 0, 9.5), (40, 30, 18)))
+    with pytest.warns(MapWarning, match=r"the mesh spans 40 x 30 m, with a storey of 8.5 m, as if it were in feet"):
+        mesh_map(house, MeshReading(resolution_m=0.5))
+    partial = mesh_map(house, MeshReading(resolution_m=0.1, unit_m=0.3048))
+    assert partial.height_range_m == pytest.approx((0.0, 18 * 0.3048))
+    assert partial.bounds_m[2] == pytest.approx(40 * 0.3048, abs=0.21)
+    mesh_map(scene_mesh(box((0, 0, 0), (12, 8, 9))), MeshReading(resolution_m=0.5))
 
 
 def test_too_many_cells() -> None:

@@ -155,8 +155,22 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
         (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
         (RADIO + shape("cube", moved('<rotate x="1"/>')), "has a to_world with <rotate {'x': '1'}>, which cannot"),
         (RADIO + shape("cube", moved('<matrix value="1 2"/>')), "has a to_world with <matrix {'value': '1 2'}>, which"),
-        (RADIO + shape("cube", moved('<scale value="nan"/>')), "is not allowed: give finite numbers of metres"),
-        (RADIO + shape("cube", moved('<scale value="0"/>')), "holds degenerate triangles alone"),
+        (
+            RADIO + shape("cube", moved('<scale value="nan"/>')),
+            "which cannot be read (a transform is not finite): ",
+        ),
+        (
+            RADIO + shape("cube", moved('<scale value="0"/>')),
+            "which cannot be read (it flattens the shape): ",
+        ),
+        (
+            RADIO + shape("cube", moved('<matrix value="1 0 0 0  0 1 0 0  0 0 1 0  0.1 0 0 1"/>')),
+            "which cannot be read (a transform is projective, with the last row [0.1, 0.0, 0.0, 1.0]): give matrix",
+        ),
+        (
+            RADIO + shape("cube", moved('<matrix value="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 2"/>')),
+            "a transform is projective, with the last row [0.0, 0.0, 0.0, 2.0]",
+        ),
     ],
 )
 def test_refused(tmp_path: Path, content: str, message: str) -> None:

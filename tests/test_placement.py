@@ -147,6 +147,13 @@ class TestErrors:
         with pytest.raises(SettingsError, match=message):
             sp.place_transmitter(home(HALF_SEEN), **options)
 
+    @pytest.mark.parametrize("cells", [4, 6, 8])
+    def test_rooms_without_space_for_a_neighbour(self, cells: int) -> None:
+        state = np.pad(np.zeros((cells, cells), np.uint8), 1, constant_values=1)
+        settings = sp.TraceSettings(max_depth=0, diffraction=False)
+        found = sp.place_transmitter(sp.PartialMap(state, 0.1), trace_settings=settings)
+        assert (found.score, len(found.trajectory_m)) == (1.0, 1)
+
     def test_no_free_cell(self) -> None:
         with pytest.raises(PositionError, match="a transmitter can stand nowhere: the map has 0 free cells"):
             sp.place_transmitter(home("??#\n###"))

@@ -80,7 +80,7 @@ def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
 def require_room(partial: PartialMap) -> None:
     assert states(partial, INSIDE, IN_WALL, OUTSIDE, (3.27, 1.27)) == [FREE, WALL, UNKNOWN, UNKNOWN]
     assert states(partial, (1.4, 1.3), (3.03, 1.3)) == [FREE, WALL]  # under the table; the pillar
-    assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.02)
     assert partial.is_complete
     assert (partial.state == FREE).sum() * 0.05**2 == pytest.approx(5 * 3 - 0.25, rel=0.05)
 
@@ -106,6 +106,31 @@ def test_heights_count_from_the_floor(floor_m: float) -> None:
     require_room(map_from_points(room(floor_m)))
 
 
+@pytest.mark.parametrize("noise_m", [0.0, 0.003, 0.02])
+@pytest.mark.parametrize(("floor_m", "height_m"), [(0.0, 2.5), (0.024, 2.6), (-1.23, 2.62), (7.0, 2.75)])
+def test_wall_height(floor_m: float, height_m: float, noise_m: float) -> None:
+    """A flat surface without noise fills one layer of voxels, with noise two."""
+    rng = np.random.default_rng(1)
+    points = shell((0.02, 0.02, 0), (5.02, 4.02, height_m), rng)
+    points[:, 2] += rng.normal(floor_m, noise_m, len(points))
+    assert map_from_points(points).wall_height_m == pytest.approx(height_m, abs=0.02)
+
+
+def test_feet() -> None:
+    points = shell((0, 0, 0), (40, 30, 9), np.random.default_rng(0))[::3]
+    message = r"points spans 40.1 x 30.1 m, with a storey of 9 m, as if it were in feet: give unit_m=0.3048 for"
+    with pytest.warns(MapWarning, match=message):
+        map_from_points(points)
+    assert map_from_points(points, unit_m=1).wall_height_m == pytest.approx(9.0, abs=0.02)
+    partial = map_from_points(points, unit_m=0.3048, resolution_m=0.1)
+    assert partial.wall_height_m == pytest.approx(9 * 0.3048, abs=0.02)
+    report = partial.import_report
+    assert report is not None
+    assert (report.unit_m, report.unit_source, report.rooms) == (0.3048, "unit_m", 1)
+    assert report.extent_m == pytest.approx((40 * 0.3048, 30 * 0.3048), abs=0.3)
+    assert [(row.name, row.count) for row in report.used] == [("points", len(points))]
+
+
 def test_map_coordinates(tmp_path: Path) -> None:
     shift = np.array([500_000.0, 4_500_000.0, 0.0])
     far = load_map(write(tmp_path / "room.laz", ROOM + shift))
@@ -126,7 +151,7 @@ def test_two_storeys() -> None:
     require_room(map_from_points(both, observed=[(0, 0), (5.1, 0), (5.1, 3.1), (0, 3.1)]))
     partial = map_from_points(both, height_band_m=(3.9, 4.7))
     assert states(partial, INSIDE, (12.0, 1.5)) == [UNKNOWN, FREE]
-    assert partial.wall_height_m == pytest.approx(2.6, abs=0.06)
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.02)
 
 
 def test_walls_alone() -> None:
@@ -186,8 +211,8 @@ def test_shipped_scene_comes_back() -> None:
         ({"points": np.zeros((0, 3))}, "points holds no finite point: give a cloud with x, y, z in metres"),
         ({"points": np.full((5, 3), np.nan)}, "points holds no finite point"),
         ({"points": [["a"] * 3]}, "points = [['a', 'a', 'a']] is not numeric: give x, y, z in metres, (N, 3)"),
-        ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: scale it to metres"),
-        ({"points": ROOM * 1000}, "scale it to metres (0.01 for centimetres"),
+        ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: give unit_m, the length of its unit in metres"),
+        ({"points": ROOM * 1000}, "give unit_m, the length of its unit in metres, 0.01 for centimetres"),
         ({"points": [(0, 0, 0), (1e5, 0, 0)]}, "points spans more than 52,429 m: remove stray points, or cut it"),
         ({"points": [(0, 0, 0), (1e9, 0, 0)]}, "points holds coordinates above 1e+08 m: give a cloud in metres"),
         ({"points": [(0, 0, 0), (9e3, 9e3, 0)]}, "more than 100,000,000: give"),
@@ -196,6 +221,7 @@ def test_shipped_scene_comes_back() -> None:
         ({"sensor_positions_m": [(1.0, 2.0)], "up": "y"}, 'with up = "y": give x, y, z of the cloud, (M, 3)'),
         ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high)"),
         ({"up": "x"}, "up = 'x' is not allowed"),
+        ({"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres, such as 0.3048 for feet"),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed"),
     ],
 )

@@ -12,12 +12,14 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
+from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.maps import ros_map
+from sionna_partial.maps.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.maps.ros_map import turn_grid, write_ros_map
@@ -256,8 +258,8 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
         ("origin", ([0, 0, 90],), r"the yaw in radians, one turn at most \(not degrees\)"),
         ("negate", (2, -1, 0.0, "maybe", None), "give 0 .dark is wall. or 1 .bright is wall."),
         ("mode", ("ternary", 3, None), "choose one of trinary, scale, raw"),
-        ("image", ("", None, 3, ["map.pgm"], "a\0b"), "give the file name of the map image"),
-        ("image", ("gone.pgm", ".", "a" * 300), "there is no file '.*'; put the image there"),
+        ("image", ("", None, 3, ["map.pgm"], "a\0b", "a\ud800b"), "give the file name of the map image"),
+        ("image", ("gone.pgm", ".", "a" * 300, "loop"), "there is no file '.*'; put the image there"),
         ("wall_height", (0, -3, math.nan, "tall"), r"give a number of metres in \[0.1, 100\]"),
         (
             "material",
@@ -270,12 +272,13 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
 def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], message: str) -> None:
     """The error names the file, the field, the value and the remedy."""
     (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
+    (tmp_path / "loop").symlink_to("loop")
     for value in values:
         path = write_sheet(tmp_path, **{key: value})
         with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}") as caught:
             load_map(path)
         shown = str(value)
-        assert len(shown) > 100 or shown in str(caught.value) or "\0" in shown
+        assert len(shown) > 100 or shown in str(caught.value) or {"\0", "\ud800"} & {*shown}
 
 
 def test_origin_too_far(tmp_path: Path) -> None:
@@ -530,3 +533,69 @@ def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
     with pytest.raises(MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells,"):
         turn_grid(GRID, 0.1, (0.0, 1.0, 0.5))
+
+
+REPORTS = Path(__file__).parent / "reports"
+
+
+def levels(*parts: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Return a square grid of occupancies with `count` cells for each value from low to high."""
+    values = np.concatenate([np.repeat(np.arange(low, high + 1), count) for low, high, count in parts])
+    size = math.ceil(math.sqrt(len(values)))
+    return np.append(values, np.full(size**2 - len(values), -1)).reshape(size, size)
+
+
+class TestContinuousValues:
+    """Occupancies of many values between the thresholds, as Cartographer exports them."""
+
+    def test_thresholds_fit_the_map(self) -> None:
+        """The map has 26,480 free cells, 1,520 of wall, and 15,200 unknown ones."""
+        path = REPORTS / "continuous_occupancy" / "carto.yaml"
+        with pytest.warns(MapWarning, match=r"26,543 of 28,000 seen cells have an occupancy between 19.6 and 65 %"):
+            partial = load_map(path)
+        assert np.bincount(partial.state.ravel()).tolist() == [26_480, 1_520, 15_200]
+        assert "walls are the cells from 53.9 % on" in str(partial.import_report)
+        shade = np.asarray(Image.open(path.with_suffix(".pgm")))[::-1]
+        percent = np.where(shade == 128, -1, np.rint(100 * (1 - shade / 255))).astype(np.int8)
+        with pytest.warns(MapWarning, match=r"walls are the cells from 54.0 % on, and other seen cells are free"):
+            assert np.array_equal(map_from_occupancy(percent, 0.05).state, partial.state)
+        given = map_from_occupancy(percent, 0.05, free_percent=25)
+        assert np.bincount(given.state.ravel()).tolist() == [2_854, 1_457, 38_889]
+        with pytest.warns(MapWarning, match="1,457 wall cells and 0 free ones"):
+            load_map(path, strict=True)
+
+    @pytest.mark.parametrize(
+        ("parts", "free", "wall"),
+        [
+            ([(10, 40, 400), (70, 95, 30)], 31 * 400, 26 * 30),
+            ([(30, 45, 900), (60, 80, 9)], 16 * 900, 21 * 9),
+        ],
+    )
+    def test_valleys(self, parts: list[tuple[int, int, int]], free: int, wall: int) -> None:
+        with pytest.warns(MapWarning, match="as in a map of probabilities"):
+            partial = map_from_occupancy(levels(*parts), 0.05)
+        assert np.bincount(partial.state.ravel(), minlength=2)[:2].tolist() == [free, wall]
+
+    @pytest.mark.parametrize("parts", [[(20, 60, 100)], [(0, 100, 50)], [(28, 48, 500)], [(50, 99, 100)]])
+    def test_values_that_are_not_separate(self, parts: list[tuple[int, int, int]]) -> None:
+        message = "seen cells have an occupancy between 25 and 65 % and are read as unknown: Give free_percent"
+        with pytest.warns(MapWarning, match=message):
+            partial = map_from_occupancy(levels(*parts), 0.05)
+        assert partial.import_report is not None
+        (row,) = partial.import_report.skipped
+        assert row.count == sum(
+            count for low, high, count in parts for value in range(low, high + 1) if 25 < value < 65
+        )
+
+    @pytest.mark.parametrize(
+        "parts",
+        [
+            [(0, 0, 5000), (100, 100, 500)],
+            [(0, 0, 5000), (50, 50, 3000), (100, 100, 500)],
+            [(0, 0, 5000), (26, 64, 20), (99, 100, 500)],
+        ],
+    )
+    def test_other_maps_keep_the_standard_thresholds(self, parts: list[tuple[int, int, int]]) -> None:
+        percent = levels(*parts)
+        standard = map_from_occupancy(percent, 0.05, free_percent=25, occupied_percent=65)
+        assert np.array_equal(map_from_occupancy(percent, 0.05).state, standard.state)

@@ -6,6 +6,7 @@ from pathlib import Path
 import ezdxf
 import numpy as np
 import pytest
+import shapely
 import yaml
 
 import sionna_partial as sp
@@ -57,10 +58,26 @@ class TestMap:
         with pytest.raises(MapError, match=message):
             replace(room(), **changes)  # type: ignore[arg-type]
 
-    @pytest.mark.parametrize("where", [np.zeros((3, 3), bool), [(0.0, 1.0)], "door", [[1, 2, 3]] * 4])
-    def test_areas_that_are_none(self, where: object) -> None:
-        with pytest.raises(MapError, match="where"):
-            room().with_wall_material("brick", where)
+    @pytest.mark.parametrize(
+        ("where", "message"),
+        [
+            (np.zeros((3, 3), bool), r"where has shape \(3, 3\): give booleans \(40, 60\), or corners \(M, 2\)"),
+            ([(0.0, 1.0)], r"where has shape \(1, 2\): give the corners \(M, 2\) of a polygon without crossings"),
+            ("door", "where = 'door' is not numeric: give cells"),
+            ([[1, 2, 3]] * 4, r"where has shape \(4, 3\): give the corners"),
+            ([(0, 0), (4, 0), (4, np.nan)], r"where has the corner \[4.0, nan\]: give the corners .* all finite"),
+            ([(0, 0), (4, 4), (4, 0), (0, 4)], r"where = .* is no polygon \(Self-intersection.*: give the corners"),
+            ([(0, 0), (1, 1), (2, 2)], r"where = .* is no polygon \("),
+            (shapely.Polygon([(0, 0), (4, 4), (4, 0), (0, 4)]), r"where is no area \(Self-inters.*shapely.make_valid"),
+        ],
+    )
+    def test_areas_that_are_none(self, where: object, message: str) -> None:
+        for change in (
+            lambda: room().with_wall_material("brick", where),
+            lambda: room().with_obstacle_height(1, where),
+        ):
+            with pytest.raises(MapError, match=message):
+                change()
 
 
 class TestFiles:

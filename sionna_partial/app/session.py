@@ -38,6 +38,7 @@ from sionna_partial.errors import MapError, PositionError, SettingsError, Sionna
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.export import save_coverage, save_network
+from sionna_partial.files import unzipped
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -637,13 +638,9 @@ def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
 def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
     """Return the files of a zip, which may not unpack to more than `MOST_BYTES`."""
     try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            entries = [entry for entry in archive.infolist() if not entry.is_dir()]
-            if sum(entry.file_size for entry in entries) > MOST_BYTES:
-                raise MapError(f"the zip unpacks to more than {MOST_BYTES:,} bytes: give a smaller map.")
-            return [(entry.filename, archive.read(entry)) for entry in entries]
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
-        raise MapError(f"the zip cannot be read ({error}): give a ROS map's YAML and image.") from error
+        return [*unzipped(content, MOST_BYTES).items()]
+    except ValueError as error:
+        raise MapError(f"the zip cannot be read ({error}): give a zip of a ROS map's YAML and image.") from error
 
 
 def _zipped(paths: Sequence[Path]) -> bytes:

@@ -21,6 +21,7 @@ from sionna_partial.files import (
     input_path,
     open_regular,
     output_path,
+    require_plain_folder,
     require_plain_hdf5,
     write_netcdf,
 )
@@ -169,6 +170,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
         if source.suffix == ".zarr":
             if not source.is_dir():
                 raise NotADirectoryError("no folder")
+            require_plain_folder(source)
             table = xr.open_zarr(source, chunks=None, consolidated=False)
         else:
             open_regular(source, "path", SettingsError, MAX_BYTES).close()

@@ -23,6 +23,7 @@ _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [
 _MATERIAL_HELP = "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
 
 Map = Annotated[Path, typer.Argument(metavar="MAP", help=MAP_HELP, show_default=False)]
+MapIfGiven = Annotated[Path | None, typer.Argument(metavar="MAP", help=MAP_HELP, show_default=False)]
 Strict = Annotated[bool, typer.Option("--strict", help="Read the map file to the letter, even if it looks wrong.")]
 HeightBand = Annotated[
     tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help=_BAND_HELP, show_default=False)
@@ -36,6 +37,13 @@ MaterialOf = Annotated[
     typer.Option(
         metavar="LAYER=MATERIAL", help="Of a drawing or IFC model: material of a layer or type.", show_default=False
     ),
+]
+WallLayers = Annotated[
+    list[str] | None,
+    typer.Option("--wall-layer", metavar="LAYER", help="Of a drawing: a layer with walls.", show_default=False),
+]
+Unit = Annotated[
+    float | None, typer.Option(help="Of a drawing or scan: length of its unit [m], 0.001 for mm.", show_default=False)
 ]
 ObstacleHeight = Annotated[
     float | None,
@@ -180,6 +188,8 @@ def _read_map(
     up: Up = None,
     wall_height: WallHeight = None,
     material_of: MaterialOf = None,
+    wall_layer: WallLayers = None,
+    unit: Unit = None,
     storey: Storey = None,
     obstacle_height: ObstacleHeight = None,
 ) -> Any:
@@ -195,9 +205,23 @@ def _read_map(
         height_band_m=height_band,
         up=up,
         layer_materials=materials,
+        wall_layers=wall_layer or None,
+        unit_m=unit,
         storey=storey,
         obstacle_height_m=obstacle_height,
     )
+
+
+def _read_map_if_given(map_path: Path | None, **options: Any) -> Any:
+    return None if map_path is None else _read_map(map_path, **options)
+
+
+_read_map_if_given.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [
+        option.replace(annotation=MapIfGiven, default=None) if name == "map_path" else option
+        for name, option in inspect.signature(_read_map).parameters.items()
+    ]
+)
 
 
 def _sensor(
@@ -212,6 +236,7 @@ def _sensor(
 
 Settings = Annotated[dict[str, Any], settings_of]
 PartialMap = Annotated[Any, _read_map]
+PartialMapIfGiven = Annotated[Any, _read_map_if_given]
 Sensor = Annotated[SensorSettings, _sensor]
 """Parameters of commands that combine options, see `with_options`."""
 

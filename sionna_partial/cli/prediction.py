@@ -145,8 +145,12 @@ def demo(out: Annotated[Path, typer.Option(help="Folder for the results.")] = Pa
     opt.print_files(out, files)
 
 
-def info() -> None:
-    """Report what is found, what is missing, and what to do."""
+@opt.with_options
+def info(*, partial: opt.PartialMapIfGiven) -> None:
+    """Report how a map was read; without a map, what is installed, what is missing, and what to do."""
+    if partial is not None:
+        typer.echo(str(partial.import_report))
+        return
     from rich.console import Console
     from rich.table import Column, Table
 

@@ -40,8 +40,8 @@ POLL_S = 1.0
 ANY_PORT = "127.0.0.1:0"
 """Address of dask's own pages: its usual port may be taken."""
 
-MAX_SCHEDULER_BYTES = 1_000_000
-"""Largest scheduler file."""
+MAX_SCHEDULER_BYTES, MAX_INDEX_BYTES = 1_000_000, 4_000_000_000
+"""Largest scheduler file, and largest index of a data set [bytes]."""
 
 CONNECT_S = 30.0
 """Time to wait for a scheduler [s]."""
@@ -214,7 +214,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
             )
         return
     try:
-        differences = list(_differences(json.loads(path.read_text(encoding="utf-8")), index))
+        differences = list(_differences(json.loads(read_bytes(path, "path", OutputError, MAX_INDEX_BYTES)), index))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise OutputError(f"'{path}' is damaged ({error}): choose a new folder.") from error
     if differences:

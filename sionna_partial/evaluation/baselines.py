@@ -12,13 +12,16 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write
+from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.settings import PredictorSettings
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
+
+_MAX_BYTES = 1_000_000
+"""Largest file of the majority that is read."""
 
 OFFICES = ("mixed", "open")
 """Indoor scenarios of 3GPP TR 38.901."""
@@ -88,7 +91,7 @@ class Baselines(Shown):
         """Read what `save` wrote."""
         path = folder / MAJORITY_FILE
         try:
-            content = json.loads(path.read_text(encoding="utf-8"))
+            content = json.loads(read_bytes(path, "path", PredictorError, _MAX_BYTES))
             cells = [content[state.name] for state in LinkState]
             columns = (tuple(float(cell[name]) for cell in cells) for name in ("share", "gain_mean_db", "gain_std_db"))
             majority = Majority(*columns)

@@ -7,6 +7,7 @@ import sqlite3
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -17,8 +18,9 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import BAG_SUFFIXES, DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError, SionnaPartialError
 from sionna_partial.files import decoding, input_path, open_regular
+from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array
-from sionna_partial.maps.ros_map import states_from_percent, turn_grid
+from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent, turn_grid
 
 MAX_BAG_BYTES = 10**12
 """Largest file of a recording [bytes]; only the messages that are asked for are read."""
@@ -34,8 +36,8 @@ _MCAP_MAGIC, _MCAP_SCHEMA, _MCAP_CHUNK = b"\x89MCAP0\r\n", 3, 6
 MAX_TILT_RAD = 0.01
 """Largest roll and pitch of a map's origin that pass for level [rad]."""
 
-OCCUPIED_PERCENT = 65
-"""Occupancy from which a cell is wall (the default of nav2's map_saver) [percent]."""
+OCCUPIED_PERCENT, FREE_PERCENT = 65, 25
+"""Occupancy from which a cell is wall, and up to which it is free (the defaults of nav2's map_saver) [percent]."""
 
 GRID = "OccupancyGrid"
 """Type of messages with a map."""
@@ -199,7 +201,9 @@ def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time
             raise MapError(f"path = '{recording.path}' has no map{given}: topic {name} {what}: {remedy}")
         grid = recording.decoded(*last).content
         try:
-            return map_from_occupancy(grid)
+            partial = map_from_occupancy(grid)
+            assert partial.import_source is not None
+            return replace(partial, import_source=replace(partial.import_source, file=str(recording.path)))
         except MapError as error:
             raise MapError(f"path = '{recording.path}', topic {name}: {error}") from error
 
@@ -210,8 +214,8 @@ def map_from_occupancy(
     *,
     origin_m: tuple[float, float] | None = None,
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
-    occupied_percent: float = OCCUPIED_PERCENT,
-    free_percent: float = 25,
+    occupied_percent: float | None = None,
+    free_percent: float | None = None,
 ) -> PartialMap:
     """Make a map of a ROS `nav_msgs/OccupancyGrid`: of the message itself, or of its array.
 
@@ -227,8 +231,9 @@ def map_from_occupancy(
         origin is honoured: quarter turns are exact, and for any other yaw cells have half the size.
     wall_height_m : float
         Height of walls and ceiling [m].
-    occupied_percent, free_percent : float
-        From this value a cell is wall; up to this value it is free (the defaults of nav2's map_saver).
+    occupied_percent, free_percent : float or None
+        From this value a cell is wall; up to this value it is free. By default 65 and 25, as of nav2's map_saver, or,
+        for a map of continuous values such as of Cartographer, one threshold that fits it, with a `MapWarning`.
 
     Returns
     -------
@@ -263,23 +268,33 @@ def map_of_percent(
     origin_m: tuple[float, float],
     yaw: float,
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
-    occupied_percent: float = OCCUPIED_PERCENT,
-    free_percent: float = 25,
+    occupied_percent: float | None = None,
+    free_percent: float | None = None,
 ) -> PartialMap:
     """Make a map of occupancies in percent, x and y of its lower-left corner [m], and its yaw [rad]."""
     values = grid_array("data", data, "iu")
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
         raise MapError(f"data holds {values[outside][0]}: give -1 for unknown, or the occupancy in percent, 0 to 100.")
+    is_given = free_percent is not None or occupied_percent is not None
+    free_percent = FREE_PERCENT if free_percent is None else free_percent
+    occupied_percent = OCCUPIED_PERCENT if occupied_percent is None else occupied_percent
     free, occupied = number_of(free_percent), number_of(occupied_percent)
     if not 0 <= free < occupied <= 100 or occupied <= 1:
         given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
         raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
+    notes = ImportNotes("data", 1.0, "resolution_m")
+    if not is_given:
+        count = np.bincount(values[(values >= 0) & (values <= 100)], minlength=101)
+        remedy = "Give free_percent and occupied_percent to choose others."
+        found = fitted_threshold(np.arange(101.0), count, free, occupied, notes, remedy)
+        free, occupied = (free, occupied) if found is None else (found, found)
     state = states_from_percent(values, occupied, free)
     partial = PartialMap(state, resolution_m, origin_m, wall_height_m)
-    if not yaw:
-        return partial
-    return PartialMap(*turn_grid(partial.state, partial.resolution_m, (*partial.origin_m, yaw)), wall_height_m)
+    if yaw:
+        turned = turn_grid(partial.state, partial.resolution_m, (*partial.origin_m, yaw))
+        partial = PartialMap(*turned, wall_height_m)
+    return notes.attached_to(partial)
 
 
 def occupancy_parts(message: Any) -> tuple[NDArray[Any], float, tuple[float, float, float]]:

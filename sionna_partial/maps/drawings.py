@@ -1,61 +1,40 @@
 """DXF floor plans -> PartialMap: lines of the wall layers on cells, and what they enclose."""
 
-import io
 import math
 import os
-import re
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
+from sionna_partial.maps.drawing_layers import NO_WALL, PARTIAL_HEIGHT, skip_reason
+from sionna_partial.maps.drawing_lines import LINE_TYPES, XREF, DrawnLines, Segments, opened
+from sionna_partial.maps.drawing_units import POSSIBLE_M, unit_of, wall_thickness
+from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
 """Largest drawing that is read [bytes]."""
 
-MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 200_000, 16
-"""Most pieces of lines, most blocks and entities in them, and most blocks within blocks."""
-
-WALL_NAMES = re.compile(
-    r"wall|wand|wänd|mauer|mur(?!al)|pared|parete|vägg|vegg|muur|sciana|ściana|стен|colum|pillar|s-cols|stütze|partition|"
-    r"window|glaz|fenster|fenetre|fenêtre|ventana|finestra",
-    re.IGNORECASE,
-)
-"""What names of layers with walls, columns and windows contain, in some languages of Europe."""
-
-NO_WALL_NAMES = re.compile(r"head|text|dim|anno|iden|note|furn|möbel|mobel", re.IGNORECASE)
-"""What names of layers contain that describe walls, or close doors (headers, in the names of the AIA)."""
-
-UNITS_M = {1.0: "metres", 0.01: "centimetres", 0.001: "millimetres"}
-"""Units in which plans without a unit are drawn [m]."""
-
-PLAUSIBLE_M, POSSIBLE_M = (4.0, 60.0), (1.0, 2000.0)
-"""Longer side of a building, where its unit is guessed, and of any one [m]."""
-
 OPENING_M, SOLID_M = 2.0, 0.5
 """Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both of its faces [m]."""
 
-FLAT_FRACTION = 0.001
-"""Distance of a polygon from its curve, in extents of the curve."""
-
-_LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID"}
-
-Segments = Floats
-"""Ends (N, 2, 2) of pieces of lines."""
+MAX_ADDED, MAX_GROWTH = 8, 1.5
+"""Most layers that are tried where walls enclose hardly any area; most that one of them may add to the extent."""
 
 
 def map_from_drawing(
@@ -63,6 +42,7 @@ def map_from_drawing(
     *,
     wall_layers: Sequence[str] | None = None,
     layer_materials: Mapping[str, Material | str] | None = None,
+    layer_heights_m: Mapping[str, float] | None = None,
     unit_m: float | None = None,
     resolution_m: float = DEFAULT_RESOLUTION_M,
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
@@ -80,13 +60,18 @@ def map_from_drawing(
         The drawing (DXF, text or binary).
     wall_layers : sequence of str or None
         Layers with the walls, `*` and `?` as in file names. By default visible layers whose names look like walls,
-        columns or windows, and all visible ones, with a `MapWarning`, if there are none.
+        columns or windows, in languages of Europe and in the AIA/NCS standard, without those to be demolished. If there
+        are none, all visible layers are walls. If they enclose hardly any area, the layer that closes most rooms is
+        added. Both raise a `MapWarning`.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers, `*` and `?` as in file names, or their names as of `Material.named`. Where
         there are lines of several, the last holds. All other walls are of the default.
+    layer_heights_m : mapping of str to float, or None
+        Heights of the walls on layers [m], `*` and `?` as in file names. By default walls reach the ceiling, with a
+        `MapWarning` for layers whose names mean a partial height.
     unit_m : float or None
-        Length of a unit of the drawing [m], 0.001 for millimetres. By default that of its `$INSUNITS`. Without one it
-        is guessed if only one of m, cm and mm makes a building, with a `MapWarning`.
+        Length of a unit of the drawing [m], 0.001 for millimetres. By default the unit of its `$INSUNITS`. Another
+        unit, with a `MapWarning`, if extent, doors, walls and texts of the drawing fit only that one.
     resolution_m : float
         Edge of a cell [m].
     wall_height_m : float
@@ -95,6 +80,7 @@ def map_from_drawing(
     Returns
     -------
     PartialMap
+        Its `import_report` lists the unit, and the layers that were read and skipped.
 
     Raises
     ------
@@ -117,45 +103,170 @@ def map_from_drawing(
     names = _given_layers(wall_layers)
     content = read_bytes(source, "path", MapError, MAX_DRAWING_BYTES, "purge it, or delete what is no wall.")
     with decoding(source, "no DXF", MapError):
-        drawing = _opened(content)
-        layers = _wall_layers(source, drawing, names)
-        segments, on_layer = _segments(source, drawing, layers)
-        materials = _of_layers(source, drawing, layers, layer_materials or {})
-        unit = unit or _unit(source, drawing, segments)
-    segments = segments * unit
-    extent = np.ptp(segments.reshape(-1, 2), axis=0)
-    if not POSSIBLE_M[0] <= extent.max() <= POSSIBLE_M[1]:
-        raise MapError(
-            f"path = '{source}' has walls that span {extent[0]:g} x {extent[1]:g} m with unit_m = {unit:g}: give the "
-            "unit_m in which it is drawn (0.001 for millimetres), or the wall_layers of one plan."
-        )
-    empty = fitted_grid(np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]), resolution_m)
-    state = states_of_lines(segments, empty)
+        plan = _Plan.of(source, opened(content))
+        reasons = plan.skip_reasons(names)
+        layers = {layer for layer, reason in reasons.items() if not reason}
+        segments, on_layer = plan.segments(layers)
+        notes = ImportNotes(source, unit or 0.0, "unit_m")
+        if unit is None:
+            notes.unit_m, notes.unit_source = plan.unit(segments)
+        state, empty = _cells(source, segments * notes.unit_m, notes.unit_m, resolution_m)
+        if names is None and _enclosed(state) < ENCLOSED_FRACTION:
+            added = _closing_layer(plan, reasons, segments, notes.unit_m, resolution_m)
+            if added is not None:
+                reasons[added], layers = "", layers | {added}
+                segments, on_layer = plan.segments(layers)
+                state, empty = _cells(source, segments * notes.unit_m, notes.unit_m, resolution_m)
+        plan.note(notes, reasons)
+        materials = _by_layer("layer_materials", plan, layers, layer_materials, material_given)
+        heights_m = _by_layer("layer_heights_m", plan, layers, layer_heights_m, _height_given)
     if not (state == CellState.FREE).any():
         raise MapError(
             f"path = '{source}': the walls of {shown(sorted(layers))} enclose nothing: name the layers that close the "
-            f"rooms as wall_layers; it has {_listed(drawing)}."
+            f"rooms as wall_layers; it has {plan.listed()}."
         )
     partial = PartialMap(state, empty.resolution_m, empty.origin_m, wall_height_m)
-    return with_materials(partial, segments, on_layer, materials) if materials else partial
+    lines = segments * notes.unit_m
+    partial = with_materials(partial, lines, on_layer, materials) if materials else partial
+    partial = _with_heights(source, partial, lines, on_layer, heights_m)
+    _warn_of_close_lines(source, segments, notes.unit_m, partial.resolution_m)
+    size = "give the unit_m in which it is drawn (0.001 for millimetres), or the wall_layers of one plan."
+    area = f"name the layers that close the rooms as wall_layers; it has {plan.listed()}."
+    return notes.attached_to(partial, size=size, doors=size, area=area)
 
 
-def _of_layers(
-    path: Path, drawing: Any, layers: set[str], given: Mapping[str, Material | str]
-) -> dict[Material, set[str]]:
-    """Return which of the layers with walls are of each material."""
-    from fnmatch import fnmatch
+class _Plan(NamedTuple):
+    """A drawing: its layers (in lower case) and whether they are visible, its lines, and the names of layers."""
 
+    path: Path
+    drawing: Any
+    visible: dict[str, bool]
+    lines: DrawnLines
+    names: dict[str, str]
+
+    @classmethod
+    def of(cls, path: Path, drawing: Any) -> "_Plan":
+        lines = DrawnLines(path, drawing)
+        visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF)}
+        visible |= {layer.dxf.name.lower(): layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
+        return cls(path, drawing, visible, lines, {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers})
+
+    def unit(self, segments: Segments) -> tuple[float, str]:
+        """Return the length of a unit [m] and where it comes from; see `unit_of`."""
+        header, texts = self.drawing.header, self.drawing.modelspace().query("TEXT MTEXT")
+        names = {"TEXT": "height", "MTEXT": "char_height"}
+        heights = np.array([float(text.dxf.get(names[text.dxftype()], 0.0)) for text in texts])
+        code, is_metric = int(header.get("$INSUNITS", 0)), header.get("$MEASUREMENT", 1) == 1
+        return unit_of(self.path, code, is_metric, segments, heights)
+
+    def listed(self) -> str:
+        """Return the names of the layers with their numbers of lines."""
+        counts = self.lines.line_counts()
+        names = sorted(self.visible, key=lambda layer: (-counts[layer], layer))
+        texts = (f"{self.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
+        return f"{len(names)} layers: {', '.join(texts)}"
+
+    def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
+        """Return the reason for which each layer is no wall, "" for those with walls."""
+        if names is not None:
+            found = {
+                layer: "" if any(fnmatch(layer, name.lower()) for name in names) else "not in wall_layers"
+                for layer in self.visible
+            }
+            if all(found.values()):
+                what = f"wall_layers = {shown(names)} are none of path = '{self.path}'"
+                raise MapError(f"{what}: it has {self.listed()}.")
+            return found
+        found = {layer: skip_reason(layer) if shows else "hidden" for layer, shows in self.visible.items()}
+        if all(found.values()):
+            message = f"path = '{self.path}' has no layer whose name looks like walls, so all lines are walls"
+            warnings.warn(f"{message}: name them as wall_layers; it has {self.listed()}.", MapWarning, stacklevel=4)
+            found = {layer: "" if reason != "hidden" else reason for layer, reason in found.items()}
+        return found
+
+    def segments(self, layers: set[str]) -> tuple[Segments, NDArray[np.str_]]:
+        """Return pieces of lines on some layers as `DrawnLines.segments`, or raise a MapError."""
+        segments, on_layer = self.lines.segments(layers)
+        if not len(segments):
+            remedy = f"name layers with lines as wall_layers; it has {self.listed()}."
+            raise MapError(f"path = '{self.path}' has no lines on {shown(sorted(layers))}: {remedy}")
+        return segments, on_layer
+
+    def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
+        """Note which elements are used, and which are skipped."""
+        for (name, kind), count in self.lines.counts.items():
+            layer = self.names.get(name, name)
+            if kind == XREF:
+                notes.skip(name, count, "external reference: bind it in the drawing")
+            elif kind in LINE_TYPES:
+                notes.skip(layer, count, reasons.get(name, NO_WALL))
+            elif kind != "INSERT" and not reasons.get(name, NO_WALL):
+                notes.skip(f"{kind} on {layer}", count, "type without lines")
+
+
+def _cells(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> tuple[States, PartialMap]:
+    """Return the cell states (ny, nx) of lines [m], and an empty map of these cells."""
+    extent = np.ptp(segments.reshape(-1, 2), axis=0)
+    if not POSSIBLE_M[0] <= extent.max() <= POSSIBLE_M[1]:
+        raise MapError(
+            f"path = '{path}' has walls that span {extent[0]:g} x {extent[1]:g} m with unit_m = {unit_m:g}: give the "
+            "unit_m in which it is drawn (0.001 for millimetres), or the wall_layers of one plan."
+        )
+    empty = fitted_grid(np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]), resolution_m)
+    return states_of_lines(segments, empty), empty
+
+
+def _enclosed(state: States) -> float:
+    return float((state == CellState.FREE).sum() / state.size)
+
+
+def _closing_layer(
+    plan: _Plan, reasons: dict[str, str], segments: Segments, unit_m: float, resolution_m: float
+) -> str | None:
+    """Return the other layer with which walls enclose most area, and warn of it; None if none closes the rooms."""
+    counts, found = plan.lines.line_counts(), dict[str, float]()
+    others = [layer for layer, reason in reasons.items() if reason == NO_WALL and counts[layer]]
+    extent = np.ptp(segments.reshape(-1, 2), axis=0).max()
+    for layer in sorted(others, key=lambda layer: -counts[layer])[:MAX_ADDED]:
+        both = np.concatenate([segments, plan.segments({layer})[0]])
+        if np.ptp(both.reshape(-1, 2), axis=0).max() <= MAX_GROWTH * extent:
+            state, empty = _cells(plan.path, both * unit_m, unit_m, resolution_m)
+            if _enclosed(state) >= 2 * ENCLOSED_FRACTION:
+                found[layer] = float((state == CellState.FREE).sum()) * empty.resolution_m**2
+    if not found:
+        return None
+    best = max(found, key=found.__getitem__)
+    used = shown(sorted(layer for layer, reason in reasons.items() if not reason))
+    what = f"path = '{plan.path}' has walls on {used} that enclose hardly any area"
+    what += (
+        f", so layer '{best}' ({counts[best]:,} lines) is read as walls, too, which then enclose {found[best]:.3g} m2"
+    )
+    warnings.warn(f"{what}: give wall_layers; it has {plan.listed()}.", MapWarning, stacklevel=4)
+    return best
+
+
+def _warn_of_close_lines(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> None:
+    """Warn of walls whose faces are closer to each other than a cell."""
+    thickness_m = wall_thickness(segments) * unit_m
+    if 0 < thickness_m < resolution_m:
+        what = f"path = '{path}' has lines {thickness_m:.2g} m apart, closer than resolution_m = {resolution_m:g}"
+        remedy = f"give a resolution_m of {thickness_m / 2:.1g}, or the unit_m in which it is drawn."
+        warnings.warn(f"{what}, with unit_m = {unit_m:g}: {remedy}", MapWarning, stacklevel=3)
+
+
+def _by_layer(name: str, plan: _Plan, layers: set[str], given: Any, checked: Any) -> dict[Any, set[str]]:
+    """Return the layers with walls for each value of an option that has values by the names of layers."""
+    given = {} if given is None else given
     if not isinstance(given, Mapping):
-        raise MapError(f"layer_materials = {shown(given)} is not allowed: give materials by the names of layers.")
-    found: dict[Material, set[str]] = {}
-    for name, value in given.items():
-        material = material_given(name, value)
-        own = {layer for layer in layers if fnmatch(layer, str(name).lower())}
+        raise MapError(f"{name} = {shown(given)} is not allowed: give values by the names of layers.")
+    found: dict[Any, set[str]] = {}
+    for pattern, value in given.items():
+        value = checked(pattern, value)
+        own = {layer for layer in layers if fnmatch(layer, str(pattern).lower())}
         if not own:
-            what = f"layer_materials[{shown(name)}] names no layer with walls of path = '{path}'"
-            raise MapError(f"{what}: it has {_listed(drawing)}.")
-        found[material] = found.get(material, set()) | own
+            what = f"{name}[{shown(pattern)}] names no layer with walls of path = '{plan.path}'"
+            raise MapError(f"{what}: it has {plan.listed()}.")
+        found[value] = found.get(value, set()) | own
     return found
 
 
@@ -167,20 +278,53 @@ def material_given(name: str, value: object) -> Material:
     return material
 
 
+def _height_given(name: str, value: object) -> float:
+    height_m = number_of(value)
+    if not 0.01 <= height_m <= 100:
+        raise MapError(
+            f"layer_heights_m[{shown(name)}] = {shown(value)} is not allowed: give a height of 0.01 to 100 m."
+        )
+    return height_m
+
+
 def with_materials(
     partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], materials: dict[Material, set[str]]
 ) -> PartialMap:
     """Give each wall the material of the nearest line."""
+    owner = _owners(partial, segments, on_layer, [*materials.values()])
+    return replace(partial, wall_material=owner, wall_materials=tuple(materials))
+
+
+def _with_heights(
+    path: Path, partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], heights_m: dict[float, set[str]]
+) -> PartialMap:
+    """Let walls on some layers end at a height [m], and warn of walls of partial height without one."""
+    named = set().union(*heights_m.values())
+    low = sorted(layer for layer in set(on_layer.tolist()) - named if PARTIAL_HEIGHT.search(layer))
+    if low:
+        what = f"path = '{path}' has walls of partial height on {shown(low)}, which are read up to the ceiling"
+        remedy = f"give layer_heights_m to map_from_drawing, such as {{'{low[0]}': 1.1}}, or wall_layers without them."
+        warnings.warn(f"{what}: {remedy}", MapWarning, stacklevel=3)
+    owner = _owners(partial, segments, on_layer, [*heights_m.values()]) if heights_m else np.zeros((1, 1))
+    for number, height_m in enumerate(heights_m, 1):
+        partial = partial.with_obstacle_height(height_m, owner == number)
+    return partial
+
+
+def _owners(
+    partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], groups: Sequence[set[str]]
+) -> NDArray[np.uint8]:
+    """Return the number (from 1) of the group of layers with the nearest line to each cell (ny, nx), 0 for others."""
     lines = (segments - partial.origin_m) / partial.resolution_m
     drawn = np.zeros(partial.shape, dtype=np.uint8)
-    for number, layers in enumerate([set(on_layer.tolist()), *materials.values()]):
+    for number, layers in enumerate([set(on_layer.tolist()), *groups]):
         chosen, cells = np.isin(on_layer, sorted(layers)), np.zeros(partial.shape, dtype=np.bool_)
         corners = np.zeros((int(chosen.sum()), 5, 2))
         corners[:, :2] = lines[chosen]
         mark_cells(corners, np.full(len(corners), 2), cells, BORDER_M / partial.resolution_m, True)
         drawn[cells] = number + 1
     nearest = ndimage.distance_transform_edt(drawn == 0, return_distances=False, return_indices=True)
-    return replace(partial, wall_material=drawn[tuple(nearest)] - 1, wall_materials=tuple(materials))
+    return np.asarray(drawn[tuple(nearest)] - 1)
 
 
 def _given_unit(unit_m: float | None) -> float | None:
@@ -194,116 +338,6 @@ def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
     if wall_layers is not None and not (plain and wall_layers and all(isinstance(each, str) for each in wall_layers)):
         raise MapError(f"wall_layers = {shown(wall_layers)} is not allowed: give names of layers, such as ['WALLS'].")
     return wall_layers
-
-
-def _opened(content: bytes) -> Any:
-    """Parse a DXF, which has to end as one."""
-    from ezdxf import recover
-    from ezdxf.document import Drawing
-    from ezdxf.lldxf.tagger import binary_tags_loader
-
-    is_binary = content.startswith(b"AutoCAD Binary DXF")
-    if not content.endswith(b"EOF\0") if is_binary else content.split()[-1:] != [b"EOF"]:
-        raise ValueError("it does not end with EOF")
-    return Drawing.load(binary_tags_loader(content)) if is_binary else recover.read(io.BytesIO(content))[0]
-
-
-def _layers(drawing: Any) -> dict[str, bool]:
-    """Names of all layers, and whether they are visible; those that are only used have no settings."""
-    used = (entity.dxf.layer for entity in drawing.entitydb.values() if entity.dxf.hasattr("layer"))
-    settings = {layer.dxf.name: layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
-    known = {name.lower() for name in settings}
-    return {name: True for name in used if name.lower() not in known} | settings
-
-
-def _listed(drawing: Any) -> str:
-    names = sorted(_layers(drawing))
-    return f"{len(names)} layers: {', '.join(names[:40])}"
-
-
-def _wall_layers(path: Path, drawing: Any, names: Sequence[str] | None) -> set[str]:
-    """Names, in lower case, of the layers with walls."""
-    from fnmatch import fnmatch
-
-    every = {name.lower(): is_visible for name, is_visible in _layers(drawing).items()}
-    if names is not None:
-        found = {layer for layer in every if any(fnmatch(layer, name.lower()) for name in names)}
-        if not found:
-            raise MapError(f"wall_layers = {shown(names)} are none of path = '{path}': it has {_listed(drawing)}.")
-        return found
-    visible = {name for name, is_visible in every.items() if is_visible}
-    found = {name for name in visible if WALL_NAMES.search(name) and not NO_WALL_NAMES.search(name)}
-    if not found:
-        message = f"path = '{path}' has no layer whose name looks like walls, so all lines are walls"
-        warnings.warn(f"{message}: name them as wall_layers; it has {_listed(drawing)}.", MapWarning, stacklevel=3)
-    return found or visible
-
-
-def _segments(path: Path, drawing: Any, layers: set[str]) -> tuple[Segments, NDArray[np.str_]]:
-    """Pieces (N, 2, 2) of lines on some layers of the model space, in units of the drawing, and their layers (N,)."""
-    pieces: list[tuple[float, float, float, float]] = []
-    on_layer: list[str] = []
-    parts = 0
-    for entity in _entities(drawing.modelspace(), "", MAX_NESTING):
-        parts += entity is None or entity.is_virtual
-        if parts > MAX_PARTS or len(pieces) > MAX_PIECES:
-            what = f"{MAX_PARTS:,} entities in blocks, or {MAX_PIECES:,} pieces of lines"
-            raise MapError(f"path = '{path}' has more than {what}: save the walls alone, exploded, as a drawing.")
-        if entity is not None and entity.dxf.layer.lower() in layers and entity.dxftype() in _LINES:
-            for corners in _curves(entity):
-                points = np.array([(corner.x, corner.y) for corner in corners], dtype=np.float64).reshape(-1, 2)
-                if np.isfinite(points).all():
-                    pieces.extend(np.hstack([points[:-1], points[1:]]).tolist())
-                    on_layer.extend([entity.dxf.layer.lower()] * (len(points) - 1))
-    if not pieces:
-        raise MapError(
-            f"path = '{path}' has no lines on {shown(sorted(layers))}: name layers with lines as wall_layers; it has "
-            f"{_listed(drawing)}."
-        )
-    return np.array(pieces).reshape(-1, 2, 2), np.array(on_layer)
-
-
-def _entities(entities: Iterable[Any], layer: str, nesting: int) -> Iterator[Any]:
-    """Yield entities with those of blocks, None for each block; what is on layer 0 in a block is on the block's own."""
-    for entity in entities:
-        if layer and entity.dxf.layer == "0":
-            entity.dxf.layer = layer
-        if entity.dxftype() == "INSERT":
-            for each in entity.multi_insert() if entity.mcount > 1 else [entity]:
-                yield None
-                if nesting:
-                    yield from _entities(each.virtual_entities(), entity.dxf.layer, nesting - 1)
-        elif entity.dxftype() == "MLINE":
-            yield from _entities(entity.virtual_entities(), entity.dxf.layer, nesting - 1) if nesting else ()
-        else:
-            yield entity
-
-
-def _curves(entity: Any) -> Iterator[Any]:
-    """Corners of the polygons that an entity consists of."""
-    from ezdxf.path import from_hatch, make_path
-
-    for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:
-        corners = np.array([(corner.x, corner.y) for corner in path.control_vertices()])
-        if len(corners) > 1:
-            yield path.flattening(max(FLAT_FRACTION * float(np.ptp(corners, axis=0).max()), 1e-9), segments=4)
-
-
-def _unit(path: Path, drawing: Any, segments: Segments) -> float:
-    """Length of a unit of a drawing [m]."""
-    from ezdxf import units
-    from ezdxf.enums import InsertUnits
-
-    code = drawing.header.get("$INSUNITS", 0)
-    if code in range(1, 25):
-        return float(units.conversion_factor(InsertUnits(code), InsertUnits.Meters))
-    size = float(np.ptp(segments.reshape(-1, 2), axis=0).max())
-    found = [unit for unit in UNITS_M if PLAUSIBLE_M[0] <= size * unit <= PLAUSIBLE_M[1]]
-    what = f"path = '{path}' has no unit ($INSUNITS = {code}), and walls of {size:g} units"
-    if len(found) != 1:
-        raise MapError(f"{what}: give unit_m, 0.001 if they are millimetres, 0.01 for centimetres, 1 for metres.")
-    warnings.warn(f"{what}, which are read as {UNITS_M[found[0]]}: give unit_m.", MapWarning, stacklevel=3)
-    return found[0]
 
 
 def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:

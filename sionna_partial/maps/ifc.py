@@ -1,7 +1,9 @@
-"""IFC building models -> PartialMap: a storey cut at the height of windows, by the types of what is cut."""
+"""IFC building models -> PartialMap: a storey cut at the height of windows, by the types of its elements."""
 
+import math
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +17,7 @@ from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, read_bytes
 from sionna_partial.maps.drawings import Segments, material_given, states_of_lines, with_materials
+from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
@@ -29,6 +32,9 @@ CUT_M = 1.2001
 
 LEAST_STOREY_M = 2.0
 """Height from which on the next storey is the ceiling of one [m]: levels nearer by are of stairs or foundations."""
+
+MAX_THICKNESS_M = 10.0
+"""Largest thickness of a material [m]."""
 
 DOOR = "IfcDoor"
 
@@ -56,8 +62,23 @@ NAMES = {
 """What names of materials contain, by our names for them; the first that fits counts."""
 
 
+PANES = ("IfcWindow", "IfcCurtainWall")
+"""Types whose panes count, not their frames."""
+
+SOLID = ("concrete", "reinforced concrete", "brick", "wood")
+"""Names of materials whose walls are as thick as their bodies, where no layer has a thickness."""
+
+
+class _Cut(NamedTuple):
+    """Lines of the body of an element in a horizontal plane, and the area that they enclose [m]."""
+
+    product: Any
+    segments: Segments
+    area: shapely.Geometry
+
+
 class _Piece(NamedTuple):
-    """What is cut of a part of a building: its material, None for the default, the lines, and what they enclose [m]."""
+    """Material of an element, None for the default, its lines, and the area that they enclose [m]."""
 
     material: Material | None
     segments: Segments
@@ -73,12 +94,14 @@ def map_from_ifc(
 ) -> PartialMap:
     """Make a map of a storey of an IFC model; see `load_map`.
 
-    Walls, columns, windows and the parts of curtain walls are cut 1.2 m above the storey. What they enclose is free,
-    as on a drawing. Doors are open, unless `layer_materials` has a material for "IfcDoor".
+    Walls, columns, windows and the parts of curtain walls are cut 1.2 m above the storey; an element without a body has
+    the bodies of its parts. The enclosed area is free, as on a drawing. Doors are open, unless `layer_materials` has a
+    material for "IfcDoor".
     """
     try:
         import ifcopenshell
         import ifcopenshell.geom
+        from ifcopenshell.util.unit import calculate_unit_scale
     except ImportError as error:
         raise MapError(f"path = '{path}' needs ifcopenshell: pip install 'sionna-partial[ifc]'.") from error
     content = read_bytes(path, "path", MapError, MAX_IFC_BYTES, "export the storey alone.")
@@ -86,15 +109,18 @@ def map_from_ifc(
         raise MapError(f"path = '{path}' is damaged or no IFC (it is no whole STEP file): export it again as .ifc.")
     with decoding(path, "no IFC", MapError):
         model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))
-        floor_m, height_m = _storey(path, model, storey)
-        pieces = _pieces(path, model, floor_m + CUT_M, _given(path, model, layer_materials or {}))
+        notes = ImportNotes(path, float(calculate_unit_scale(model)), "units of the IfcProject")
+        floor_m, height_m = _storey(path, model, storey, notes)
+        pieces = _pieces(model, floor_m + CUT_M, _given(path, model, layer_materials or {}), notes)
     if not pieces:
         raise MapError(f"path = '{path}' has no walls {CUT_M:.1f} m above the storey: give another storey.")
-    return _map_of(path, pieces, resolution_m, height_m)
+    partial = _map_of(path, pieces, resolution_m, height_m)
+    remedy = "look at the elements that were skipped in the import_report, and at the storey."
+    return notes.attached_to(partial, size="correct the units of the model.", area=remedy)
 
 
 def _map_of(path: Path, pieces: list[_Piece], resolution_m: float, height_m: float) -> PartialMap:
-    """Lay what was cut on cells."""
+    """Return the map of elements that were cut."""
     segments = np.concatenate([each.segments for each in pieces])
     empty = fitted_grid(np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]), resolution_m)
     state = states_of_lines(segments, empty, _covered([each.area for each in pieces], empty))
@@ -107,13 +133,12 @@ def _map_of(path: Path, pieces: list[_Piece], resolution_m: float, height_m: flo
     return with_materials(partial, segments, owner, named) if named else partial
 
 
-def _storey(path: Path, model: Any, name: str | None) -> tuple[float, float]:
-    """World z of the storey that is asked for, or the only one with walls, and the height of its ceiling above [m]."""
+def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tuple[float, float]:
+    """Return world z of the given storey, or of the only one with walls, and the height of its ceiling above [m]."""
     from ifcopenshell.util.element import get_container
     from ifcopenshell.util.placement import get_local_placement
-    from ifcopenshell.util.unit import calculate_unit_scale
 
-    unit_m = calculate_unit_scale(model)
+    unit_m = notes.unit_m
     every = model.by_type("IfcBuildingStorey")
     level_m = {each: float(get_local_placement(each.ObjectPlacement)[2, 3]) * unit_m for each in every}
     walls = model.by_type("IfcWall")
@@ -128,6 +153,7 @@ def _storey(path: Path, model: Any, name: str | None) -> tuple[float, float]:
         what = f"storey = {shown(name)} is one of {len(chosen)} of path = '{path}'"
         raise MapError(f"{what}: give the name of one as storey; it has {named[:1000]}.")
     floor_m = level_m[chosen[0]]
+    notes.notes.append(f"storey '{chosen[0].Name}' at {floor_m:g} m, cut {CUT_M:.1f} m above it")
     above = [level - floor_m for level in level_m.values() if level - floor_m >= LEAST_STOREY_M]
     return floor_m, min(above, default=DEFAULT_WALL_HEIGHT_M)
 
@@ -144,29 +170,68 @@ def _given(path: Path, model: Any, given: Mapping[str, Material | str]) -> dict[
     return found
 
 
-def _pieces(path: Path, model: Any, height_m: float, given: dict[str, Material]) -> list[_Piece]:
-    """Cut what is a wall at a height [m]; windows and doors come after the walls that they are in."""
+def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: ImportNotes) -> list[_Piece]:
+    """Cut the walls at a height [m]; windows and doors come after the walls that they are in."""
+    kinds = [kind for kind in TYPES if kind != DOOR or kind in given]
+    owner_of = _bodies(model, kinds)
+    cuts = _cuts(model, height_m, [model.by_id(body) for body in owner_of], notes)
+    of_owner: dict[tuple[int, int], list[_Cut]] = {}
+    for body, (number, owner) in owner_of.items():
+        of_owner.setdefault((-number, owner.id()), []).extend([cuts[body]] if body in cuts else [])
+    pieces = []
+    for (number, owner_id), bodies in sorted(of_owner.items()):
+        owner, kind = model.by_id(owner_id), kinds[-number]
+        if not any(len(body.segments) for body in bodies):
+            reason = f"nothing {CUT_M:.1f} m above the storey" if bodies else "no body of its own"
+            notes.skip(owner.is_a(), 1, reason)
+            continue
+        own = [body for body in bodies if body.product.id() == owner_id and len(body.segments)]
+        bodies = own or [body for body in bodies if len(body.segments)]
+        for name in [owner.is_a(), *(body.product.is_a() for body in bodies if not own)]:
+            notes.use(name)
+        material = given.get(kind) or _material(owner, TYPES[kind], bodies, notes.unit_m)
+        segments = np.concatenate([body.segments for body in bodies])
+        pieces.append(_Piece(material, segments, shapely.union_all([body.area for body in bodies])))
+    for element in model.by_type("IfcElement"):
+        if element.id() not in owner_of and element.Representation and not element.is_a("IfcFeatureElement"):
+            is_door = element.is_a(DOOR)
+            notes.skip(element.is_a(), 1, "open; layer_materials for IfcDoor closes it" if is_door else "no wall")
+    return pieces
+
+
+def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:
+    """Return the number of the kind, and the wall, of all elements that may have a body: walls, and parts of walls."""
+    owner_of = {element.id(): (number, element) for number, kind in enumerate(kinds) for element in model.by_type(kind)}
+    waiting = [(element, *owner) for owner in owner_of.values() for element in owner[1:]]
+    while waiting:
+        element, number, owner = waiting.pop()
+        for relation in getattr(element, "IsDecomposedBy", None) or ():
+            for part in relation.RelatedObjects:
+                if part.id() not in owner_of and part.is_a("IfcElement") and not part.is_a(DOOR):
+                    owner_of[part.id()] = number, owner
+                    waiting.append((part, number, owner))
+    return owner_of
+
+
+def _cuts(model: Any, height_m: float, products: list[Any], notes: ImportNotes) -> dict[int, _Cut]:
+    """Cut the bodies of elements at a height [m]."""
     import ifcopenshell.geom
 
-    kinds = [kind for kind in TYPES if kind != DOOR or kind in given]
-    products = [each for kind in kinds for each in model.by_type(kind) if each.Representation]
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
-    pieces, triangles = dict[tuple[int, int], _Piece](), 0
+    products = [each for each in products if each.Representation]
+    cuts, triangles = dict[int, _Cut](), 0
     shapes: Any = ifcopenshell.geom.iterator(settings, model, core_count(), include=products) if products else ()
     for shape in shapes:
-        mesh, product = shape.geometry, model.by_id(shape.id)
+        mesh = shape.geometry
         corners_m = np.reshape(mesh.verts, (-1, 3))[np.reshape(mesh.faces, (-1, 3)).astype(np.intp)]
         triangles += len(corners_m)
         if triangles > MAX_TRIANGLES:
-            raise MapError(f"path = '{path}' has more than {MAX_TRIANGLES:,} triangles: export the storey alone.")
+            raise MapError(f"path = '{notes.file}' has more than {MAX_TRIANGLES:,} triangles: export the storey alone.")
         segments = _cut(corners_m, height_m)
-        if len(segments):
-            number, kind = next((number, kind) for number, kind in enumerate(kinds) if product.is_a(kind))
-            material = given.get(kind) or _material(product, TYPES[kind])
-            area = shapely.build_area(shapely.multilinestrings(segments))
-            pieces[-number, shape.id] = _Piece(material, segments, area)
-    return [pieces[key] for key in sorted(pieces)]
+        area = shapely.build_area(shapely.multilinestrings(segments))
+        cuts[shape.id] = _Cut(model.by_id(shape.id), segments, area)
+    return cuts
 
 
 def _cut(corners_m: Floats, height_m: float) -> Segments:
@@ -199,20 +264,47 @@ def _covered(areas: list[shapely.Geometry], empty: PartialMap) -> Bools:
     return cells
 
 
-def _material(product: Any, usual: str | None) -> Material | None:
-    """Return the material of a part: that of its type if it is named, else of its thickest layer with a known name."""
+def _material(owner: Any, usual: str | None, bodies: list[_Cut], unit_m: float) -> Material | None:
+    """Return the material of a wall, with the thickness of its layers of that material.
+
+    It is the usual one of the type if that is named, else the one with the thickest layers of a known name. Drywall
+    keeps its thickness: its constants are of a whole wall with its cavity.
+    """
     from ifcopenshell.util.element import get_material
 
-    found = get_material(product, should_skip_usage=True)
-    layers = _layers(found) if found is not None else []
-    names = [(thickness, name) for thickness, text in layers if (name := _known(text))]
-    if usual is not None and (not names or usual in {name for _, name in names}):
-        return Material.named(usual)
-    return Material.named(max(names, key=lambda layer: layer[0])[1]) if names else None
+    thickness_m = dict[str, float]()
+    found = get_material(owner, should_skip_usage=True)
+    sources = (
+        [(found, bodies)]
+        if found is not None
+        else [(get_material(body.product, should_skip_usage=True), [body]) for body in bodies]
+    )
+    for source, of_source in sources:
+        layers = [] if source is None else _layers(source)
+        names = [(thickness * unit_m, name) for thickness, text in layers if (name := _known(text))]
+        if len({name for _, name in names}) == 1 and not any(thickness for thickness, _ in names):
+            is_solid = owner.is_a("IfcWall") and names[0][1] in SOLID
+            names = [(sum(_width_m(body.area) for body in of_source) if is_solid else 0.0, names[0][1])]
+        for thickness, name in names:
+            thickness_m[name] = thickness_m.get(name, 0.0) + thickness
+    if any(owner.is_a(kind) for kind in PANES):
+        thickness_m = {name: thickness for name, thickness in thickness_m.items() if "glass" in name}
+    if usual is None and not thickness_m:
+        return None
+    name = usual if usual is not None and (not thickness_m or usual in thickness_m) else ""
+    name = name or max(thickness_m, key=thickness_m.__getitem__)
+    material, thick_m = Material.named(name), min(round(thickness_m.get(name, 0.0), 3), MAX_THICKNESS_M)
+    return material if not thick_m or name == "drywall" else replace(material, thickness_m=thick_m)
+
+
+def _width_m(area: shapely.Geometry) -> float:
+    """Return the width of strips of one width and any lengths from their area and perimeter [m]."""
+    count, perimeter_m = max(1, len(shapely.get_parts(area))), area.length
+    return float(perimeter_m - math.sqrt(max(0.0, perimeter_m**2 - 16 * count * area.area))) / (4 * count)
 
 
 def _layers(found: Any) -> list[tuple[float, str]]:
-    """Thickness (0 where there is none) and name of each material of a set."""
+    """Return thickness in units of the model (0 where there is none) and name of each material of a set."""
     if found.is_a("IfcMaterial"):
         return [(0.0, found.Name or "")]
     of_kind = {
@@ -221,9 +313,13 @@ def _layers(found: Any) -> list[tuple[float, str]]:
         "IfcMaterialProfileSet": "MaterialProfiles",
         "IfcMaterialList": "Materials",
     }
-    parts = getattr(found, of_kind.get(found.is_a(), ""), None) or ()
-    materials = ((float(getattr(each, "LayerThickness", 0.0)), getattr(each, "Material", each)) for each in parts)
-    return [(thickness, material.Name or "") for thickness, material in materials if material is not None]
+    layers = []
+    for part in getattr(found, of_kind.get(found.is_a(), ""), None) or ():
+        material = getattr(part, "Material", part)
+        role = getattr(part, "Name", None) if part.is_a("IfcMaterialConstituent") else None
+        names = [name for name in (material.Name if material is not None else None, role) if name]
+        layers.append((float(getattr(part, "LayerThickness", None) or 0.0), " ".join(names)))
+    return layers
 
 
 def _known(text: str) -> str | None:

@@ -6,7 +6,7 @@ import io
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +35,7 @@ from sionna_partial.files import (
     output_path,
     read_bytes,
 )
+from sionna_partial.maps.import_report import ImportSource
 from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
 from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
@@ -73,6 +74,8 @@ def load_map(
     resolution_m: float | None = None,
     up: str | None = None,
     layer_materials: Mapping[str, Material | str] | None = None,
+    wall_layers: Sequence[str] | None = None,
+    unit_m: float | None = None,
     storey: str | None = None,
     obstacle_height_m: float | None = None,
 ) -> PartialMap:
@@ -108,12 +111,17 @@ def load_map(
         Edge of the cells of the map of a mesh, cloud, drawing or building model [m], 0.05 by default. They lie on
         multiples of it.
     up : {"z", "y"} or None
-        Axis of a mesh or cloud that points up. By default z, with a `MapWarning` if that looks wrong; y in many GLB
-        files.
+        Axis of a mesh or cloud that points up. By default y of glTF (.glb, .gltf), as its specification says, and z of
+        other files, with a `MapWarning` if that looks wrong.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers of a drawing, or their names as of `Material.named` (see `map_from_drawing`).
         Of a building model, by types such as "IfcWall", in place of those that its materials name. Doors that are given
         one ("IfcDoor") are closed.
+    wall_layers : sequence of str or None
+        Layers of a drawing with the walls, `*` and `?` as in file names (see `map_from_drawing`).
+    unit_m : float or None
+        Length of a unit of a drawing, mesh or cloud [m], 0.001 for millimetres, 0.3048 for feet. By default that of
+        the header of a drawing, and 1 for meshes and clouds.
     storey : str or None
         Name of a storey of a building model; it may be left out where one alone has walls.
     obstacle_height_m : float or None
@@ -124,7 +132,7 @@ def load_map(
     -------
     PartialMap
         In world axes: the origin's yaw is honoured. Quarter turns are exact; for any other yaw the map is turned onto
-        cells of half the size.
+        cells of half the size. Its `import_report` lists what was used and skipped of the file.
 
     Raises
     ------
@@ -147,12 +155,15 @@ def load_map(
     file, reader = _reader_of(source)
     given: dict[str, Any] = {"height_band_m": height_band_m, "observed": observed, "resolution_m": resolution_m}
     given |= {"up": up, "layer_materials": layer_materials, "storey": storey}
+    given |= {"wall_layers": wall_layers, "unit_m": unit_m}
     for name, value in given.items():
         if value is not None and name not in reader.options:
-            kinds = {"layer_materials": "drawings and building models", "storey": "building models"}.get(name, "scans")
+            kinds = _OPTIONS_OF.get(name, "scans")
             raise MapError(f"{name} is for {kinds} alone, but path = '{source}' is {reader.what}: leave it out.")
     given["strict"] = strict or None
     partial = reader.read(file, **{name: given[name] for name in reader.options if given[name] is not None})
+    if partial.import_source is None:
+        partial = replace(partial, import_source=ImportSource(str(source)))
     if partial.environment.is_extruded:
         warn_of_odd_states(f"path = '{source}'", partial)
     if wall_height_m is not None:
@@ -385,7 +396,9 @@ def _read_mesh(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.files import read_mesh
 
     reading = MeshReading(**options)
-    return mesh_map(read_mesh(source, reading.up), reading)
+    is_gltf = source.suffix.lower() in (".glb", ".gltf")
+    notes = reading.notes(source, "specification of glTF") if is_gltf else reading.notes(source)
+    return reading.attached(notes, mesh_map(read_mesh(source, reading.up, notes), reading))
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:
@@ -398,7 +411,9 @@ def _read_mitsuba(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
     from sionna_partial.maps.mesh.files import read_mitsuba_scene
 
-    return mesh_map(read_mitsuba_scene(source), MeshReading(**options))
+    reading = MeshReading(**options)
+    notes = reading.notes(source, "Mitsuba scene")
+    return reading.attached(notes, mesh_map(read_mitsuba_scene(source, notes), reading))
 
 
 def _read_drawing(source: Path, **options: Any) -> PartialMap:
@@ -461,7 +476,15 @@ class _Reader(NamedTuple):
     options: tuple[str, ...] = ()
 
 
-_OF_SCANS = ("height_band_m", "observed", "resolution_m", "up")
+_OPTIONS_OF = {
+    "layer_materials": "drawings and building models",
+    "storey": "building models",
+    "wall_layers": "drawings",
+    "unit_m": "drawings and scans",
+}
+"""Files that options are for, other than scans."""
+
+_OF_SCANS = ("height_band_m", "observed", "resolution_m", "up", "unit_m")
 _BAG = _Reader("a rosbag", _read_bag)
 _MITSUBA = _Reader("a Mitsuba scene", _read_mitsuba, _OF_SCANS)
 _CALIBRATED = _Reader("the map of a calibration", _read_npz)
@@ -473,7 +496,10 @@ _READERS = {
     **dict.fromkeys(MESH_SUFFIXES, _Reader("a mesh", _read_mesh, _OF_SCANS)),
     **dict.fromkeys(POINT_SUFFIXES, _Reader("a point cloud", _read_cloud, _OF_SCANS)),
     ".ply": _Reader("a mesh or a point cloud", _read_ply, _OF_SCANS),
-    **dict.fromkeys(DRAWING_SUFFIXES, _Reader("a drawing", _read_drawing, ("resolution_m", "layer_materials"))),
+    **dict.fromkeys(
+        DRAWING_SUFFIXES,
+        _Reader("a drawing", _read_drawing, ("resolution_m", "layer_materials", "wall_layers", "unit_m")),
+    ),
     **dict.fromkeys(
         IFC_SUFFIXES, _Reader("a building model", _read_ifc, ("resolution_m", "layer_materials", "storey"))
     ),

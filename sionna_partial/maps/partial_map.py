@@ -3,7 +3,7 @@
 import itertools
 import math
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +18,8 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M, DEFAULT_WALL_HEIGHT_M, Ce
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import FloorPlan, Mesh
+from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
+from sionna_partial.maps.import_report import MapWarning as MapWarning
 from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.maps.wall_cells import wall_cells
 from sionna_partial.settings import Material
@@ -45,10 +47,6 @@ POCKET_M = 0.4
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
-
-
-class MapWarning(UserWarning):
-    """A map file that was not read to the letter, because unknown cells would have read as free or wall."""
 
 
 _FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np.uint8)
@@ -89,6 +87,8 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
     obstacle_heights_m : tuple of float
         At most 255 heights that `obstacle` counts [m].
+    import_source : ImportSource or None
+        What the reader used of the file, for `import_report`. Maps that differ in it alone are equal.
 
     Raises
     ------
@@ -114,6 +114,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     wall_materials: tuple[Material, ...] = ()
     obstacle: NDArray[np.uint8] | None = None
     obstacle_heights_m: tuple[float, ...] = ()
+    import_source: ImportSource | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "state", _checked_state(self.state))
@@ -250,10 +251,13 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             area = real_array("where", where, MapError, "give cells (ny, nx) as booleans, or a polygon.", "biuf")
             if area.dtype == np.bool_ and area.shape == self.shape:
                 return area
-            if area.dtype == np.bool_ or area.ndim != 2 or area.shape[1] != 2 or len(area) < 3:
+            if area.dtype == np.bool_:
                 what = f"where has shape {area.shape}"
                 raise MapError(f"{what}: give booleans {self.shape}, or corners (M, 2) of a polygon in metres.")
-            where = shapely.Polygon(area.astype(np.float64))
+            where = area_polygon("where", area)
+        elif not where.is_valid:
+            remedy = "give a geometry without crossings, of finite coordinates, or repair it with shapely.make_valid."
+            raise MapError(f"where is no area ({shapely.is_valid_reason(where)}): {remedy}")
         rows, columns = np.indices(self.shape)
         centres = cell_centres_m(self, np.stack([rows, columns], axis=-1))
         return np.asarray(shapely.contains_xy(where, centres[..., 0], centres[..., 1]))
@@ -281,6 +285,14 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     def height_range_m(self) -> tuple[float, float]:
         """World z of floor and ceiling [m]; of a mesh, its ends. Radios are between them."""
         return self.environment.height_range_m
+
+    @cached_property
+    def import_report(self) -> ImportReport | None:
+        """Report of the file that the map was read from: unit, extent, rooms, doors, elements used and skipped.
+
+        None for a map that was not read from a file.
+        """
+        return None if self.import_source is None else report_of(self.import_source, self.state, self.resolution_m)
 
     @cached_property
     def is_complete(self) -> bool:
@@ -423,6 +435,22 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             ((z <= low) | (z >= high), too_high, "change its height z or the map's wall_height_m."),
             (walled, "is inside a wall", "move it to a free or unknown cell."),
         ]
+
+
+def area_polygon(name: str, corners_m: ArrayLike) -> shapely.Polygon:
+    """Return the polygon with corners (M, 2) in x and y [m], or raise a MapError that names the argument."""
+    remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres"
+    corners = float_array(name, corners_m, MapError, f"{remedy}.")
+    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
+        raise MapError(f"{name} has shape {corners.shape}: {remedy}.")
+    if not np.isfinite(corners).all():
+        wrong = corners[~np.isfinite(corners).all(axis=1)][0].tolist()
+        raise MapError(f"{name} has the corner {wrong}: {remedy}, all finite.")
+    polygon = shapely.Polygon(corners)
+    if not polygon.is_valid or not polygon.area:
+        what = f"{name} = {shown(corners.tolist())} is no polygon ({shapely.is_valid_reason(polygon)})"
+        raise MapError(f"{what}: {remedy}.")
+    return polygon
 
 
 def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:

@@ -16,13 +16,21 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import affine_transform, binary_dilation
 
-from sionna_partial.arrays import States
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
-from sionna_partial.files import atomic_write, open_regular, read_bytes
+from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
+from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.mesh import SceneMesh
-from sionna_partial.maps.partial_map import MAX_CELLS, MAX_INTERIOR_CELLS, MapWarning, PartialMap, frontier_cells
+from sionna_partial.maps.partial_map import (
+    MAX_CELLS,
+    MAX_INTERIOR_CELLS,
+    ODD_CELLS,
+    MapWarning,
+    PartialMap,
+    frontier_cells,
+)
 from sionna_partial.settings import Material
 
 logger = logging.getLogger(__name__)
@@ -44,6 +52,18 @@ MAX_IMAGE_BYTES = 16 * MAX_CELLS
 
 DARK_OCCUPANCY = 0.51
 """Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
+
+SPREAD_FRACTION, REPORTED_FRACTION = 0.25, 0.1
+"""Fractions of the seen cells between the thresholds from which a map has continuous values, and from which a map of
+other values gets a warning. No value may have more than the first fraction of the cells between the thresholds."""
+
+SEPARATION = 4.0
+"""Least distance between the mean occupancies of free and wall cells, in standard deviations. Halves of a uniform
+distribution have 3.5."""
+
+VALLEY_PERCENT, VALLEY_FRACTION = 2.0, 0.5
+"""Half the width of the valley between free cells and walls [percent], and its largest number of cells as a fraction of
+the number around the means of both."""
 
 FEW_CELLS = 100
 """Number of dark grey pixels, or of wall cells, up to which nothing is said."""
@@ -116,11 +136,14 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
         raise _refuse(path, "interior_cells", interior, "give the number of free cells of the complete home.")
     material = _material(path, "material", raw.get("material"))
     pixels = _read_pixels(sheet)
-    state = _classify(pixels, sheet)
-    if sheet.mode == "trinary" and not strict:
-        _keep_unknown(state, pixels, sheet)
-    if not (strict or _warn_of_inflation(state, sheet)):
-        _warn_of_dark_unknown(state, pixels, sheet)
+    notes = ImportNotes(path, 1.0, f"resolution of the YAML, {resolution_m:g} m for a cell")
+    state = None if strict else _fitted_state(pixels, sheet, notes)
+    if state is None:
+        state = _classify(pixels, sheet)
+        if sheet.mode == "trinary" and not strict:
+            _keep_unknown(state, pixels, sheet)
+        if not (strict or _warn_of_inflation(state, sheet)):
+            _warn_of_dark_unknown(state, pixels, sheet)
     state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
@@ -133,7 +156,8 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
             cells = _decode(sheet._replace(image=image))
             layers[target] = tuple(made(path, name, each) for each in _listed(path, name, given, listed))
             layers[name] = _layer(path, name, cells, (listed, layers[target]), pixels.level.shape, origin)
-    return PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, **layers)
+    partial = PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, **layers)
+    return notes.attached_to(partial)
 
 
 def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
@@ -293,6 +317,56 @@ def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, f
     return state
 
 
+def fitted_threshold(
+    percent: Floats, count: Indices, free_percent: float, occupied_percent: float, notes: ImportNotes, remedy: str
+) -> float | None:
+    """Return the occupancy that separates free cells from walls in a map of continuous values, None in any other.
+
+    Such a map, as of Cartographer, has many seen cells of many values between the thresholds. The threshold is in the
+    valley of the histogram (V,) of seen cells, between two distributions that are well separated, one with a mean below
+    50 percent and one above. Cells between the thresholds are counted in the notes, and warned of.
+    """
+    between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
+    inside = int(count[between].sum())
+    if not inside:
+        return None
+    what = f"{inside:,} of {total:,} seen cells have an occupancy between {free_percent:g} and {occupied_percent:g} %"
+    is_spread = inside > SPREAD_FRACTION * total and count[between].max() <= SPREAD_FRACTION * inside
+    threshold = _split(percent, count, between) if is_spread and inside > FEW_CELLS else None
+    if threshold is None:
+        notes.skip("seen cells", inside, f"occupancy between {free_percent:g} and {occupied_percent:g} %: unknown")
+        if is_spread and inside > max(ODD_CELLS, REPORTED_FRACTION * total):
+            warnings.warn(f"{notes.file}: {what} and are read as unknown: {remedy}", MapWarning, stacklevel=4)
+        return None
+    decided = f"walls are the cells from {threshold:.1f} % on, and other seen cells are free"
+    notes.notes.append(f"{what}: {decided}")
+    warnings.warn(f"{notes.file}: {what}, as in a map of probabilities: {decided}. {remedy}", MapWarning, stacklevel=4)
+    return threshold
+
+
+def _split(percent: Floats, count: Indices, allowed: Bools) -> float | None:
+    """Return the threshold in the valley between two distributions, None where they are not separate."""
+    order = np.argsort(percent)
+    value, weight, allowed = percent[order], count[order].astype(np.float64), allowed[order]
+    value, weight, allowed = (each[weight > 0] for each in (value, weight, allowed))
+    sums = np.cumsum([weight, weight * value, weight * value**2], axis=1)
+    low, high = sums[:, :-1], sums[:, -1:] - sums[:, :-1]
+    (low_mean, low_var), (high_mean, high_var) = (
+        (part[1] / part[0], np.maximum(part[2] / part[0] - (part[1] / part[0]) ** 2, 1.0)) for part in (low, high)
+    )
+    good = (allowed[:-1] | allowed[1:]) & (low_mean < 50.0) & (high_mean > 50.0)
+    good &= high_mean - low_mean >= SEPARATION * np.sqrt((low_var + high_var) / 2)
+    middle = (value[:-1] + value[1:]) / 2
+    around, around_low, around_high = (
+        (np.abs(value - each[:, None]) < VALLEY_PERCENT) @ weight for each in (middle, low_mean, high_mean)
+    )
+    good &= around < VALLEY_FRACTION * np.minimum(around_low, around_high)
+    if not good.any():
+        return None
+    wide = (np.abs(value - middle[:, None]) < 2.5 * VALLEY_PERCENT) @ weight
+    return float(middle[np.lexsort((-np.diff(value), wide, ~good))[0]])
+
+
 def _refuse(sheet: Path, field: str, value: object, remedy: str) -> MapError:
     return MapError(f"{sheet}: {field} = {shown(value)} is not allowed: {remedy}")
 
@@ -381,11 +455,10 @@ def _origin(path: Path, value: object) -> tuple[float, float, float]:
 
 
 def _image_path(path: Path, value: object, *, confined: bool) -> Path:
-    if not isinstance(value, str) or not value or "\0" in value:
+    if not isinstance(value, str) or not value or not is_path(value):
         raise _refuse(path, "image", value, "give the file name of the map image.")
     image = path.parent / value
-    outside = Path(value).is_absolute() or not image.resolve().is_relative_to(path.parent.resolve())
-    if confined and (outside or ".." in Path(value).parts):
+    if confined and not lies_in(path.parent, value):
         raise _refuse(path, "image", value, "the image of an exported scene lies in the scene's folder.")
     if not os.path.isfile(image):
         raise _refuse(path, "image", value, f"there is no file '{image}'; put the image there or correct the name.")
@@ -448,6 +521,36 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
     if sheet.mode == "scale" and pixels.alpha is not None:
         state[pixels.alpha < 255] = CellState.UNKNOWN
     return state
+
+
+def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes) -> States | None:
+    """Return the states of a map of continuous values, with thresholds that fit it; None for any other map.
+
+    Unknown are transparent pixels, and the shade 205, 127 or 128 if it is far more frequent than the shades beside it.
+    """
+    full = 255 * pixels.per_shade + pixels.opaque
+    shade = np.arange(full + 1) / full
+    if sheet.mode == "raw":
+        percent = np.rint(255.0 * shade)
+        unknown = percent > 100
+    else:
+        percent, unknown = 100.0 * (shade if sheet.negate else 1.0 - shade), np.zeros(full + 1, dtype=bool)
+    opaque = np.ones(pixels.level.shape, dtype=bool) if pixels.alpha is None else pixels.alpha == 255
+    count = np.bincount(pixels.level[opaque], minlength=full + 1)
+    if sheet.mode != "raw":
+        marks = [255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, 127, 128]
+        levels = np.array(marks) * pixels.per_shade + pixels.opaque
+        level = int(levels[np.argmax(count[levels])])
+        beside = np.delete(count, levels)[max(level - 10 * pixels.per_shade, 0) : level + 10 * pixels.per_shade]
+        unknown[level] = count[level] > 2 * beside.max(initial=0)
+    thresholds = 100.0 * sheet.free_thresh, 100.0 * sheet.occupied_thresh
+    remedy = "Pass strict=True to read the file to the letter, or set free_thresh and occupied_thresh in it."
+    threshold = fitted_threshold(percent, np.where(unknown, 0, count), *thresholds, notes, remedy)
+    if threshold is None:
+        return None
+    table = np.where(percent >= threshold, CellState.WALL, CellState.FREE).astype(np.uint8)
+    table[unknown] = CellState.UNKNOWN
+    return np.where(opaque, table[pixels.level], np.uint8(CellState.UNKNOWN))
 
 
 def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:

@@ -284,7 +284,9 @@ class Search:
         return np.where(far, link_values(links, self.settings), 1.0 if self.settings.objective == "coverage" else 0.0)
 
     def scores(self, positions_m: Floats, area: PlacementArea) -> Floats:
-        """Scores (P,) of positions (P, 3) [m]."""
+        """Return the scores (P,) of positions (P, 3) [m]; P may be 0."""
+        if not len(positions_m):
+            return np.zeros(0)
         values = self.values(positions_m, area)
         return np.array([placement_score(each, area.weight, self.settings) for each in values])
 

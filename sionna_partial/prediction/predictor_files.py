@@ -17,7 +17,7 @@ import numpy as np
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write, read_bytes, temporary_folder
+from sionna_partial.files import atomic_write, read_bytes, temporary_folder, unzipped
 from sionna_partial.prediction.inputs import GAIN_INPUTS
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
 from sionna_partial.prediction.paper_networks import OUTPUT_WIDTHS, import_keras, own_input
@@ -125,13 +125,10 @@ def _read_card(path: Path) -> dict[str, Any]:
 def _require_our_kind(path: Path, archive: bytes) -> None:
     """Raise a PredictorError unless the archive is a Keras model of classes and sizes such as our networks have."""
     try:
-        with zipfile.ZipFile(io.BytesIO(archive)) as content:
-            if sum(entry.file_size for entry in content.infolist()) > _MAX_BYTES:
-                raise PredictorError(f"path = '{path}' unpacks to more than {_MAX_BYTES:,} bytes: do not use it.")
-            config = json.loads(content.read("config.json"))
-            config_bytes = content.getinfo("config.json").file_size
-            found, largest = set(_classes(config)), max(_sizes(config), default=0)
-    except (zipfile.BadZipFile, KeyError, ValueError, RecursionError, NotImplementedError) as error:
+        content = unzipped(archive, _MAX_BYTES)["config.json"]
+        config, config_bytes = json.loads(content), len(content)
+        found, largest = set(_classes(config)), max(_sizes(config), default=0)
+    except (KeyError, ValueError, RecursionError) as error:
         raise PredictorError(f"path = '{path}' is no Keras archive ({error}): train and save it anew.") from error
     foreign = sorted(name for name in found if name not in _CLASSES)
     if foreign:

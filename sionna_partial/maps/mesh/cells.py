@@ -1,6 +1,8 @@
 """SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and what has been observed of it."""
 
 import math
+import os
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,13 +12,14 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.checks import float_array, shown
+from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.environment import Mesh
+from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap
+from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
 from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
@@ -30,8 +33,21 @@ DEFAULT_RESOLUTION_M = 0.05
 SMALLEST_M, HIGHEST_M = 0.1, 100.0
 """Extent along x or y below which, and height above which, a mesh is in another unit than metres [m]."""
 
+LOWEST_CEILING_M, HIGHEST_ROOM_M, FLOORS_RATIO = 2.2, 6.0, 1.5
+"""Heights of the lowest rooms and of usual storeys [m]; ratio of floors to walls from which y of a taller scan points
+up."""
+
+FEET_STOREY, FOOT_M, WIDE_RATIO = (7.0, 11.0), 0.3048, 2.0
+"""Height of a storey in feet, length of a foot [m], and ratio of width to height from which it is no tall hall."""
+
+LEVEL_M, LEVEL_FRACTION = 0.1, 0.3
+"""Height of a level in which flat surfaces are counted [m], and fraction of the largest level of a floor or ceiling."""
+
 RIM_M = 0.3
 """Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
+
+
+UNIT_REMEDY = "give unit_m, the length of its unit in metres"
 
 
 @dataclass(frozen=True)
@@ -42,10 +58,22 @@ class MeshReading:
     observed: ArrayLike | PartialMap | None = None
     resolution_m: float | None = None
     up: str | None = None
+    unit_m: float | None = None
 
     def __post_init__(self) -> None:
         if self.up is not None and not (isinstance(self.up, str) and self.up in ("z", "y")):
             raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
+        if self.unit_m is not None and not 1e-6 <= number_of(self.unit_m) <= 1e6:
+            remedy = "give the length of a unit in metres, such as 0.3048 for feet."
+            raise MapError(f"unit_m = {shown(self.unit_m)} is not allowed: {remedy}")
+
+    def notes(self, file: str | os.PathLike[str], unit_source: str = "taken for metres") -> ImportNotes:
+        """Return the notes of a file that is read."""
+        return ImportNotes(file, self.unit_m or 1.0, unit_source if self.unit_m is None else "unit_m")
+
+    def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
+        """Return a map with its report; its extent is checked where all of the file is observed."""
+        return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.")
 
 
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
@@ -54,8 +82,11 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     Known cells with a surface in the height band are walls. Walls that run along lattice lines are in the cells above
     or to the right of them, or on the other side if those are unknown.
     """
+    if reading.unit_m is not None:
+        mesh = replace(mesh, vertices_m=mesh.vertices_m * reading.unit_m, height_range_m=None)
     empty = fitted_grid(mesh.bounds_m, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
     require_metres("the mesh", mesh.bounds_m, reading.height_band_m)
+    warn_of_feet("the mesh", mesh.bounds_m, _storey_m(mesh), reading)
     band_m = _band(mesh, reading.height_band_m)
     if reading.observed is None:
         known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
@@ -76,9 +107,38 @@ def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
     x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
         raise MapError(
-            f"{what} spans {x:g} x {y:g} x {z:g} m: scale it to metres (0.01 for centimetres, 1000 for kilometres)"
+            f"{what} spans {x:g} x {y:g} x {z:g} m: {UNIT_REMEDY}, 0.01 for centimetres, 1000 for kilometres"
             + (", or give the height_band_m of the walls if it is so high." if z > HIGHEST_M else ".")
         )
+
+
+def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshReading) -> None:
+    """Warn of a wide storey whose height is usual in feet; a narrow one may be a tall hall, and a unit is believed."""
+    x, y, _ = np.ptp(bounds_m, axis=0)
+    if reading.unit_m is None and FEET_STOREY[0] <= storey_m <= FEET_STOREY[1] and min(x, y) >= WIDE_RATIO * storey_m:
+        size = f"{what} spans {x:.3g} x {y:.3g} m, with a storey of {storey_m:.3g} m, as if it were in feet"
+        warnings.warn(f"{size}: give unit_m={FOOT_M} for feet, or unit_m=1 for metres.", MapWarning, stacklevel=5)
+
+
+def _storey_m(mesh: SceneMesh) -> float:
+    """Return the height between the lowest floor and the surface above it, or of the mesh where there is none [m]."""
+    corners = mesh.corners_m
+    area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(area, axis=1)
+    flat = np.abs(area[:, 2]) > 0.99 * size
+    low_m, high_m = mesh.bounds_m[:, 2]
+    level = np.rint((corners[flat, :, 2].mean(axis=1) - low_m) / LEVEL_M).astype(np.int64)
+    areas = np.bincount(level, size[flat], minlength=1)
+    levels_m = LEVEL_M * np.flatnonzero(areas >= max(LEVEL_FRACTION * areas.max(), 1e-9))
+    above_m = levels_m[levels_m >= levels_m.min(initial=np.inf) + LOWEST_CEILING_M]
+    return float(above_m[0] - levels_m[0] if len(above_m) else high_m - low_m)
+
+
+def looks_y_up(extent_m: Floats, across_y: float, across_z: float) -> bool:
+    """Return whether a scan is lowest along y, yet as high as a room, and has most area, as of floors, across y."""
+    x, y, z = extent_m
+    ratio = 1.0 if y <= HIGHEST_ROOM_M else FLOORS_RATIO
+    return bool(LOWEST_CEILING_M <= y < min(x, z) and across_y > ratio * across_z)
 
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
@@ -154,7 +214,8 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
         row, column = (np.clip(index + 1, 0, size - 1) for index, size in zip((row, column), known.shape, strict=True))
         cells, is_empty = known[np.ix_(row, column)], not known.any()
     else:
-        polygon, is_empty = _polygon(observed), False
+        polygon, is_empty = area_polygon("observed", observed), False
+        shapely.prepare(polygon)
         cells = np.stack([shapely.contains_xy(polygon, x, height) for height in y])
     if not cells.any() and not is_empty:
         x0, y0, x1, y1 = empty.bounds_m
@@ -163,18 +224,6 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
             "the world axes of the mesh, in metres."
         )
     return cells
-
-
-def _polygon(observed: ArrayLike) -> Any:
-    remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres, or a PartialMap."
-    corners = float_array("observed", observed, MapError, remedy)
-    if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
-        raise MapError(f"observed has shape {corners.shape} or values that are not finite: {remedy}")
-    polygon = shapely.Polygon(corners)
-    if not polygon.is_valid or not polygon.area:
-        raise MapError(f"observed is no polygon ({shapely.is_valid_reason(polygon)}): {remedy}")
-    shapely.prepare(polygon)
-    return polygon
 
 
 def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:

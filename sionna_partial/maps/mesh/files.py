@@ -24,7 +24,9 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.files import decoding, read_bytes
+from sionna_partial.files import decoding, lies_in, read_bytes
+from sionna_partial.maps.import_report import ImportNotes
+from sionna_partial.maps.mesh.cells import looks_y_up
 from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
@@ -34,8 +36,8 @@ CUT = "cut or simplify the mesh."
 MAX_XML_BYTES = 100_000_000
 """Largest scene file that is read [bytes]."""
 
-LOWEST_CEILING_M = 2.2
-"""Height of the lowest rooms [m]: what is lower along y does not stand on its side."""
+Y_UP_KINDS = ("glb", "gltf")
+"""Formats whose y points up: glTF 2.0, section 3.4."""
 
 DEFAULT_THICKNESS_M = 0.1
 """Thickness of a radio material where none is given [m] (Sionna RT)."""
@@ -71,28 +73,36 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
         return read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
 
 
-def read_mesh(path: Path, up: str | None = None) -> SceneMesh:
-    """Read a mesh file in metres, without colours and textures. `up` is the axis of the file that points up."""
-    vertices, triangles = _read_triangles(path, path.suffix.lower().removeprefix("."))
-    if up is None and _looks_y_up(vertices, triangles):
-        message = f'path = \'{path}\' looks as if y pointed up: give up="y" to turn it, or up="z" to read it as it is.'
-        warnings.warn(message, MapWarning, stacklevel=3)
-    if up == "y":
+def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = None) -> SceneMesh:
+    """Read a mesh file, without colours and textures.
+
+    `up` is the axis of the file that points up: by default y of glTF, as its specification says, and z of other files.
+    """
+    notes = notes or ImportNotes(path)
+    kind = path.suffix.lower().removeprefix(".")
+    axis, other = (up or "y", "z") if kind in Y_UP_KINDS else (up or "z", "y")
+    vertices, triangles = _read_triangles(path, kind, notes)
+    if axis == "y":
         vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    return _joined(path, [(vertices, triangles)], [0], (None,))
+    if up is None and _looks_y_up(vertices, triangles):
+        what = f"looks as if {other} pointed up" + (", against the specification of glTF" if axis == "y" else "")
+        message = f'path = \'{path}\' {what}: give up="{other}" to turn it, or up="{axis}" to read it as it is.'
+        warnings.warn(message, MapWarning, stacklevel=3)
+    reason = "up" if up else "the specification of glTF" if axis == "y" else "the default"
+    notes.notes.append(f"{axis} of the file points up ({reason})")
+    return _joined(path, [(vertices, triangles)], [0], (None,), notes)
 
 
 def confined_path(folder: Path, name: str, what: str) -> Path:
     """Return the path of a file that another one names, or raise a MapError (`what` ...) if it is not in the folder."""
-    inside = bool(name) and "\0" not in name and not Path(name).is_absolute() and ".." not in Path(name).parts
-    if not inside or not (folder / name).resolve().is_relative_to(folder.resolve()):
+    if not lies_in(folder, name):
         raise MapError(f"{what} {name!r}, which is not allowed: put it into '{folder}' and give its relative path.")
     if not (folder / name).is_file():
         raise MapError(f"{what} {name!r}, which is not there: put it into '{folder}', or correct the name.")
     return folder / name
 
 
-def _read_triangles(path: Path, kind: str) -> Triangles:
+def _read_triangles(path: Path, kind: str, notes: ImportNotes) -> Triangles:
     """Read the triangles of a mesh file in the axes of the file; nodes of a scene are placed by their transforms."""
     content = read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
     with decoding(path, f"no {kind.upper()} mesh", MapError):
@@ -102,7 +112,7 @@ def _read_triangles(path: Path, kind: str) -> Triangles:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # damage ends in the error below
             scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, skip_materials=True)
-            parts = [*_placed_parts(path, scene)]
+            parts = [*_placed_parts(path, scene, notes)]
         _require_whole(kind, content, sum(len(triangles) for _, triangles in parts))
     if not any(len(triangles) for _, triangles in parts):
         raise MapError(f"path = '{path}' holds 0 triangles: give a mesh with surfaces, not points or lines alone.")
@@ -129,19 +139,20 @@ def _require_whole(kind: str, content: bytes, triangles: int) -> None:
         raise ValueError(f"it announces {counts[b'face']} faces, and has {triangles}")
 
 
-def _placed_parts(path: Path, scene: Any) -> Iterator[Triangles]:
+def _placed_parts(path: Path, scene: Any, notes: ImportNotes) -> Iterator[Triangles]:
     """Yield the triangles of every node of a trimesh scene, in the axes of the scene."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
         if not isinstance(part, trimesh.Trimesh):
+            notes.skip(type(part).__name__, 1, "no surface")
             continue
         vertices, triangles = np.asarray(part.vertices, dtype=np.float64), np.asarray(part.faces, dtype=np.int64)
         wrong = (triangles < 0) | (triangles >= len(vertices))
         if wrong.any():
             count = f"vertex {triangles[wrong][0]}, but {len(vertices)} vertices"
             raise MapError(f"path = '{path}' has a triangle with {count}: export the mesh again.")
-        yield vertices @ transform[:3, :3].T + transform[:3, 3], triangles
+        yield vertices @ _affine(transform)[:3, :3].T + transform[:3, 3], triangles
 
 
 def _concatenated(parts: list[Triangles]) -> Triangles:
@@ -150,7 +161,9 @@ def _concatenated(parts: list[Triangles]) -> Triangles:
     return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
 
 
-def _joined(path: Path, parts: list[Triangles], index: list[int], materials: tuple[Material | None, ...]) -> SceneMesh:
+def _joined(
+    path: Path, parts: list[Triangles], index: list[int], materials: tuple[Material | None, ...], notes: ImportNotes
+) -> SceneMesh:
     """Build the mesh of a file of parts with an index into the materials each; raise a MapError that names the file."""
     material = np.repeat(index, [len(triangles) for _, triangles in parts])
     try:
@@ -159,33 +172,36 @@ def _joined(path: Path, parts: list[Triangles], index: list[int], materials: tup
         raise MapError(f"path = '{path}': {error}") from error
     if not len(mesh.triangles):
         raise MapError(f"path = '{path}' holds degenerate triangles alone: give a mesh with surfaces, in metres.")
+    notes.use("triangles", len(mesh.triangles))
+    notes.skip("triangles", sum(len(triangles) for _, triangles in parts) - len(mesh.triangles), "degenerate")
     return mesh
 
 
 def _looks_y_up(vertices_m: Floats, triangles: NDArray[np.int64]) -> bool:
-    """Whether the mesh is lowest along y, yet as high as a room, and more of it faces along y than z, as floors do."""
+    """Return whether the mesh lies on its side; see `looks_y_up`."""
     corners = vertices_m[triangles]
-    if not np.isfinite(corners).all():
+    if not np.isfinite(corners).all() or not len(corners):
         return False
     extent = corners.max(axis=(0, 1)) - corners.min(axis=(0, 1))
     area = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = np.bincount(np.argmax(area, axis=1), weights=np.linalg.norm(area, axis=1), minlength=3)
-    return bool(LOWEST_CEILING_M <= extent[1] < min(extent[0], extent[2]) and facing[1] > facing[2])
+    return looks_y_up(extent, facing[1], facing[2])
 
 
-def read_mitsuba_scene(path: Path) -> SceneMesh:
+def read_mitsuba_scene(path: Path, notes: ImportNotes | None = None) -> SceneMesh:
     """Read the meshes of a Mitsuba scene file, which lie in its folder or below, with their radio materials.
 
     Materials are those that Sionna RT takes (`radio-material`, `itu-radio-material`, and names such as
     `mat-itu_concrete`); any other is None, with a warning.
     """
-    root, shapes = _read_shapes(path)
+    notes = notes or ImportNotes(path)
+    root, shapes = _read_shapes(path, notes)
     if not shapes:
         raise MapError(f"path = '{path}' holds no shape: give a Mitsuba scene with meshes.")
     named = {bsdf.get("id"): _material(path, bsdf) for bsdf in root.findall("./bsdf")}
     used = [_material_of(path, element, named) for element, _ in shapes]
     materials = tuple(dict.fromkeys(used))
-    return _joined(path, [triangles for _, triangles in shapes], [*map(materials.index, used)], materials)
+    return _joined(path, [triangles for _, triangles in shapes], [*map(materials.index, used)], materials, notes)
 
 
 def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object) -> SceneMesh:
@@ -201,7 +217,8 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
     except (KeyError, TypeError, ValueError) as error:
         sheet = folder / "map.yaml"
         raise MapError(f"path = '{sheet}' has a damaged mesh entry ({error}): export it again.") from error
-    _, shapes = _read_shapes(path)
+    notes = ImportNotes(path)
+    _, shapes = _read_shapes(path, notes)
     names = [_name(element) for element, _ in shapes]
     index = {f"part{number}": number for number in range(len(materials))}
     for name in names:
@@ -210,10 +227,11 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
     if not shapes:
         return SceneMesh(np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0, np.uint8), materials, (low, high))
     parts = [(vertices + shift, triangles) for _, (vertices, triangles) in shapes]
-    return replace(_joined(path, parts, [index[name] for name in names], materials), height_range_m=(low, high))
+    mesh = _joined(path, parts, [index[name] for name in names], materials, notes)
+    return replace(mesh, height_range_m=(low, high))
 
 
-def _read_shapes(path: Path) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
+def _read_shapes(path: Path, notes: ImportNotes) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
     """Read a scene file and its shapes; a document type, which entities need, and other files are refused."""
     content = read_bytes(path, "path", MapError, MAX_XML_BYTES, "split the scene.")
     try:
@@ -232,10 +250,10 @@ def _read_shapes(path: Path) -> tuple[ET.Element, list[tuple[ET.Element, Triangl
     if others:
         remedy = f"give {', '.join(SHAPE_TYPES)}; Mitsuba writes other meshes as PLY (mesh.write_ply)."
         raise MapError(f"path = '{path}' has shapes of type {', '.join(others)}: {remedy}")
-    return root, [(element, _shape_triangles(path, element)) for element in elements]
+    return root, [(element, _shape_triangles(path, element, notes)) for element in elements]
 
 
-def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
+def _shape_triangles(path: Path, shape: ET.Element, notes: ImportNotes) -> Triangles:
     """Triangles of a shape, with its to_world: each step of that acts on the outcome of those before it."""
     kind, matrix = str(shape.get("type")), np.eye(4)
     _require_known(path, shape, SHAPE_PROPERTIES)
@@ -244,15 +262,27 @@ def _shape_triangles(path: Path, shape: ET.Element) -> Triangles:
     else:
         what = f"path = '{path}': shape {_name(shape)!r} has the filename"
         file = confined_path(path.parent, _property(shape, "filename") or "", what)
-        vertices, triangles = _read_triangles(file, kind)
+        vertices, triangles = _read_triangles(file, kind, notes)
     for step in (step for node in shape.findall("transform[@name='to_world']") for step in node):
         try:
-            matrix = _step(step) @ matrix
+            one = _affine(_step(step))
+            if np.linalg.matrix_rank(one[:3, :3]) < 3:
+                raise ValueError("it flattens the shape")
         except (KeyError, ValueError) as error:
             what = f"shape {_name(shape)!r} has a to_world with <{step.tag} {step.attrib}>"
-            remedy = "give matrix, translate, scale or rotate."
-            raise MapError(f"path = '{path}': {what}, which cannot be read: {remedy}") from error
+            remedy = "give matrix, translate, scale or rotate, finite, not 0 in scale, and with 0 0 0 1 as last row."
+            raise MapError(f"path = '{path}': {what}, which cannot be read ({error}): {remedy}") from error
+        matrix = one @ matrix
     return vertices @ matrix[:3, :3].T + matrix[:3, 3], triangles
+
+
+def _affine(matrix: Floats) -> Floats:
+    """Return a matrix (4, 4), or raise a ValueError if it is projective or not finite."""
+    if not np.isfinite(matrix).all():
+        raise ValueError("a transform is not finite")
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), rtol=0, atol=1e-9):
+        raise ValueError(f"a transform is projective, with the last row {matrix[3].tolist()}")
+    return matrix
 
 
 def _step(step: ET.Element) -> Floats:

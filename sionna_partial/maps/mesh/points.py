@@ -9,7 +9,7 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -23,14 +23,17 @@ from sionna_partial.checks import float_array, real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, open_regular
+from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_BAND_M,
     DEFAULT_RESOLUTION_M,
     MeshReading,
     fitted_grid,
+    looks_y_up,
     narrow_areas,
     observed_cells,
     require_metres,
+    warn_of_feet,
 )
 from sionna_partial.maps.mesh.mesh import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -89,9 +92,10 @@ def map_from_points(
     observed: ArrayLike | PartialMap | None = None,
     resolution_m: float | None = None,
     up: str | None = None,
+    unit_m: float | None = None,
     wall_height_m: float | None = None,
 ) -> PartialMap:
-    """Make a map of a point cloud in metres.
+    """Make a map of a point cloud.
 
     Floor and ceiling are the layers in which most cells have points. Cells with points in the height band are walls,
     other cells with points between floor and ceiling are free, and so are small gaps between them. Heights of the map
@@ -113,6 +117,8 @@ def map_from_points(
         Edge of the cells [m], 0.05 by default.
     up : {"z", "y"} or None
         Axis of the cloud that points up, z by default.
+    unit_m : float or None
+        Length of a unit of the cloud [m], 0.3048 for feet; 1 by default. All other arguments are in metres.
     wall_height_m : float or None
         Height of walls and ceiling [m]; by default that of the ceiling that was found, or 3.
 
@@ -135,7 +141,7 @@ def map_from_points(
     >>> room.state_at([[2.0, 1.0], [2.0, 2.97], [2.0, 4.0]]).tolist()
     [0, 1, 2]
     """
-    reading = MeshReading(height_band_m, observed, resolution_m, up)
+    reading = MeshReading(height_band_m, observed, resolution_m, up, unit_m)
     if isinstance(points, str | os.PathLike):
         partial = _read(Path(points), reading, sensor_positions_m)
     else:
@@ -143,7 +149,7 @@ def map_from_points(
         if cloud.ndim != 2 or cloud.shape[1] != 3:
             raise MapError(f"points has shape {cloud.shape}: give x, y, z in metres, (N, 3), or the path of a file.")
         parts = (cloud[start : start + PART] for start in range(0, len(cloud), PART))
-        partial = _cloud_map("points", parts, reading, sensor_positions_m)
+        partial = _cloud_map("points", parts, reading, sensor_positions_m, reading.notes("points"))
     return partial if wall_height_m is None else replace(partial, wall_height_m=wall_height_m)
 
 
@@ -157,7 +163,7 @@ def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None
         open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream,
         decoding(path, f"no {kind.upper()}", MapError),
     ):
-        return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m)
+        return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m, reading.notes(path))
 
 
 def is_cloud(path: Path) -> bool:
@@ -282,13 +288,17 @@ def _require_count(count: int, announced: int) -> None:
 
 
 def _cloud_map(
-    what: str, parts: Iterable[NDArray[Any]], reading: MeshReading, sensor_positions_m: ArrayLike | None
+    what: str,
+    parts: Iterable[NDArray[Any]],
+    reading: MeshReading,
+    sensor_positions_m: ArrayLike | None,
+    notes: ImportNotes,
 ) -> PartialMap:
     """Turn points, in parts, into a map."""
     cell = DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m
     cell = PartialMap(np.full((1, 1), CellState.UNKNOWN), cell).resolution_m
     sensors = _sensors(sensor_positions_m, reading.up)
-    voxels, count = _occupied_voxels(what, parts, cell, reading.up)
+    voxels, count, heights_m = _occupied_voxels(what, parts, cell, reading, notes)
     size = np.array([cell, cell, LAYER_M])
     bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
     require_metres(what, bounds - [[0.0], [1.0]] * size, reading.height_band_m)
@@ -304,7 +314,10 @@ def _cloud_map(
             raise MapError(f"sensor_positions_m has {at}, more than {MAX_SENSOR_M:g} m from the points: give metres.")
     column, row = (voxels[:, :2] - np.rint(np.array(empty.origin_m) / cell).astype(np.int64)).T
     z = (voxels[:, 2] + 0.5) * LAYER_M
-    floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], reading.height_band_m)
+    floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], heights_m, reading.height_band_m)
+    notes.notes.append(f"floor at z = {floor_m:g} m" + ("" if ceiling_m is None else f", ceiling at {ceiling_m:g} m"))
+    if ceiling_m is not None:
+        warn_of_feet(what, bounds, ceiling_m - floor_m, reading)
     low, high = reading.height_band_m or (floor_m + DEFAULT_BAND_M[0], floor_m + DEFAULT_BAND_M[1])
     band = (z > low) & (z < high)
     wall = _walls(np.ravel_multi_index((row[band], column[band]), empty.shape), count[band], empty.shape)
@@ -320,7 +333,7 @@ def _cloud_map(
     state = np.where(known, np.where(wall, CellState.WALL, CellState.FREE), CellState.UNKNOWN).astype(np.uint8)
     state[_enclosed(state == CellState.FREE, cell)] = CellState.UNKNOWN
     height_m = DEFAULT_WALL_HEIGHT_M if ceiling_m is None else ceiling_m - floor_m
-    return replace(empty, state=state, wall_height_m=round(height_m, 2))
+    return reading.attached(notes, replace(empty, state=state, wall_height_m=round(height_m, 2)))
 
 
 def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
@@ -340,20 +353,32 @@ def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
 
 
 def _occupied_voxels(
-    what: str, parts: Iterable[NDArray[Any]], cell_m: float, up: str | None
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return indices x, y, z (V, 3) of the voxels with points, on multiples of their size, and how many these are."""
+    what: str, parts: Iterable[NDArray[Any]], cell_m: float, reading: MeshReading, notes: ImportNotes
+) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]]]:
+    """Return indices x, y, z (V, 3) of the voxels with points, on multiples of their size, and their numbers of points.
+
+    The third value has the number of points, and the sum of their heights [m], of each layer.
+    """
+    heights_m: dict[int, tuple[int, float]] = {}
     base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for part in parts:
-        points = part[np.isfinite(part).all(axis=1)].astype(np.float64)
+        points = part[np.isfinite(part).all(axis=1)].astype(np.float64) * (reading.unit_m or 1.0)
+        notes.use("points", len(points))
+        notes.skip("points", len(part) - len(points), "not finite")
         if not len(points):
             continue
         if np.abs(points).max() > MAX_COORDINATE_M:
             raise MapError(f"{what} holds coordinates above {MAX_COORDINATE_M:g} m: give a cloud in metres.")
-        if up == "y":
+        if reading.up == "y":
             points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
         index = np.floor(points / (cell_m, cell_m, LAYER_M) + 1e-9).astype(np.int64)
         base = index[0].copy() if base is None else base
+        layers, inverse = np.unique(index[:, 2], return_inverse=True)
+        for layer, points_in, sum_m in zip(
+            layers.tolist(), np.bincount(inverse).tolist(), np.bincount(inverse, points[:, 2]).tolist(), strict=True
+        ):
+            old = heights_m.get(layer, (0, 0.0))
+            heights_m[layer] = old[0] + points_in, old[1] + sum_m
         index += _HALF - base
         if index.min() < 0 or index.max() >= 2 * _HALF:
             raise MapError(f"{what} spans more than {_HALF * cell_m:,.0f} m: remove stray points, or cut it.")
@@ -365,7 +390,7 @@ def _occupied_voxels(
         raise MapError(f"{what} holds no finite point: give a cloud with x, y, z in metres.")
     keys, counts = _merged(pending)
     mask = (1 << _BITS) - 1
-    return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts
+    return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts, heights_m
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -387,13 +412,23 @@ def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, 
     return np.asarray((layers >= max(1, math.ceil(WALL_FRACTION * fuller))) & ~is_noise)
 
 
-def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | None) -> tuple[float, float | None]:
-    """Heights of the floor below a band, the lowest by default, and of the ceiling above it, if there is one [m]."""
+def _floor_and_ceiling(
+    layer: NDArray[np.int64], heights_m: Mapping[int, tuple[int, float]], band_m: tuple[float, float] | None
+) -> tuple[float, float | None]:
+    """Return the heights of the floor below a band, the lowest by default, and of the ceiling above it, if any [m].
+
+    Each is the mean height of the points in its two fullest layers: a flat surface with noise is spread over two.
+    """
     first = int(layer.min())
-    pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # what is flat and measured is spread over two layers
+    pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # pairs[k] counts the layers k and k + 1
     full = np.nonzero(pairs >= FLOOR_FRACTION * pairs.max())[0]
     runs = np.split(full, np.nonzero(np.diff(full) > 1)[0] + 1)
-    slabs_m = [(run[np.argmax(pairs[run])] + first + 1) * LAYER_M for run in runs if len(run) * LAYER_M <= SLAB_M]
+    slabs_m = []
+    for run in runs:
+        if len(run) * LAYER_M <= SLAB_M:
+            lower = int(run[np.argmax(pairs[run])]) + first
+            counts, sums_m = zip(*(heights_m.get(each, (0, 0.0)) for each in (lower, lower + 1)), strict=True)
+            slabs_m.append(round(sum(sums_m) / sum(counts), 3))
     low = math.inf if band_m is None else height_pair("height_band_m", band_m)[0]
     below = [slab for slab in slabs_m if slab < low] or [first * LAYER_M]
     floor_m = below[0] if band_m is None else below[-1]
@@ -401,11 +436,10 @@ def _floor_and_ceiling(layer: NDArray[np.int64], band_m: tuple[float, float] | N
 
 
 def _looks_y_up(voxels: NDArray[np.int64], bounds: Floats) -> bool:
-    """Whether the cloud is lowest along y, yet as high as a room, and its fullest layers lie across y, not z."""
-    x, y, z = np.ptp(bounds, axis=0)
+    """Return whether the fullest layers of the cloud lie across y, not z; see `looks_y_up`."""
     layers = [np.bincount(voxels[:, axis] - voxels[:, axis].min()) for axis in (1, 2)]
     fullest = [np.convolve(cells, (1, 1)).max() for cells in layers]
-    return bool(LOWEST_CEILING_M <= y < min(x, z) and fullest[0] > fullest[1])
+    return looks_y_up(np.ptp(bounds, axis=0), *fullest)
 
 
 def _without_strays(free: Bools, cell_m: float) -> Bools:

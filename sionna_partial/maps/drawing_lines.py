@@ -1,0 +1,166 @@
+"""Lines of a DXF: entities of the model space and of blocks -> pieces of lines by layer."""
+
+import io
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats
+from sionna_partial.errors import MapError
+
+MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 2_000_000, 16
+"""Most pieces of lines, most blocks and entities in them, and most blocks within blocks."""
+
+FLAT_FRACTION = 0.001
+"""Distance of a polygon from its curve, in extents of the curve."""
+
+LINE_TYPES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "MLINE"}
+"""Types of entities that are read."""
+
+XREF = "external reference"
+"""Type of the elements that stand for a block in another file."""
+
+Segments = Floats
+"""Ends (N, 2, 2) of pieces of lines."""
+
+
+def opened(content: bytes) -> Any:
+    """Parse a DXF, which has to end as one. The slow reader for damaged files is the second choice."""
+    from ezdxf import recover
+    from ezdxf.document import Drawing
+    from ezdxf.filemanagement import dxf_stream_info
+    from ezdxf.lldxf.const import DXFError
+    from ezdxf.lldxf.tagger import binary_tags_loader
+
+    is_binary = content.startswith(b"AutoCAD Binary DXF")
+    if not content.endswith(b"EOF\0") if is_binary else content[-100:].split()[-1:] != [b"EOF"]:
+        raise ValueError("it does not end with EOF")
+    if is_binary:
+        return Drawing.load(binary_tags_loader(content))
+    try:
+        encoding = dxf_stream_info(io.StringIO(content.decode("latin-1"))).encoding
+        return Drawing.read(io.TextIOWrapper(io.BytesIO(content), encoding, errors="surrogateescape"))
+    except (DXFError, ValueError, LookupError, AttributeError, TypeError):
+        return recover.read(io.BytesIO(content))[0]
+
+
+class DrawnLines:
+    """Lines of a drawing by layer. Blocks are read once, however often they are inserted.
+
+    `counts` is the number of entities on each layer (in lower case) by type, with those of blocks: entities on layer 0
+    of a block take the layer of their INSERT.
+    """
+
+    def __init__(self, path: Path, drawing: Any) -> None:
+        self._path, self._drawing = path, drawing
+        self._counted: dict[str, Counter[tuple[str, str]]] = {}
+        self._read: dict[str, dict[str, Segments]] = {}
+        space = drawing.modelspace()
+        self.counts = self._count(space, MAX_NESTING)
+        if sum(self.counts.values()) - len(space) > MAX_PARTS:
+            raise self._too_large()
+
+    def line_counts(self) -> Counter[str]:
+        """Return the number of entities with lines on each layer."""
+        found = Counter[str]()
+        for (layer, kind), count in self.counts.items():
+            found[layer] += count * (kind in LINE_TYPES)
+        return found
+
+    def segments(self, layers: set[str]) -> tuple[Segments, NDArray[np.str_]]:
+        """Return pieces (N, 2, 2) of lines on some layers, in units of the drawing, and their layers (N,)."""
+        self._read.clear()
+        found = self._lines(self._drawing.modelspace(), layers, MAX_NESTING)
+        kept = {layer: found[layer] for layer in sorted(found) if layer in layers}
+        pieces = [segments[..., :2].reshape(-1, 2, 2) for segments in kept.values()]
+        names = np.repeat(np.array([*kept] or [""]), [len(each) for each in pieces] or [0])
+        return np.concatenate([np.zeros((0, 2, 2)), *pieces]), names
+
+    def _count(self, entities: Iterable[Any], nesting: int) -> Counter[tuple[str, str]]:
+        found = Counter[tuple[str, str]]()
+        for entity in entities:
+            layer, kind = entity.dxf.get("layer", "0").lower(), entity.dxftype()
+            if kind != "INSERT":
+                found[layer, kind] += 1
+                continue
+            name, times = entity.dxf.get("name", ""), entity.mcount
+            found["", kind] += times
+            block = entity.block()
+            if block is not None and block.block.is_xref:
+                found[name, XREF] += times
+            elif block is not None and nesting:
+                if name not in self._counted:
+                    self._counted[name] = Counter()  # a block within itself is empty
+                    self._counted[name] = self._count(block, nesting - 1)
+                for (own, inner), count in self._counted[name].items():
+                    found[layer if own == "0" else own, inner] += count * times
+        return found
+
+    def _lines(self, entities: Iterable[Any], layers: set[str], nesting: int) -> dict[str, Segments]:
+        """Return pieces (N, 2, 3) of lines by layer; layer 0 takes the layer of an INSERT later."""
+        parts: dict[str, list[Segments]] = {}
+        pieces = 0
+        for entity in entities:
+            layer = entity.dxf.get("layer", "0").lower()
+            if entity.dxftype() == "INSERT":
+                found = self._inserted(entity, layer, layers, nesting)
+            elif layer in layers or layer == "0":
+                found = [(layer, lines) for lines in _pieces(entity) if np.isfinite(lines).all()]
+            else:
+                continue
+            for name, lines in found:
+                parts.setdefault(name, []).append(lines)
+                pieces += len(lines)
+            if pieces > MAX_PIECES:
+                raise self._too_large()
+        return {name: np.concatenate(lines) for name, lines in parts.items()}
+
+    def _inserted(self, insert: Any, layer: str, layers: set[str], nesting: int) -> list[tuple[str, Segments]]:
+        name, block = insert.dxf.get("name", ""), insert.block()
+        wanted = {own: layer if own == "0" else own for own, _ in self._counted.get(name, ())}
+        wanted = {own: target for own, target in wanted.items() if target in layers or target == "0"}
+        if not wanted or not nesting:
+            return []
+        if name not in self._read:
+            self._read[name] = {}  # a block within itself is empty
+            self._read[name] = self._lines(block, layers, nesting - 1)
+        found = []
+        for placed in insert.multi_insert() if insert.mcount > 1 else [insert]:
+            matrix = np.array(list(placed.matrix44())).reshape(4, 4)
+            for own in wanted.keys() & self._read[name].keys():
+                found.append((wanted[own], self._read[name][own] @ matrix[:3, :3] + matrix[3, :3]))
+        return found
+
+    def _too_large(self) -> MapError:
+        what = f"{MAX_PARTS:,} entities in blocks, or {MAX_PIECES:,} pieces of lines"
+        return MapError(f"path = '{self._path}' has more than {what}: save the walls alone, exploded, as a drawing.")
+
+
+def _pieces(entity: Any) -> Iterator[Segments]:
+    """Yield the pieces (N, 2, 3) of the lines of an entity."""
+    kind = entity.dxftype()
+    if kind == "LINE":
+        yield np.array([[entity.dxf.start.xyz, entity.dxf.end.xyz]])
+    elif kind == "MLINE":
+        for part in entity.virtual_entities():
+            yield from _pieces(part)
+    elif kind in LINE_TYPES:
+        for corners in _curves(entity):
+            yield np.stack([corners[:-1], corners[1:]], axis=1)
+
+
+def _curves(entity: Any) -> Iterator[Floats]:
+    """Yield the corners (N, 3) of the polygons that an entity consists of."""
+    from ezdxf.path import from_hatch, make_path
+
+    for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:
+        corners = np.array([corner.xyz for corner in path.control_vertices()])
+        if len(corners) > 1 and path.has_curves:
+            flat = max(FLAT_FRACTION * float(np.ptp(corners[:, :2], axis=0).max()), 1e-9)
+            corners = np.array([corner.xyz for corner in path.flattening(flat, segments=4)])
+        if len(corners) > 1:
+            yield corners

@@ -1,0 +1,192 @@
+"""ImportReport: what a reader used and skipped of a file, and the size of the map that it made."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from sionna_partial.arrays import States
+from sionna_partial.constants import CellState
+from sionna_partial.display import Shown
+from sionna_partial.maps.rooms import rooms_of
+
+SIZES_M, DOORS_M = (3.0, 300.0), (0.5, 3.0)
+"""Plausible longer sides of a building, and plausible widths of doors [m]."""
+
+ENCLOSED_FRACTION = 0.1
+"""Fraction of the extent of a building that is free at least."""
+
+SHOWN_ROWS = 30
+"""Number of elements that the text of a report lists as used, and as skipped."""
+
+_Map = TypeVar("_Map", bound=Any)
+
+
+class MapWarning(UserWarning):
+    """A map file that was not read to the letter, or whose map is not plausible.
+
+    `report` is the `ImportReport` of the map, or None.
+    """
+
+    report: ImportReport | None = None
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Elements of a file with one name or type, their number, and the reason for which they were skipped."""
+
+    name: str
+    count: int
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ImportSource:
+    """What a reader knows of a file: see `ImportReport`."""
+
+    file: str
+    unit_m: float = 1.0
+    unit_source: str = "format"
+    used: tuple[Elements, ...] = ()
+    skipped: tuple[Elements, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ImportReport(ImportSource, Shown):
+    """Report of a map that was read from a file.
+
+    Size, rooms and doors are computed from the cells of the map, so that they check the result of the import.
+
+    Parameters
+    ----------
+    file : str
+        Path of the file.
+    unit_m : float
+        Length of a unit of the file [m].
+    unit_source : str
+        Where the unit comes from: a header, an option, the file format, or a guess.
+    used, skipped : tuple of Elements
+        Elements of the file by name or type, with their number, and the reason for which they were skipped.
+    notes : tuple of str
+        What else the reader decided.
+    extent_m : (float, float)
+        Extent of the known cells along x and y [m].
+    rooms : int
+        Number of rooms.
+    free_area_m2 : float
+        Area of the free cells [m^2].
+    door_widths_m : tuple of float
+        Widths of the openings between rooms, to a cell [m]. Each room that is joined to others counts once.
+    """
+
+    extent_m: tuple[float, float] = (0.0, 0.0)
+    rooms: int = 0
+    free_area_m2: float = 0.0
+    door_widths_m: tuple[float, ...] = ()
+
+    def __str__(self) -> str:
+        (x, y), widths = self.extent_m, self.door_widths_m
+        doors = f"{widths[0]:.2f} to {widths[-1]:.2f} m (median {np.median(widths):.2f} m)" if widths else "none"
+        lines = {
+            "file": self.file,
+            "unit": f"{self.unit_m:g} m ({self.unit_source})",
+            "extent": f"{x:.4g} x {y:.4g} m",
+            "rooms": f"{self.rooms}",
+            "free area": f"{self.free_area_m2:.4g} m2",
+            "doors": f"{len(widths)}: {doors}" if widths else doors,
+            "used": _listed(self.used),
+            "skipped": _listed(self.skipped),
+            "notes": list(self.notes),
+        }
+        rows = [
+            (name, text) for name, value in lines.items() for text in ([value] if isinstance(value, str) else value)
+        ]
+        names = [
+            name if name != before else "" for (name, _), (before, _) in zip(rows, [("", ""), *rows], strict=False)
+        ]
+        return "\n".join(f"{name:11}{text}" for name, (_, text) in zip(names, rows, strict=True))
+
+    def faults(self, size: str, doors: str, area: str) -> Iterable[str]:
+        """Yield what is not plausible about the map, with a remedy for each; those without remedy are not checked."""
+        (x, y), widths = self.extent_m, self.door_widths_m
+        if size and not SIZES_M[0] <= max(x, y) <= SIZES_M[1]:
+            yield f"spans {x:.4g} x {y:.4g} m, with {self._unit}: {size}"
+        if doors and widths and not any(DOORS_M[0] <= width <= DOORS_M[1] for width in widths):
+            yield f"has doors of {widths[0]:.2f} to {widths[-1]:.2f} m, with {self._unit}: {doors}"
+        if area and self.free_area_m2 < ENCLOSED_FRACTION * x * y:
+            yield f"encloses {self.free_area_m2:.3g} m2 in an extent of {x:.4g} x {y:.4g} m: {area}"
+
+    @property
+    def _unit(self) -> str:
+        return f"a unit of {self.unit_m:g} m ({self.unit_source})"
+
+
+@dataclass
+class ImportNotes:
+    """Notes that a reader takes while it reads a file: what it used, what it skipped and why, and the unit.
+
+    Examples
+    --------
+    >>> notes = ImportNotes("model.ifc", 0.001, "IfcSIUnit of the model")
+    >>> notes.use("IfcWall", 12)
+    >>> notes.skip("IfcFurniture", 3, "no wall")
+    """
+
+    file: str | os.PathLike[str]
+    unit_m: float = 1.0
+    unit_source: str = "format"
+    notes: list[str] = field(default_factory=list)
+    _counts: dict[tuple[str, str], int] = field(default_factory=dict)
+
+    def use(self, name: str, count: int = 1) -> None:
+        """Count elements that were used."""
+        self.skip(name, count, "")
+
+    def skip(self, name: str, count: int, reason: str) -> None:
+        """Count elements that were skipped."""
+        self._counts[name, reason] = self._counts.get((name, reason), 0) + count
+
+    def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
+        """Return a PartialMap with its report, and warn of a result that is not plausible.
+
+        `size`, `doors` and `area` are the remedies, which name the options, for maps of an implausible extent, with
+        implausible doors, and that enclose hardly any area. A check without a remedy is left out.
+        """
+        rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
+        used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
+        source = ImportSource(str(self.file), self.unit_m, self.unit_source, used, skipped, tuple(self.notes))
+        partial = replace(partial, import_source=source)
+        if size or doors or area:
+            for fault in partial.import_report.faults(size, doors, area):
+                warning = MapWarning(f"path = '{self.file}' {fault}")
+                warning.report = partial.import_report
+                warnings.warn(warning, stacklevel=4)
+        return partial
+
+
+def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
+    """Return the report of a map with the cells (ny, nx)."""
+    free, known = state == CellState.FREE, state != CellState.UNKNOWN
+    rooms = rooms_of(free, resolution_m)
+    spans = [_span(known.any(axis=axis)) * resolution_m for axis in (0, 1)]
+    area_m2, doors_m = float(free.sum()) * resolution_m**2, tuple(rooms.openings_m.tolist())
+    return ImportReport(
+        **vars(source), extent_m=(spans[0], spans[1]), rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
+    )
+
+
+def _span(known: Any) -> int:
+    cells = np.flatnonzero(known)
+    return int(cells[-1] - cells[0]) + 1 if len(cells) else 0
+
+
+def _listed(rows: tuple[Elements, ...]) -> list[str]:
+    texts = [f"{row.name}: {row.count:,}{f' ({row.reason})' if row.reason else ''}" for row in rows[:SHOWN_ROWS]]
+    more = len(rows) - SHOWN_ROWS
+    return [*texts, f"and {more:,} more"] if more > 0 else texts
