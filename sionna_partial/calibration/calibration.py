@@ -208,8 +208,7 @@ def calibrate_materials(
     seed : int, optional
         Seed of the rays that find the paths of a mesh, in place of that in `trace_settings`. Nothing else is drawn.
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

@@ -85,7 +85,7 @@ def save_channels(
     memory_gb : float
         How much memory the coefficients of a link may take [GB].
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``.
+        As in `predict_map`.
     **options
         Arguments of `TracedLinks.cir`, for links.
 

@@ -197,8 +197,7 @@ def sample_channels(
     memory_gb : float
         How much memory the draws may take, and all their paths together where they are asked for at once [GB].
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

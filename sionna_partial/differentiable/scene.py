@@ -181,8 +181,7 @@ class DifferentiableScene:
         rx : (N, 3) array-like
             Receiver positions [m].
         progress : bool or callable, optional
-            False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-            terminals and notebooks after 2 s.
+            As in `predict_map`.
 
         Raises
         ------

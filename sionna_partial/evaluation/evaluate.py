@@ -125,8 +125,7 @@ def evaluate(
     baselines : Baselines, optional
         Those fitted to other links; by default those in the folder of the predictor, else the shipped ones.
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

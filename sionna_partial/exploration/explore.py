@@ -183,8 +183,7 @@ def explore_trajectory(
     home, steps, seed, sensor, policy, tx
         As of `explore`.
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

@@ -164,8 +164,7 @@ def place_transmitter(
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

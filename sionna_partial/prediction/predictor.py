@@ -397,8 +397,7 @@ class Predictor(Shown):
         settings : PredictorSettings, optional
             The paper's networks by default.
         progress : bool or callable, optional
-            False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-            terminals and notebooks after 2 s.
+            As in `predict_map`.
 
         Returns
         -------

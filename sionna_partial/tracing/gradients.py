@@ -109,8 +109,7 @@ def gain_gradients(
         Refraction and diffuse reflection must be off; diffraction too on meshes.
     scene_settings : SceneSettings, optional
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

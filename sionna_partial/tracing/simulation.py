@@ -401,8 +401,7 @@ def trace_links(
         between floor and ceiling) or is at the transmitter: an error, or a link without paths, of link state 255 and
         gain NaN.
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------

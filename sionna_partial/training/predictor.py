@@ -99,8 +99,7 @@ def train(
         Networks "map" by default, with a `PredictorWarning` on fewer than 20 homes. Frequency, diffraction and paths
         through walls must be those of the data set, and are by default; the seed splits the homes, too.
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        As in `predict_map`.
 
     Returns
     -------
