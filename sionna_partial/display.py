@@ -1,4 +1,4 @@
-"""How results are shown: in one line at a prompt, and with a picture under it in a notebook."""
+"""Display of results: in one line at a prompt, and with a picture under it in a notebook."""
 
 from base64 import b64encode
 from collections.abc import Mapping

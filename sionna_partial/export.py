@@ -55,7 +55,7 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     coverage : xarray.Dataset
         From `predict_map`.
     path : path-like
-        Where the file shall be. A file that is there is replaced.
+        Path of the file, which is replaced if it exists.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     network : xarray.Dataset
         From `network_map`.
     path : path-like
-        Where the file shall be. A file that is there is replaced.
+        Path of the file, which is replaced if it exists.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What is found on this machine, what is missing, and what to do about it."""
+"""Report on this machine: installed parts, missing parts and remedies."""
 
 import platform
 import re

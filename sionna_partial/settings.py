@@ -49,13 +49,13 @@ HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
 HOME_KINDS = get_args(HomeKind)
 
 NetworkKind = Literal["paper", "paths", "map"]
-"""What a predictor sees of links: the paper's features, what each path crosses, and the map around the transmitter."""
+"""Inputs of a predictor: the paper's features; also the walls along each path; also the map around the transmitter."""
 
 Objective = Literal["coverage", "percentile"]
-"""What a transmitter is placed for: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
+"""Objective of a placement: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
 
 Policy = Literal["random", "coverage"]
-"""How an exploring robot chooses frontiers."""
+"""Policy by which an exploring robot chooses frontiers."""
 
 Frequency = Annotated[float, Within(*FREQUENCIES_HZ)]
 Fraction = Annotated[float, Within(0.0, 1.0)]
@@ -159,7 +159,7 @@ DRYWALL = WALL_MATERIALS["drywall"]
 
 @dataclass(frozen=True)
 class SceneSettings(Checked):
-    """How a map becomes a scene. Of a map with a mesh, only the material counts.
+    """Settings of the conversion of a map to a scene. For a map with a mesh, only the material is used.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ class SceneSettings(Checked):
     ceiling : bool
         Whether there is a ceiling above the floor.
     outline : {"lines", "cells"}
-        Where walls stand: on few straight lines fitted to the wall cells, or on the staircase through the centres of
+        Position of the walls: few straight lines fitted to the wall cells, or the staircase through the centres of
         the wall cells as they are, for which `bridge_gap_m` does not count.
 
     Raises
@@ -198,7 +198,7 @@ class SceneSettings(Checked):
 
 @dataclass(frozen=True)
 class TraceSettings(Checked):
-    """What the ray tracer computes.
+    """Settings of the ray tracer.
 
     Parameters
     ----------
@@ -224,7 +224,7 @@ class TraceSettings(Checked):
     max_walls : int
         Largest number of walls that a path goes through, 1 to 16. `max_depth` does not count them.
     wall_depth_m : float
-        How deep one wall may be [m], 0 to 10. Of the faces that a path goes through one after the other, with no free
+        Largest depth of one wall [m], 0 to 10. Of the faces that a path goes through one after the other, with no free
         cell between them, those within this depth are one wall, and have the loss of one slab of the material; so have
         the faces where it enters a closed body of a mesh and leaves it again. At 0 every face is a slab, as in the
         exported scene.
@@ -274,7 +274,7 @@ class TraceSettings(Checked):
 
 @dataclass(frozen=True)
 class SensorSettings(Checked):
-    """What the exploring robot sees from one pose, and its errors; by default it makes none.
+    """Sensor of the exploring robot and its errors; by default there are none.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ than large (the square of a uniform number).
 
 @dataclass(frozen=True)
 class DatasetSettings(Checked):
-    """Which links of a home a data set has.
+    """Selection of the links of each home in a data set.
 
     Parameters
     ----------
@@ -356,15 +356,15 @@ class DatasetSettings(Checked):
     margin_m : float
         Width of the map area beyond the known cells of the complete home [m]. Maps are cut and extended to it.
     sensor : SensorSettings or "mixed"
-        What the exploring robot sees, and its errors; "mixed" draws it for each home from `MIXED_SENSORS`, by `seed`
+        Sensor of the exploring robot and its errors; "mixed" draws it for each home from `MIXED_SENSORS`, by `seed`
         and the home's name: one home in three has a camera of 60 to 120 degrees, the others a lidar that turns.
     short_link_fraction : float
         Fraction of the receivers of each transmitter that are drawn within `SHORT_LINK_M` of it [1]. In large
         buildings most links between uniformly drawn positions are long, and in outage.
     scene : SceneSettings
-        How maps become scenes.
+        Conversion of maps to scenes.
     trace : TraceSettings
-        What is traced, on the complete and on the partial maps.
+        Settings of the traces on the complete and on the partial maps.
 
     Raises
     ------
@@ -407,7 +407,7 @@ class DatasetSettings(Checked):
 
 @dataclass(frozen=True)
 class PredictorSettings(Checked):
-    """How a predictor is trained.
+    """Settings of the training of a predictor.
 
     Parameters
     ----------
@@ -461,7 +461,7 @@ class PredictorSettings(Checked):
 
 @dataclass(frozen=True)
 class PlacementSettings(Checked):
-    """What a transmitter is placed for, and how high it stands.
+    """Objective of a placement, and heights of transmitter and receivers.
 
     Parameters
     ----------

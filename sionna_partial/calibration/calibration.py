@@ -78,17 +78,17 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
     noise_db : float
         Standard deviation of the measurements' noise [dB], as found.
     offset_db : float
-        What links in line of sight were measured above their gains [dB], if that is so much that it cannot be the
-        material: of transmit power and antennas, subtracted from all. Else 0.
+        Offset of the measured gains of links in line of sight [dB], if it is too large to come from the material. It
+        comes from transmit power and antennas, and is subtracted from all gains. Otherwise 0.
     used : (N,) bool array
-        Which of the measured links were used.
+        Mask of the measured links that were used.
     left_out : dict of str to int
-        How many were not, by reason.
+        Number of links that were left out, by reason.
     gain_db, gain_before_db, gain_after_db : (N,) float64 arrays
         Gain of the measured links: as measured, less the offset, and as traced with the start's and with the
         calibrated materials [dB].
     start, materials : tuple of M Material
-        Where the search began, and where it ended.
+        Materials at the start and at the end of the search.
     posteriors : tuple of M Posterior
         Distribution of each material, given the measurements: arrays `permittivity`, `conductivity_s_m` [S/m] and
         `weight` (K,), which sums to 1.
@@ -197,11 +197,11 @@ def calibrate_materials(
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        What is known of the building.
+        Map of the building, complete or partial.
     measurements : Measurements, mapping, data frame, Dataset or path of a CSV
         With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB] (see `measurements_of`).
     start : Material, optional
-        Where the search begins; its thickness is kept. By default the material of the scene.
+        Start of the search; its thickness is kept. By default the material of the scene.
     trace_settings : TraceSettings, optional
         Refraction and diffuse reflection must be off; diffraction too on meshes.
     scene_settings : SceneSettings, optional

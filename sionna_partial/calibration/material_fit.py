@@ -182,7 +182,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Posterior(Shown):
-    """What measurements leave open about one material: K values with weights that sum to 1, all (K,)."""
+    """Posterior of one material: K values with weights that sum to 1, all (K,)."""
 
     permittivity: Floats
     conductivity_s_m: Floats
@@ -214,7 +214,7 @@ class Posterior(Shown):
 
 
 class MaterialTarget:
-    """How well materials explain measured gains (N,) [dB] of links that all have a path; weight is the likelihood's.
+    """Misfit of materials to measured gains (N,) [dB] of links that all have a path; weight is the likelihood's.
 
     With `has_offset` all gains have an unknown offset, which links in line of sight show.
     """

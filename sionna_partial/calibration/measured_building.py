@@ -48,7 +48,7 @@ class LinkPaths:
     ----------
     paths : PathSet
     columns : (M,) int array
-        Which of the scene's materials are sought.
+        Materials of the scene that are sought.
     link : (P,) int64 array
         Link of each path.
     """

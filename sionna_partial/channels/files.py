@@ -83,7 +83,7 @@ def save_channels(
         A `.zarr` folder, which must not be there yet, or a `.nc` or `.h5` file.
     layout : {"sionna", "deepmimo"}
     memory_gb : float
-        How much memory the coefficients of a link may take [GB].
+        Memory limit for the coefficients of a link [GB].
     progress : bool or callable, optional
         As in `predict_map`.
     **options

@@ -1,4 +1,4 @@
-"""What links through the same unseen space have in common: Gaussian latents, one for each link and draw.
+"""Gaussian latents, one for each link and draw, which links through the same unseen space share.
 
 Every link is a weighted sum of one Gaussian field over the plane along its direct line, as in the network shadowing
 model of Agrawal and Patwari (Correlated Link Shadow Fading in Multi-Hop Wireless Networks, IEEE Transactions on

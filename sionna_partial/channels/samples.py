@@ -64,7 +64,7 @@ class ChannelSamples(Shown):
     gain_db : (n, N) or (n, T, N) float64 array
         Omnidirectional path gain [dB], -150 in an outage.
     memory_gb : float
-        How much memory all paths of `drawn` may take [GB].
+        Memory limit for all paths of `drawn` [GB].
     """
 
     link_state: States
@@ -181,7 +181,7 @@ def sample_channels(
     Parameters
     ----------
     scene : PartialMap or path
-        What is known of the building.
+        Map of the building, complete or partial.
     tx : (3,) or (T, 3) array-like
         Transmitter positions [m].
     rx : (N, 3) array-like
@@ -195,7 +195,7 @@ def sample_channels(
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     memory_gb : float
-        How much memory the draws may take, and all their paths together where they are asked for at once [GB].
+        Memory limit for the draws, and for all their paths where they are requested at once [GB].
     progress : bool or callable, optional
         As in `predict_map`.
 

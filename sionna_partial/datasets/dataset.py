@@ -49,7 +49,7 @@ CONNECT_S = 30.0
 
 @dataclass(frozen=True)
 class DatasetReport(Shown):
-    """What a run has done: names of the homes that it built and that were there, and why others failed."""
+    """Result of a run: names of the homes that it built and that were there before, and reasons of failures."""
 
     folder: Path
     built: tuple[str, ...]

@@ -17,7 +17,7 @@ from sionna_partial.settings import NetworkKind, PredictorSettings, TraceSetting
 
 @dataclass(frozen=True)
 class LinkTraces:
-    """How links were traced: carrier frequency [Hz], and whether with diffraction on plans, and through walls."""
+    """Settings of the traces: carrier frequency [Hz], and whether with diffraction on plans, and through walls."""
 
     frequency_hz: float
     diffraction: bool

@@ -1,4 +1,4 @@
-"""Which homes a data set is built from: homes made from seeds, and complete maps from files."""
+"""Homes of a data set: homes made from seeds, and complete maps from files."""
 
 import os
 from collections.abc import Iterable, Iterator

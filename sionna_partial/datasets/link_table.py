@@ -66,7 +66,7 @@ class LinkTable(Shown):
 
     @property
     def context(self) -> LinkContext:
-        """What the maps show of the links."""
+        """Features of the links that derive from the maps."""
         assert self.features.context is not None
         return self.features.context
 

@@ -42,7 +42,7 @@ class Row:
     stage : float
         Steps that the robot has explored; below 1, the fraction that it was to observe.
     ends_seen : {"all", "both", "one", "none"}
-        Which links: all, or those with so many ends in observed cells.
+        Selection of links: all, or by the number of ends in observed cells.
     model : str
         "predictor" or a baseline.
     metrics : Metrics
@@ -209,7 +209,7 @@ def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> di
 
 
 def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, ...]) -> Iterator[str]:
-    """Which homes the baselines were trained on."""
+    """Homes that the baselines were trained on."""
     fitted = others["distance only"]
     those = "those" if set(fitted.homes) == set(model.homes) else "others than those"
     yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."

@@ -1,1 +1,1 @@
-"""Where a robot should drive next."""
+"""Next views of a robot, and simulated exploration."""

@@ -41,23 +41,23 @@ _REPORT_STEPS = 10
 @read_only
 @dataclass(frozen=True, eq=False)
 class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
-    """The trajectory of a robot through a home, and what it had seen at several moments.
+    """Trajectory of a robot through a home, and its map at several moments.
 
     Parameters
     ----------
     home : PartialMap
-        What there was to be seen.
+        The complete home.
     sensor : SensorSettings
-        What it was seen with.
+        Sensor of the robot.
     steps : (M,) tuple of int
         Numbers of actions [1], increasing; where fractions were asked for, those after which each was observed.
     states : (M, ny, nx) uint8 array of CellState
         The robot's map after so many steps, on the grid of `home`.
     poses : (N, 3) array
-        Where the robot was after 0, 1, ... actions, up to the last of `steps`: world x, y [m], and heading from x
+        Pose of the robot after 0, 1, ... actions, up to the last of `steps`: world x, y [m], and heading from x
         towards y [degree].
     believed_poses : (N, 3) array
-        Where it believed to be. It differs from `poses` only with drift.
+        Pose in the robot's own estimate. It differs from `poses` only with drift.
 
     Examples
     --------
@@ -76,7 +76,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
 
     @property
     def maps(self) -> list[PartialMap]:
-        """What the robot had seen after each of `steps`.
+        """Map of the robot after each of `steps`.
 
         `interior_cells` is the number of free cells of the home. A mesh is cut to what is known, each time anew.
         """
@@ -124,7 +124,7 @@ def explore(
     Parameters
     ----------
     home : PartialMap
-        What is there to be seen. Its unknown cells stop the robot and its view, and stay unknown.
+        The complete home. Its unknown cells stop the robot and its view, and stay unknown.
     steps : sequence of int or float
         Numbers of actions [1], increasing, at most `MAX_STEPS`, after which the map is returned. After 0 nothing has
         been seen. Or fractions of the free area in [0, 1), increasing: each map is the first that has so much of it,
@@ -132,9 +132,9 @@ def explore(
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
-        What the robot sees in one look, and its errors; None is the defaults, without errors.
+        Sensor of the robot and its errors; None is the default, without errors.
     policy : {"random", "coverage"}
-        How frontiers are chosen: at random, or where the uncertainty of the coverage falls most for few actions, as in
+        Choice of frontiers: at random, or where the uncertainty of the coverage falls most for few actions, as in
         `next_views`. The latter predicts at every choice: about a minute for 300 steps.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
         Transmitters [m] for the policy "coverage"; by default any position.

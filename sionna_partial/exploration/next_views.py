@@ -1,4 +1,4 @@
-"""Where a robot should drive next for a better coverage map: partial map -> ranked poses."""
+"""Next views for a better coverage map: partial map -> ranked poses of the robot."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ from sionna_partial.worlds.robot import (
 )
 
 GOALS = ("coverage", "state", "area")
-"""What is to become known; the first is the default."""
+"""Goals of a view; the first is the default."""
 
 MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
 """Largest numbers of poses that are returned, and of transmitters that are predicted."""
@@ -123,12 +123,12 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         Empty where nothing unknown can be reached.
     partial : PartialMap
     start_m : (2,) float64 array
-        Where the paths begin [m].
+        Start of the paths [m].
     tx_m : (T, 3) float64 array
         Transmitters that were predicted [m]; none for the goal "area".
     uncertainty : xarray.DataArray
-        On (tx, y, x): entropy of each link [bit], times the probability that the receiver is indoors. Of a transmitter
-        at an unknown position, times the relative probability of each of `tx_m`.
+        Entropy of each link on (tx, y, x) [bit], times the probability that the receiver is indoors. For a transmitter
+        at an unknown position it is multiplied by the relative probability of each of `tx_m`.
     goal : {"coverage", "state", "area"}
     sensor : SensorSettings
 
@@ -229,16 +229,16 @@ def next_views(
     measurements : Measurements, mapping, data frame or path, optional
         Gains that were measured of the transmitters, as for `predict_map`.
     goal : {"coverage", "state", "area"}
-        What is to become known: whether the path gain exceeds the threshold, the link state, or the map alone, for
-        which nothing is predicted.
+        Quantity that is to become known: whether the path gain exceeds the threshold, the link state, or the map alone,
+        for which nothing is predicted.
     count : int
         Largest number of poses.
     start : (2,) array-like, optional
-        Where the robot is [m]; by default in the middle of the largest connected part of the free cells.
+        Position of the robot [m]; by default the middle of the largest connected part of the free cells.
     threshold_db : float
         Path gain above which a receiver is covered [dB].
     sensor : SensorSettings, optional
-        What the robot sees in one look.
+        Sensor of the robot.
     predictor, scene_settings, trace_settings
         As for `predict_map`.
 

@@ -1,1 +1,1 @@
-"""What has been observed of a building: PartialMap, its files, ROS maps, arrays, and meshes."""
+"""Partial maps of buildings: PartialMap, its files, ROS maps, arrays, and meshes."""

@@ -1,4 +1,4 @@
-"""What stands in a map: walls extruded from its cells (`FloorPlan`), or the triangles of a mesh (`Mesh`).
+"""Contents of a map: walls extruded from its cells (`FloorPlan`), or the triangles of a mesh (`Mesh`).
 
 `PartialMap.environment` alone decides which of the two a map has. Another kind, such as voxels, takes a
 class like these, a way to write it in `scene.write_map`, and a way to find its paths in `tracing/finder.py`.
@@ -81,7 +81,7 @@ class FloorPlan:
 
 @dataclass(frozen=True)
 class Mesh:
-    """What has been observed of a mesh, with the methods of `FloorPlan`.
+    """Observed part of a mesh, with the methods of `FloorPlan`.
 
     It has fewer paths than a floor plan, and costs rays for all receivers that are not found together.
     """

@@ -15,10 +15,10 @@ MAX_FREE_GAP_M = 0.11
 """Longest gap of FREE cells that is closed [m]: log-odds mapping erases single wall cells."""
 
 MIN_RUN_CELLS = 3
-"""How far a wall must go on, on both sides of a gap, for the gap to be one in a seen wall [cells]."""
+"""Length of a wall on both sides of a gap from which on the gap belongs to a seen wall [cells]."""
 
 DEEP_CELLS = 4
-"""How far FREE cells are behind the face of a wall that is deep [cells]."""
+"""Depth behind the face of a deep wall in which cells are FREE [cells]."""
 
 PINHOLE_CELLS = 6
 """Largest hole in a wall that is filled [cells]."""

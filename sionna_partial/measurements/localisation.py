@@ -1,4 +1,4 @@
-"""Where a transmitter may be: gains that were measured of it -> posterior over positions."""
+"""Localisation of a transmitter: measured gains -> posterior over positions."""
 
 import math
 from collections.abc import Callable

@@ -113,7 +113,7 @@ def measurements_from_bag(
     tx : (3,) array-like, optional
         Transmitter position [m]; None, and NaN in the table, where it is not known.
     tx_power_dbm : float
-        What the receiver would report without path loss: transmit power and antenna gains less cable losses [dBm].
+        Received power without path loss: transmit power and antenna gains less cable losses [dBm].
     field : str
         Field of the messages that holds the power; the default is that of `std_msgs/Float32` and `Float64`.
     pose_topic, frame : str or None

@@ -1,1 +1,1 @@
-"""Where to put a transmitter."""
+"""Placement of transmitters."""

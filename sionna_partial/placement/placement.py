@@ -1,4 +1,4 @@
-"""Where to put a transmitter: positions compared by visibility, then traced and predicted, the best ones refined."""
+"""Placement of a transmitter: positions are compared by visibility, traced and predicted, and the best are refined."""
 
 import json
 import math
@@ -39,7 +39,7 @@ OUTAGE["p_outage"] = 1.0
 _DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
 SIMILARITY_PENALTY = 0.6
-"""How much a start loses that sees the same receivers as one that is chosen already."""
+"""Loss of score of a start that sees the same receivers as one that is chosen already."""
 
 FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 """Of the receivers, sorted by gain, the worst 5 % count in full, and linearly less up to 15 %."""
@@ -151,8 +151,8 @@ def place_transmitter(
     scene : PartialMap, path, Simulation or LinkModel
         The map, or whatever `load_map` reads.
     objective : {"coverage", "percentile"}
-        What is to be large: the mean probability that the path gain exceeds the threshold, or the mean predicted gain
-        of the worst tenth of the receivers.
+        Quantity that is maximised: the mean probability that the path gain exceeds the threshold, or the mean predicted
+        gain of the worst tenth of the receivers.
     threshold_db : float
         Path gain above which a receiver is covered [dB].
     tx_height_m, rx_height_m : float
@@ -228,7 +228,7 @@ def place_transmitter(
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """What a search for transmitters needs: settings, link model and area."""
+    """Settings, link model and area of a search for transmitters."""
 
     settings: PlacementSettings
     model: LinkModel

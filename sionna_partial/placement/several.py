@@ -1,4 +1,4 @@
-"""Where to put several transmitters: candidates drawn together, chosen greedily, then swapped."""
+"""Placement of several transmitters: candidates are drawn together, chosen greedily, then swapped."""
 
 from __future__ import annotations
 

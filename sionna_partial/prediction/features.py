@@ -47,7 +47,7 @@ LEAST_NOISE = 0.1
 """Noise of walls up to which a map counts as exact: the edges of what a robot has seen are rough, too."""
 
 _ASIDE_CELLS = 1.5
-"""How far to both sides a line has to run into known walls to cross one: the uncertainty of a map [cells]."""
+"""Distance to both sides within which a line must meet a known wall to cross it: the uncertainty of a map [cells]."""
 
 _OPAQUE_CELLS = 3.0
 """Length of a line in known walls from which it has no LOS, unless it is traced on exact walls [cells]."""
@@ -59,7 +59,7 @@ _BEYOND_CELLS = 2
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkContext(Shown):
-    """What the paths of N links cross, what the map leaves possible, and what it shows around their transmitters.
+    """Context of N links: walls along their paths, link states that the map allows, and windows of the map.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class LinkContext(Shown):
     walled_m : (N,) float64 array
         Length of the direct line in cells of known walls [m]: outlines of walls may leave them open.
     wall_noise : (N,) float64 array
-        How much range noise thickened and roughened the walls of the map, 0 (exact) to 1.
+        Degree to which range noise thickened and roughened the walls of the map, 0 (exact) to 1.
     possible : (N, 3) bool array
         Whether the map leaves each LinkState possible; at least one is.
     indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
@@ -83,7 +83,7 @@ class LinkContext(Shown):
     strongest_unobserved_m : (N,) float64 array
         Unobserved length of the strongest path but the direct one [m]; the distance where there is none.
     windows : (W, *WINDOWS) uint8 array, optional
-        What the map networks read around the transmitters.
+        Windows of the map around the transmitters, for map networks.
     straight_gain_db : (N,) float64 array
         Gain of the direct path, through whatever known walls it crosses [dB], at least -150.
     straight_walls : (N,) float64 array

@@ -56,7 +56,7 @@ FEATURES = (
 STATE_INPUTS = ("distance_m", "unobserved_distance_m")
 GAIN_INPUTS = (*STATE_INPUTS, "gain_db")
 INDOOR_INPUTS = ("unobserved_distance_m",)
-"""What the paper's networks read, unscaled; the link state of the partial trace chooses among them."""
+"""Unscaled inputs of the paper's networks; the link state of the partial trace selects the network."""
 
 
 Values = Mapping[str, Any]

@@ -59,7 +59,7 @@ Ranges = Mapping[str, tuple[float, float]]
 class GainNetwork:
     """One row of the paper's table: a network for the gain given a link state and partial link states.
 
-    Where there are no links to learn from, gain minus anchor has the mean `prior_offset_db` and the standard deviation
+    Without links to learn from, gain minus anchor has the mean `prior_offset_db` and the standard deviation
     `prior_std_db`.
     """
 

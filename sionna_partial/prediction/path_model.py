@@ -43,7 +43,7 @@ _SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0
 unobserved length, gain of the surviving paths above that of the link [dB], whether each end is in an observed cell."""
 
 _NEARLY = 0.3
-"""How much farther than the nearest link, as a fraction, an analogue may be."""
+"""Largest excess distance of an analogue over the nearest link, as a fraction."""
 
 _TURN_DEG = (6, 3)
 """Steps of zenith and azimuth in which directions of departure are counted [degree]."""

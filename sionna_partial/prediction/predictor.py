@@ -171,7 +171,7 @@ class LinkPrediction(Shown):
 
     @property
     def by_state(self) -> tuple[Floats, Floats, Floats]:
-        """What `of_parts` combines: probabilities, means and standard deviations [dB] given each LinkState (3, N)."""
+        """Arguments of `of_parts`: probabilities, means and standard deviations [dB] given each LinkState (3, N)."""
         nothing = np.zeros_like(self.p_outage)
         return (
             np.stack([self.p_outage, self.p_los, self.p_nlos]),
@@ -334,7 +334,7 @@ class Predictor(Shown):
     links : mapping of str to int
         Number of training links by "true state given partial state".
     metrics : mapping
-        What was measured on homes it was not trained on.
+        Metrics on homes that it was not trained on.
     versions : mapping of str to str
         Of the packages that trained it.
     name : str

@@ -7,7 +7,7 @@ from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 
 RAGGED_FACTOR = 2.0
-"""How much farther than the tolerance a line may be from ragged walls."""
+"""Largest distance of a line from ragged walls, in tolerances."""
 
 _CORNERS = 64
 _RESIDUAL_COST = 3.0

@@ -232,7 +232,7 @@ def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
 
 
 def _onward(graph: _Graph, beside: list[list[int]]) -> dict[tuple[int, int], int]:
-    """Where a chain goes on at a junction: (from, junction) -> next point."""
+    """Continuation of a chain at a junction: (from, junction) -> next point."""
     onward: dict[tuple[int, int], int] = {}
     for junction in np.nonzero(graph.degree > 2)[0].tolist():
         arms, tips = beside[junction], []

@@ -120,6 +120,6 @@ _KINDS: tuple[tuple[Callable[[Rng], Polygon], float], ...] = (
     (lambda rng: affinity.scale(shapely.Point(0, 0).buffer(1.0, quad_segs=4), *rng.uniform(0.25, 0.8, 2)), 0.3),
     (_heap, 0.6),
 )
-"""How each kind is drawn, and the probability that it stands at a wall."""
+"""Drawing function of each kind, and the probability that it is placed at a wall."""
 
 _FREQUENCIES = (0.3, 0.25, 0.15, 0.1, 0.2)

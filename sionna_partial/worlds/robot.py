@@ -71,7 +71,7 @@ class Frontier(NamedTuple):
 
 
 Choice = Callable[["Robot", list[Frontier]], int]
-"""Which of the frontiers a robot drives to."""
+"""Choice of the frontier that a robot drives to."""
 
 
 class Robot:
@@ -112,7 +112,7 @@ class Robot:
 
     @property
     def believed_position(self) -> tuple[float, float]:
-        """Where the robot believes to be."""
+        """Position in the estimate of the robot."""
         return self.position[0] + self._shift[0], self.position[1] + self._shift[1]
 
     def act(self) -> None:

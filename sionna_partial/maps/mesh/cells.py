@@ -52,7 +52,7 @@ UNIT_REMEDY = "give unit_m, the length of its unit in metres"
 
 @dataclass(frozen=True)
 class MeshReading:
-    """How a mesh becomes a map; None is the default. See `load_map`."""
+    """Conversion of a mesh to a map; None is the default. See `load_map`."""
 
     height_band_m: tuple[float, float] | None = None
     observed: ArrayLike | PartialMap | None = None
