@@ -347,8 +347,8 @@ def fitted_threshold(
 def _split(percent: Floats, count: Indices, allowed: Bools) -> float | None:
     """Return the threshold in the valley between two distributions, None where they are not separate."""
     order = np.argsort(percent)
+    order = order[count[order] > 0]
     value, weight, allowed = percent[order], count[order].astype(np.float64), allowed[order]
-    value, weight, allowed = (each[weight > 0] for each in (value, weight, allowed))
     sums = np.cumsum([weight, weight * value, weight * value**2], axis=1)
     low, high = sums[:, :-1], sums[:, -1:] - sums[:, :-1]
     (low_mean, low_var), (high_mean, high_var) = (
