@@ -589,7 +589,7 @@ def _others(
     fitted: dict[tuple[int, Antenna], Assimilation] = {}
     for number, (found, antenna) in enumerate(zip(of_each, antennas, strict=True)):
         for at in np.flatnonzero(~owned[number]).tolist():
-            its_antenna = antennas[owned[:, at].argmax()] if owned[:, at].any() else averaged[antenna]
+            its_antenna = antennas[int(owned[:, at].argmax())] if owned[:, at].any() else averaged[antenna]
             key = at, its_antenna
             if key not in fitted:
                 fitted[key] = _assimilated(model, others[at].tx[0], others[at], at_once, its_antenna)

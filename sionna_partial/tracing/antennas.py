@@ -265,7 +265,7 @@ class AntennaPattern(Shown):
             require_number(name, width_deg, 0.0, 360.0, open_low=True)
             cuts.append(np.minimum(12.0 * (angle_deg / width_deg) ** 2, front_to_back_db))
         name = f"sector of {horizontal_beamwidth_deg:g} x {vertical_beamwidth_deg:g} deg"
-        return cls(name, gain_dbi, *cuts)._require_passive()
+        return cls(name, gain_dbi, cuts[0], cuts[1])._require_passive()
 
     @property
     def uniform_gain_dbi(self) -> float | None:
