@@ -58,9 +58,9 @@ class PredictedLinks(NamedTuple):
 
     phi: LinkFeatures
     prediction: LinkPrediction
-    antenna_db: Floats
     p_indoor: Floats
     complete: Bools
+    antenna_db: Floats
 
     def amplified(self, gain_db: float) -> PredictedLinks:
         """Return the links of an antenna with that gain in all directions [dB]."""
@@ -276,7 +276,7 @@ class LinkModel:
             phi, prediction, antenna_db = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         known = self.partial.state_at(rx_m) != CellState.UNKNOWN
-        return PredictedLinks(phi, prediction, antenna_db, np.where(known, 1.0, p_indoor), complete)
+        return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor), complete, antenna_db)
 
     def coverage(self, tx: ArrayLike | Mapping[str, ArrayLike] | None = None, **options: Any) -> xr.Dataset:
         """Predict links everywhere on the map: `predict_map` of this model, with the same options."""

@@ -435,7 +435,7 @@ class CoverageAccessor:
             5.1.3.1-1, each from the SNR at which it is 0.6 of the Shannon bound (TR 36.942, annex A), less the overhead
             of TS 38.306.
         bandwidth_hz : float
-            Bandwidth of the channel: in Wi-Fi 20, 40, 80, 160 and (802.11be, from 5.925 GHz) 320 MHz, up to 40 MHz
+            Channel bandwidth [Hz]: in Wi-Fi 20, 40, 80, 160 and (802.11be, from 5.925 GHz) 320 MHz, up to 40 MHz
             below 3 GHz; in NR 5 to 100 MHz (FR1) or 50 MHz to 2 GHz (FR2).
 
         Raises

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -75,8 +75,6 @@ class Transmitter:
     antenna: Antenna
     grid: Receivers
     measured: Measurements | None = None
-    others: Sequence[Assimilation] = ()
-    """Other transmitters of the building: their measurements give the prior of offset and shadow scale."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +97,8 @@ class CoverageJob:
     spacing_m: float
     receivers: str
     block: int
+    others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
+    """Assimilated measurements of other transmitters, for each transmitter."""
 
     def coverage(self, transmitter: Transmitter, report: Progress) -> xr.Dataset:
         """Predict the coverage map of a transmitter."""
@@ -128,30 +128,31 @@ class CoverageJob:
         coverage = coverage_map(model.partial, grid, values, attributes)
         return coverage if posterior is None else with_posterior(coverage, posterior)
 
-    def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> list[Transmitter]:
-        """Return the transmitters with the measurements of the others in the building assimilated, each alone.
+    def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> CoverageJob:
+        """Return the job with the measurements of other transmitters assimilated, each alone.
 
-        They are not used where walls are opaque, or where the transmitter is unknown. A transmitter that is predicted
-        has its own antenna. Any other antenna is taken to be like the antenna of the transmitter that it is used for,
-        in an unknown orientation.
+        They give the prior of offset and loss of walls. Where walls are opaque, or where the transmitter is unknown,
+        they are not used. A transmitter that is predicted has its own antenna. The antenna of any other one is taken
+        to be like the antenna of the transmitter that it is used for, in an unknown orientation.
         """
         settings = self.model.simulation.trace_settings
         sources_m = [each.position_m[None] for each in transmitters if each.position_m is not None]
         if measurements is None or not sources_m or not settings.through_walls:
-            return [*transmitters]
-        others = measurements_of_others(self.model.partial, sources_m, measurements, settings.frequency_hz)
-        owned = nearest_transmitters(np.reshape([other.tx[0] for other in others], (-1, 3)), sources_m)
+            return self
+        measured = measurements_of_others(self.model.partial, sources_m, measurements, settings.frequency_hz)
+        owned = nearest_transmitters(np.reshape([each.tx[0] for each in measured], (-1, 3)), sources_m)
+        antennas = [transmitter.antenna for transmitter in transmitters]
+        averaged = {antenna: antenna.averaged(settings.frequency_hz) for antenna in {*antennas}} if measured else {}
         fitted: dict[tuple[int, Antenna], Assimilation] = {}
-        found = []
-        for number, transmitter in enumerate(transmitters):
-            keys, like = [], transmitter.antenna.averaged(settings.frequency_hz)
-            for at in np.flatnonzero(~owned[number]).tolist():
-                antenna = transmitters[int(owned[:, at].argmax())].antenna if owned[:, at].any() else like
-                keys.append((at, antenna))
-                if keys[-1] not in fitted:
-                    fitted[keys[-1]] = self._assimilated(others[at].tx[0], others[at], antenna)
-            found.append(replace(transmitter, others=[fitted[key] for key in keys]))
-        return found
+        others: dict[str, list[Assimilation]] = {transmitter.name: [] for transmitter in transmitters}
+        for transmitter, own in zip(transmitters, owned, strict=True):
+            for at in np.flatnonzero(~own).tolist():
+                has_owner, owner = owned[:, at].any(), int(owned[:, at].argmax())
+                antenna = antennas[owner] if has_owner else averaged[transmitter.antenna]
+                if (at, antenna) not in fitted:
+                    fitted[at, antenna] = self._assimilated(measured[at].tx[0], measured[at], antenna)
+                others[transmitter.name].append(fitted[at, antenna])
+        return replace(self, others=others)
 
     def _source(
         self,
@@ -171,7 +172,7 @@ class CoverageJob:
         assimilations = []
         if transmitter.measured is not None:
             for at_m, p in zip(tx_m, p_powers, strict=True):
-                options = {"p_powers": p, "others": transmitter.others}
+                options = {"p_powers": p, "others": self.others.get(transmitter.name, ())}
                 assimilations.append(self._assimilated(at_m, transmitter.measured, transmitter.antenna, **options))
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 
@@ -203,14 +204,12 @@ class CoverageJob:
     def _prior(
         self, tx_m: Floats, rx_m: Floats, antenna: Antenna, *, at_rx: bool = False
     ) -> tuple[LinkPrediction, Floats, Floats]:
-        """Predict the links to receivers (N, 3) [m] without the antenna, the antenna's gain, and P(indoor) of each."""
-        blocks = [
-            self.model.links(tx_m, rx_m[start : start + self.block], no_progress, antenna, at_rx=at_rx)
-            for start in range(0, len(rx_m), self.block)
-        ]
-        prediction = LinkPrediction.concatenate([links.prediction for links in blocks])
+        """Predict the links to any number of receivers (N, 3) [m] without the antenna, its gain, and P(indoor)."""
+        parts_m = [rx_m[start : start + self.block] for start in range(0, len(rx_m), self.block)]
+        blocks = [self.model.links(tx_m, part_m, no_progress, antenna, at_rx=at_rx) for part_m in parts_m]
         antenna_db = np.concatenate([links.antenna_db for links in blocks])
-        return prediction, antenna_db, np.concatenate([links.p_indoor for links in blocks])
+        p_indoor = np.concatenate([links.p_indoor for links in blocks])
+        return LinkPrediction.concatenate([links.prediction for links in blocks]), antenna_db, p_indoor
 
     def _located(self, transmitter: Transmitter, report: Progress) -> TransmitterPosterior:
         """Find a transmitter from its measurements."""
@@ -230,8 +229,12 @@ class CoverageJob:
         """Predict the measured links of a transmitter at (3,) [m], and fit the process to them."""
         prior, antenna_db, _ = self._prior(tx_m, measured.rx, antenna)
         settings = self.model.simulation.trace_settings
-        options |= {"frequency_hz": settings.frequency_hz, "through_walls": settings.through_walls}
-        return Assimilation.fit(self.model.partial, tx_m, measured, prior, antenna_db=antenna_db, **options)
+        options |= {
+            "antenna_db": antenna_db,
+            "frequency_hz": settings.frequency_hz,
+            "through_walls": settings.through_walls,
+        }
+        return Assimilation.fit(self.model.partial, tx_m, measured, prior, **options)
 
 
 def predict_coverage(
@@ -247,8 +250,8 @@ def predict_coverage(
     report(0.0, "building the scene")
     names, transmitters = _transmitters(model, tx, tx_antenna, measurements, grid["rx_height_m"], grid["spacing_m"])
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
-    job, maps = CoverageJob(model, block=block, **grid), []
-    transmitters = job.with_others(transmitters, measurements)
+    job = CoverageJob(model, block=block, **grid).with_others(transmitters, measurements)
+    maps = []
     for number, transmitter in enumerate(transmitters):
         part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
         maps.append(job.coverage(transmitter, part))

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
 from sionna_partial.arrays import read_only
-from sionna_partial.checks import float_array, require, require_number, require_type
+from sionna_partial.checks import real_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
@@ -48,10 +48,11 @@ NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 1
 deviation of its logarithm [dB]."""
 
 
-P_POWERS, UNSEEN_P_POWERS, P_POWERS_THROUGH_WALLS = 0.01, 0.0001, 0.95
+P_POWERS, UNSEEN_P_POWERS, FREE_P_POWERS = 0.01, 0.0001, 0.95
 """Prior probability that powers were measured and no path gains, where the transmitter is in a cell that was seen, and
-where it is not: what all measurements have in common may then be a wall that was not seen, too. The third where paths
-go through walls, at the frequencies of radios whose offset is seldom known."""
+where it is not: an offset of all measurements may then be a wall that was not seen, too. The third applies where
+paths go through walls, at the frequencies of radios whose offset is seldom known, and where the position of the
+transmitter is unknown: with the first, 90 % regions contain 69 % of transmitters if all powers are 8 dB low."""
 
 
 class Kind(NamedTuple):
@@ -205,7 +206,7 @@ class _Sample(NamedTuple):
     group: NDArray[np.intp]
 
     @classmethod
-    def of(cls, measured: Measurements, antenna_db: ArrayLike) -> _Sample:
+    def of(cls, measured: Measurements, antenna_db: Floats) -> _Sample:
         level_db, received = measured.of_paths(antenna_db)
         first, group, size = grouped(measured.rx, received, MOST_POINTS)
         return cls(measured, level_db, measured.rx[first], received[first], size, group)
@@ -389,7 +390,7 @@ class Assimilation(Shown):
         tx_m = position_array("tx_m", tx_m)
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
-        gains_db = float_array("antenna_db", antenna_db, SettingsError, "give one gain [dB], or one for each link.")
+        gains_db = real_array("antenna_db", antenna_db, SettingsError, "give one gain [dB], or one for each link.")
         good = gains_db.shape in ((), (len(measured),)) and bool(np.isfinite(gains_db).all())
         require(good, "antenna_db", antenna_db, f"give one finite gain [dB], or one for each of {len(measured)} links.")
         sample = _Sample.of(measured, gains_db)
@@ -398,7 +399,7 @@ class Assimilation(Shown):
         links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
         if p_powers is None:
             p_powers = P_POWERS if links.tx_seen else UNSEEN_P_POWERS
-            p_powers = P_POWERS_THROUGH_WALLS if through_walls else p_powers
+            p_powers = FREE_P_POWERS if through_walls else p_powers
         hypotheses = _hypotheses(sample, links, prior, kinds, min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P))
         best = max(hypotheses, key=lambda each: each.log_p)
         weights, precision = _posterior(best.covariance, best.residual, sample.received, best.noise)

@@ -13,7 +13,7 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.assimilation import LIKELY_NOISE_DB, Walks, grouped
+from sionna_partial.measurements.assimilation import FREE_P_POWERS, LIKELY_NOISE_DB, Walks, grouped
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.predictor import LinkPrediction
 
@@ -36,9 +36,8 @@ transmitters of procedural homes, also of those that no measurement received."""
 TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
 
-OFFSETS_DB, P_POWERS, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 0.8, 40.0
-"""Offsets that powers may have in common [dB], the prior probability that they are powers and no path gains, and the
-standard deviation of the offset [dB]."""
+OFFSETS_DB, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 40.0
+"""Offsets that powers may have in common, and the prior standard deviation of the offset [dB]."""
 
 OUTDOOR = 1e-6
 """Weight of positions that are outdoors for certain."""
@@ -166,4 +165,4 @@ def _log_likelihood(prediction: LinkPrediction, measured: Measurements, antenna_
 def _log_offset_prior() -> Floats:
     """Log-probability of each offset."""
     weight = np.where(OFFSETS_DB == 0.0, 0.0, np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2))
-    return np.log(P_POWERS * weight / weight.sum() + (1.0 - P_POWERS) * (OFFSETS_DB == 0.0))
+    return np.log(FREE_P_POWERS * weight / weight.sum() + (1.0 - FREE_P_POWERS) * (OFFSETS_DB == 0.0))

@@ -141,7 +141,7 @@ class Measurements(Shown):
         std_db = None if self.std_db is None else self.std_db[index]
         return Measurements(self.tx[index], self.rx[index], self.gain_db[index], std_db, self.sensitivity_db)
 
-    def of_paths(self, antenna_db: ArrayLike) -> tuple[Floats, Bools]:
+    def of_paths(self, antenna_db: Floats | float) -> tuple[Floats, Bools]:
         """Return the levels (N,) [dB] without an antenna's gain, one for all or (N,), and whether each was received.
 
         Where nothing was received the level is an upper limit: the sensitivity, or the floor without one.
@@ -396,8 +396,8 @@ def measurements_of_each(
     """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
     measured = measurements_of(measurements)
     nearest = nearest_transmitters(measured.tx, sources_m)
-    used = nearest.any(axis=1) | (len(sources_m) == 1)
-    used[0] |= not used.any()
+    used = [bool(near.any()) or len(sources_m) == 1 for near in nearest]
+    used[0] |= not any(used)
     return [
         _measured(partial, tx_m, measured, near, frequency_hz) if is_used else None
         for tx_m, near, is_used in zip(sources_m, nearest, used, strict=True)

@@ -266,7 +266,7 @@ class AntennaPattern(Shown):
             require_number(name, width_deg, 0.0, 360.0, open_low=True)
             cuts.append(np.minimum(12.0 * (angle_deg / width_deg) ** 2, front_to_back_db))
         name = f"sector of {horizontal_beamwidth_deg:g} x {vertical_beamwidth_deg:g} deg"
-        return cls(name, gain_dbi, *cuts)._require_passive()
+        return cls(name, gain_dbi, cuts[0], cuts[1])._require_passive()
 
     @property
     def uniform_gain_dbi(self) -> float | None:
@@ -403,7 +403,7 @@ class Antenna(Checked):
     Raises
     ------
     SettingsError
-        For a value out of range.
+        For a value out of range, or an array of patterns that radiates more than twice the power that it is fed.
 
     Examples
     --------
@@ -425,6 +425,22 @@ class Antenna(Checked):
             require_choice("pattern", self.pattern, PATTERNS)
         count = self.rows * self.columns
         require(self.beam < count, "beam", self.beam, f"an array of {count} antennas has beams up to {count - 1}.")
+        if isinstance(self.pattern, AntennaPattern) and self.pattern.uniform_gain_dbi is None and count > 1:
+            angles_rad, weights = _sphere()
+            radiated = weights @ (np.abs(self.pattern.amplitude(angles_rad)) ** 2 * self._array_gain(angles_rad))
+            remedy = (
+                f"this array would radiate {radiated:.3g} times the power that it is fed: give one element's pattern."
+            )
+            require(bool(radiated <= MAX_RADIATED), "rows, columns", (self.rows, self.columns), remedy)
+
+    def _array_gain(self, local_rad: Floats) -> Floats:
+        """Gain (P,) of the array over one of its elements, towards zenith and azimuth (P, 2)."""
+        toward, (column, row) = directions(local_rad)[0], divmod(self.beam, self.rows)
+        gain = np.ones(len(local_rad))
+        for along, size, beam in ((toward[:, 1], self.columns, column), (-toward[:, 2], self.rows, row)):
+            step_rad = np.pi * along - 2.0 * np.pi * beam / size
+            gain *= np.abs(np.exp(1j * np.outer(step_rad, np.arange(size))).sum(axis=1)) ** 2 / size
+        return gain
 
     @classmethod
     def of(cls, value: "Antenna | AntennaPattern | str | None") -> "Antenna":
