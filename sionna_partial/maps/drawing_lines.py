@@ -52,11 +52,12 @@ class DrawnLines:
     """Lines of a drawing by layer. Blocks are read once, however often they are inserted.
 
     `counts` is the number of entities on each layer (in lower case) by type, with those of blocks: entities on layer 0
-    of a block take the layer of their INSERT.
+    of a block take the layer of their INSERT. `names` are the layers as they are written.
     """
 
     def __init__(self, path: Path, drawing: Any) -> None:
         self._path, self._drawing = path, drawing
+        self.names = {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers}
         self._counted: dict[str, Counter[tuple[str, str]]] = {}
         self._read: dict[str, dict[str, Segments]] = {}
         space = drawing.modelspace()
@@ -83,7 +84,9 @@ class DrawnLines:
     def _count(self, entities: Iterable[Any], nesting: int) -> Counter[tuple[str, str]]:
         found = Counter[tuple[str, str]]()
         for entity in entities:
-            layer, kind = entity.dxf.get("layer", "0").lower(), entity.dxftype()
+            name, kind = entity.dxf.get("layer", "0"), entity.dxftype()
+            layer = name.lower()
+            self.names.setdefault(layer, name)
             if kind != "INSERT":
                 found[layer, kind] += 1
                 continue

@@ -33,8 +33,8 @@ MAX_DRAWING_BYTES = 100_000_000
 OPENING_M, SOLID_M = 2.0, 0.5
 """Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both of its faces [m]."""
 
-MAX_ADDED, MAX_GROWTH = 8, 1.5
-"""Most layers that are tried where walls enclose hardly any area; most that one of them may add to the extent."""
+MAX_ADDED, MAX_GROWTH = 8, 2.5
+"""Most layers that are tried where walls enclose hardly any area; largest extent with one of them, in their extents."""
 
 
 def map_from_drawing(
@@ -136,20 +136,19 @@ def map_from_drawing(
 
 
 class _Plan(NamedTuple):
-    """A drawing: its layers (in lower case) and whether they are visible, its lines, and the names of layers."""
+    """A drawing: its layers (in lower case) and whether they are visible, and its lines."""
 
     path: Path
     drawing: Any
     visible: dict[str, bool]
     lines: DrawnLines
-    names: dict[str, str]
 
     @classmethod
     def of(cls, path: Path, drawing: Any) -> "_Plan":
         lines = DrawnLines(path, drawing)
         visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF)}
         visible |= {layer.dxf.name.lower(): layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
-        return cls(path, drawing, visible, lines, {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers})
+        return cls(path, drawing, visible, lines)
 
     def unit(self, segments: Segments) -> tuple[float, str]:
         """Return the length of a unit [m] and where it comes from; see `unit_of`."""
@@ -163,7 +162,7 @@ class _Plan(NamedTuple):
         """Return the names of the layers with their numbers of lines."""
         counts = self.lines.line_counts()
         names = sorted(self.visible, key=lambda layer: (-counts[layer], layer))
-        texts = (f"{self.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
+        texts = (f"{self.lines.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
         return f"{len(names)} layers: {', '.join(texts)}"
 
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
@@ -195,7 +194,7 @@ class _Plan(NamedTuple):
     def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
         """Note which elements are used, and which are skipped."""
         for (name, kind), count in self.lines.counts.items():
-            layer = self.names.get(name, name)
+            layer = self.lines.names.get(name, name)
             if kind == XREF:
                 notes.skip(name, count, "external reference: bind it in the drawing")
             elif kind in LINE_TYPES:
@@ -223,7 +222,7 @@ def _enclosed(state: States) -> float:
 def _closing_layer(
     plan: _Plan, reasons: dict[str, str], segments: Segments, unit_m: float, resolution_m: float
 ) -> str | None:
-    """Return the other layer with which walls enclose most area, and warn of it; None if none closes the rooms."""
+    """Return the other layer that closes the rooms, and warn of it; of several, the one that encloses least area."""
     counts, found = plan.lines.line_counts(), dict[str, float]()
     others = [layer for layer, reason in reasons.items() if reason == NO_WALL and counts[layer]]
     extent = np.ptp(segments.reshape(-1, 2), axis=0).max()
@@ -235,12 +234,11 @@ def _closing_layer(
                 found[layer] = float((state == CellState.FREE).sum()) * empty.resolution_m**2
     if not found:
         return None
-    best = max(found, key=found.__getitem__)
+    best = min(found, key=found.__getitem__)
     used = shown(sorted(layer for layer, reason in reasons.items() if not reason))
     what = f"path = '{plan.path}' has walls on {used} that enclose hardly any area"
-    what += (
-        f", so layer '{best}' ({counts[best]:,} lines) is read as walls, too, which then enclose {found[best]:.3g} m2"
-    )
+    added = f"layer '{plan.lines.names[best]}' ({counts[best]:,} lines) is read as walls, too"
+    what += f", so {added}, which then enclose {found[best]:.3g} m2"
     warnings.warn(f"{what}: give wall_layers; it has {plan.listed()}.", MapWarning, stacklevel=4)
     return best
 

@@ -14,7 +14,8 @@ from sionna_partial.checks import shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, read_bytes
-from sionna_partial.maps.drawings import Segments, material_given, states_of_lines, with_materials
+from sionna_partial.maps.drawing_lines import Segments
+from sionna_partial.maps.drawings import material_given, states_of_lines, with_materials
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid
 from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
