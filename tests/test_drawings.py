@@ -260,17 +260,20 @@ def test_skipped_elements_are_listed(tmp_path: Path) -> None:
     doc.add_xref_def("structure.dxf", "STRUCTURE")
     space.add_blockref("STRUCTURE", (0, 0))
     doc.saveas(tmp_path / "plan.dxf")
-    report = load_map(tmp_path / "plan.dxf").import_report
+    text = (tmp_path / "plan.dxf").read_text().replace("  0\nCIRCLE\n", "  0\nAEC_WALL\n", 1)
+    (tmp_path / "plan.dxf").write_text(text)
+    with pytest.warns(MapWarning, match=r"are not read: AEC_WALL \(1\), STRUCTURE \(1\): explode or bind them"):
+        report = load_map(tmp_path / "plan.dxf").import_report
     assert report is not None
     assert [(row.name, row.count) for row in report.used] == [("A-GLAZ", 2), ("A-WALL", 8)]
     assert [(row.name, row.count, row.reason) for row in report.skipped] == [
         ("A-DOOR", 1, "major group of no wall (AIA/NCS)"),
-        ("A-FURN", 1, "major group of no wall (AIA/NCS)"),
         ("A-WALL-DEMO", 1, "to be demolished"),
         ("A-WALL-HEAD", 1, "texts, dimensions or door headers"),
+        ("AEC_WALL", 1, "object of another program: explode them"),
         ("HIDDEN WALLS", 1, "hidden"),
         ("POINT on A-WALL", 1, "type without lines"),
-        ("STRUCTURE", 1, "external reference: bind it in the drawing"),
+        ("STRUCTURE", 1, "external reference: bind it"),
         ("TEXT on A-WALL", 1, "type without lines"),
     ]
 
@@ -285,7 +288,7 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     outer.add_line((0, 0), (0.5, 0.1), dxfattribs={"layer": "A-FURN"})
     for x in range(1, 4):
         placed = doc.modelspace().add_blockref("OUTER", (x, 1.5), dxfattribs={"layer": "A-WALL", "rotation": 50 * x})
-        placed.set_scale(0.7 * x)
+        placed.set_scale(0.7 * x).grid((2, x), (0.9, 0.8))
     lines = drawing_lines.DrawnLines(tmp_path, doc)
     read = list[str]()
     pieces = drawing_lines._pieces
@@ -296,7 +299,8 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     def exploded(entities: Any) -> Iterator[Any]:
         for entity in entities:
             if entity.dxftype() == "INSERT":
-                yield from exploded(entity.virtual_entities())
+                for one in entity.multi_insert() if entity.mcount > 1 else [entity]:
+                    yield from exploded(one.virtual_entities())
             elif entity.dxf.layer in ("0", "A-WALL"):
                 yield from (lines[..., :2] for lines in pieces(entity))
 
@@ -306,7 +310,7 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert shapely.length(shapely.multilinestrings(found)) == pytest.approx(
         shapely.length(shapely.multilinestrings(expected)), rel=0.01
     )
-    assert lines.line_counts()["a-wall"] == 8 + 2 * 3
+    assert lines.line_counts()["a-wall"] == 8 + 2 * 2 * (1 + 2 + 3)
 
 
 @pytest.mark.parametrize("unit_m", [1.0, 0.001])

@@ -30,6 +30,9 @@ from sionna_partial.settings import Material
 MAX_DRAWING_BYTES = 100_000_000
 """Largest drawing that is read [bytes]."""
 
+FOREIGN = "AEC_", "ACAD_PROXY"
+"""Beginnings of the types of objects that are not in the DXF as lines."""
+
 OPENING_M, SOLID_M = 2.0, 0.5
 """Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both of its faces [m]."""
 
@@ -192,15 +195,23 @@ class _Plan(NamedTuple):
         return segments, on_layer
 
     def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
-        """Note which elements are used, and which are skipped."""
+        """Note which elements are used, and which are skipped; warn of those that may be walls and cannot be read."""
+        lost = dict[str, int]()
         for (name, kind), count in self.lines.counts.items():
             layer = self.lines.names.get(name, name)
-            if kind == XREF:
-                notes.skip(name, count, "external reference: bind it in the drawing")
+            if kind == XREF or kind.startswith(FOREIGN):
+                what, remedy = (kind, "explode them") if kind != XREF else (name, "bind it")
+                notes.skip(what, count, f"{'object of another program' if kind != XREF else kind}: {remedy}")
+                lost[what] = lost.get(what, 0) + count
             elif kind in LINE_TYPES:
                 notes.skip(layer, count, reasons.get(name, NO_WALL))
             elif kind != "INSERT" and not reasons.get(name, NO_WALL):
                 notes.skip(f"{kind} on {layer}", count, "type without lines")
+        if lost:
+            texts = ", ".join(f"{name} ({count:,})" for name, count in sorted(lost.items())[:20])
+            what = f"path = '{self.path}' has objects of other programs or external references, which are not read"
+            remedy = "explode or bind them in the program that the drawing comes from, and save it as DXF."
+            warnings.warn(f"{what}: {texts}: {remedy}", MapWarning, stacklevel=4)
 
 
 def _cells(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> tuple[States, PartialMap]:
