@@ -158,7 +158,7 @@ def _grid(insert: Any) -> Floats:
         (insert.dxf.row_count, insert.dxf.row_spacing, turned + math.pi / 2),
     ):
         along = np.array(ocs.to_wcs(Vec3.from_angle(angle)).xyz) * spacing
-        shifts = (shifts[:, None] + np.arange(count if spacing else 1)[:, None] * along).reshape(-1, 3)
+        shifts = (shifts[:, None] + np.arange(max(count, 1) if spacing else 1)[:, None] * along).reshape(-1, 3)
     return shifts[:, None, None]
 
 

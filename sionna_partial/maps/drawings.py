@@ -25,6 +25,7 @@ from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, Ma
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.rooms import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
@@ -364,7 +365,7 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
     area, _ = ndimage.label(to_wall > radius)
     outside = ndimage.distance_transform_edt(area != area[0, 0]) <= radius
     area, count = ndimage.label(~(wall | outside))
-    widest_m = 2 * cell_m * ndimage.maximum(to_wall, area, np.arange(count + 1))
+    widest_m = 2 * cell_m * largest_by_area(to_wall, area, count)
     inside = area > 0
     state = np.full(wall.shape, CellState.UNKNOWN, dtype=np.uint8)
     state[inside] = CellState.FREE
