@@ -164,6 +164,9 @@ def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
     """Return what the shades of the image of a layer count."""
     if not isinstance(given.get(listed), list):
         raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
+    other = sorted(str(key) for key in given if key not in ("image", listed))
+    if other:
+        raise MapError(f"{path}: {name} has the unknown keys {shown(other)}: give image and {listed} alone.")
     values: list[Any] = given[listed]
     return values
 
