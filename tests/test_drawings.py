@@ -1,19 +1,23 @@
 """DXF floor plans as maps: what ezdxf writes, layers, units, and what walls enclose."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import ezdxf
 import numpy as np
 import pytest
+import shapely
 from ezdxf.document import Drawing
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps import drawing_lines
+from sionna_partial.maps.drawing_layers import skip_reason
 from sionna_partial.maps.drawings import map_from_drawing
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -83,6 +87,230 @@ def test_options(tmp_path: Path) -> None:
     assert states(closed, (1.5, 0.12)) == [WALL]
     with pytest.raises(MapError, match=r"height_band_m is for scans alone, but path = '.*dxf' is a drawing: leave"):
         load_map(tmp_path / "plan.dxf", height_band_m=(0, 1))
+
+
+REPORTS = Path(__file__).parent / "reports"
+
+CENTIMETRES = r"so it is read in centimetres, with .* give unit_m, 0\.01 if that is right, 0\.%s for the unit of the"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit_m", "message"),
+    [
+        ("mm_as_mm", 0.001, None),
+        ("cm_as_mm", 0.01, CENTIMETRES % "001"),
+        ("cm_as_inch", 0.01, CENTIMETRES % "0254"),
+        (
+            "mm_as_inch",
+            0.001,
+            r"has the unit 0\.0254 m \(\$INSUNITS = 1 of the header\), and with it an extent of 305 m",
+        ),
+        ("m_as_mm", 1.0, r"so it is read in metres"),
+    ],
+)
+def test_wrong_units(name: str, unit_m: float, message: str | None) -> None:
+    path = REPORTS / "dxf_units" / f"{name}.dxf"
+    with pytest.warns(MapWarning, match=message) if message else nullcontext():
+        report = load_map(path).import_report
+    assert report is not None
+    assert report.extent_m == pytest.approx((12.0, 8.0), abs=0.06)
+    assert (report.unit_m, report.rooms) == (unit_m, 3)
+    given = load_map(path, unit_m=unit_m).import_report
+    assert given == replace(report, unit_source="unit_m")
+
+
+@pytest.mark.parametrize("header", [0, 4, 5, 6])
+@pytest.mark.parametrize("unit_m", [0.001, 0.01, 1.0])
+def test_units_of_a_plan(tmp_path: Path, header: int, unit_m: float) -> None:
+    """Right headers are taken without a word; wrong and missing ones are seen by doors and walls."""
+    drawing(header, unit_m).saveas(tmp_path / "plan.dxf")
+    is_right = {4: 0.001, 5: 0.01, 6: 1.0}.get(header) == unit_m
+    with nullcontext() if is_right else pytest.warns(MapWarning, match="give unit_m"):
+        require_rooms(load_map(tmp_path / "plan.dxf"))
+
+
+@pytest.mark.parametrize(("unit_m", "used_m"), [(0.01, 0.001), (1.0, 1.0)])
+def test_a_doubtful_unit_is_named(tmp_path: Path, unit_m: float, used_m: float) -> None:
+    """A hall without doors, and a drawing whose walls alone do not fit the header."""
+    doc = ezdxf.new(units=4 if used_m < 1 else 6)
+    scale = 1 / unit_m
+    for x in range(0, 40, 4):
+        for y, end in ((0, 2.4), (3.3, 8), (8.9, 16)):
+            doc.modelspace().add_line((x * scale, y * scale), (x * scale, end * scale), dxfattribs={"layer": "WALL"})
+    square = np.array([(0, 0), (36, 0), (36, 16), (0, 16)]) * scale
+    doc.modelspace().add_lwpolyline(square.tolist(), close=True, dxfattribs={"layer": "WALL"})
+    doc.saveas(tmp_path / "plan.dxf")
+    with pytest.warns(MapWarning, match="centimetres") if unit_m < 1 else nullcontext():
+        report = load_map(tmp_path / "plan.dxf").import_report
+    assert report is not None
+    assert report.extent_m == pytest.approx((36, 16), abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("name", "state", "message"),
+    [
+        ("A-WALL-FULL-N", sp.LinkState.OUTAGE, None),
+        ("A-WALL-FULL-D", sp.LinkState.LOS, None),
+        ("A-WALL-DEMO", sp.LinkState.LOS, None),
+        ("E-LITE-WALL", sp.LinkState.LOS, None),
+        ("A-WALL-PRHT", sp.LinkState.OUTAGE, "has walls of partial height on .* give layer_heights_m to map_from_draw"),
+    ],
+)
+def test_layers_by_the_standard(name: str, state: sp.LinkState, message: str | None) -> None:
+    path = REPORTS / "dxf_layers" / f"{name}.dxf"
+    with pytest.warns(MapWarning, match=message) if message else nullcontext():
+        partial = load_map(path)
+    assert partial.import_report is not None
+    used = {row.name for row in partial.import_report.used}
+    assert (name in used) == (state == sp.LinkState.OUTAGE)
+    assert used | {row.name for row in partial.import_report.skipped} == {"A-WALL-FULL-E", name}
+    assert sp.trace_links(partial, (3, 4, 1.5), [(9, 4.3, 1.5)]).link_state.tolist() == [state]
+
+
+def test_heights_of_layers() -> None:
+    path = REPORTS / "dxf_layers" / "A-WALL-PRHT.dxf"
+    partial = map_from_drawing(path, layer_heights_m={"*-prht": 1.1})
+    assert partial.obstacle_heights_m == (1.1,)
+    assert sp.trace_links(partial, (3, 4, 1.5), [(9, 4.3, 1.5)]).link_state.tolist() == [sp.LinkState.LOS]
+    points_m = np.array([[6.02, 4, 1.0], [6.02, 4, 1.2], [0.02, 4, 1.2]])
+    assert partial.is_wall_at(points_m).tolist() == [True, False, True]
+    with pytest.raises(MapError, match=r"layer_heights_m\['\*'\] = -1 is not allowed: give a height"):
+        map_from_drawing(path, layer_heights_m={"*": -1})
+    with pytest.raises(MapError, match=r"layer_heights_m = 1 is not allowed: give values by the names of layers"):
+        map_from_drawing(path, layer_heights_m=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        *[
+            (name, "")
+            for name in ("A-WALL", "a-wall-full-e", "S-COLS", "A-GLAZ-SILL", "Wand", "AR_Außenwände", "Mur ext")
+        ],
+        *[
+            (name, "")
+            for name in ("A-WALL-FULL-N", "A-WALL-CORE-2", "xref$0$A-WALL", "plan|A-GLAZ", "A-WALL-PRHT", "I-WALL")
+        ],
+        *[(name, "to be demolished") for name in ("A-WALL-D", "plan|A-WALL-FULL-D", "Wand Abbruch", "walls_demo")],
+        *[("A-WALL-F", "future work"), ("A-WALL-MOVE-M", "to be moved"), ("A-GLAZ-T", "temporary")],
+        *[("Wandleuchten", "lamps or sockets"), ("WALL LIGHTS", "lamps or sockets"), ("Wandschrank", "furniture")],
+        *[
+            (name, "major group of no wall (AIA/NCS)")
+            for name in ("E-LITE-WALL", "P-FIXT-WALL", "A-DOOR", "A-FLOR-WALL")
+        ],
+        *[("A-WALL-HEAD", "texts, dimensions or door headers"), ("Base", "name of no wall")],
+    ],
+)
+def test_names_of_layers(name: str, reason: str) -> None:
+    assert skip_reason(name) == reason
+
+
+def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
+    """Inner walls on "Wand" enclose hardly any area; the outer ones are on "Base", beside a frame and texts."""
+    doc = ezdxf.new(units=6)
+    space = doc.modelspace()
+    for x in (5, 5.2):
+        space.add_line((x, 0.2), (x, 3), dxfattribs={"layer": "Wand"})
+    for y in (4, 4.2):
+        space.add_line((6, y), (11.8, y), dxfattribs={"layer": "Wand"})
+    space.add_lwpolyline([(5, 3), (5.2, 3)], dxfattribs={"layer": "Wand"})
+    for inset in (0.0, 0.2):
+        corners = [(inset, inset), (12 - inset, inset), (12 - inset, 8 - inset), (inset, 8 - inset)]
+        space.add_lwpolyline(corners, close=True, dxfattribs={"layer": "Base"})
+    space.add_lwpolyline([(-20, -20), (50, -20), (50, 40), (-20, 40)], close=True, dxfattribs={"layer": "Rahmen"})
+    doc.saveas(tmp_path / "plan.dxf")
+    message = (
+        r"walls on \['wand'\] that enclose hardly any area, so layer 'Base' \(2 lines\) is read .* Wand \(5 lines\)"
+    )
+    with pytest.warns(MapWarning, match=message):
+        partial = load_map(tmp_path / "plan.dxf")
+    assert states(partial, (2, 2), (8, 2), (8, 6), (0.1, 4), (5.1, 1)) == [FREE, FREE, FREE, WALL, WALL]
+    assert partial.import_report is not None
+    assert [(row.name, row.count) for row in partial.import_report.used] == [("Base", 2), ("Wand", 5)]
+    assert [(row.name, row.reason) for row in partial.import_report.skipped] == [("Rahmen", "name of no wall")]
+
+
+def test_hardly_any_area(tmp_path: Path) -> None:
+    doc = ezdxf.new(units=6)
+    for corners in ([(0, 0), (1, 0), (1, 1), (0, 1)], [(0, 9), (12, 9), (12, 9.2), (0, 9.2)]):
+        doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
+    doc.saveas(tmp_path / "plan.dxf")
+    with pytest.warns(MapWarning) as caught:
+        load_map(tmp_path / "plan.dxf")
+    message = r"encloses 0\.\d+ m2 in an extent of 12\..* wall_layers; it has .* layers: WALL \(2 lines\)"
+    assert re.search(message, str(caught[0].message))
+
+
+def test_lines_closer_than_a_cell(tmp_path: Path) -> None:
+    drawing().saveas(tmp_path / "plan.dxf")
+    with pytest.warns(
+        MapWarning, match=r"has lines 0\.2 m apart, closer than resolution_m = 0\.25, .* resolution_m of 0\.1"
+    ):
+        load_map(tmp_path / "plan.dxf", resolution_m=0.25)
+
+
+def test_skipped_elements_are_listed(tmp_path: Path) -> None:
+    """Texts and points on layers of walls, blocks in other files, hidden and demolished walls."""
+    doc = drawing()
+    space = doc.modelspace()
+    space.add_point((1, 1), dxfattribs={"layer": "A-WALL"})
+    space.add_line((1, 1), (2, 2), dxfattribs={"layer": "A-WALL-DEMO"})
+    doc.layers.add("HIDDEN WALLS").off()
+    space.add_line((1, 1), (2, 2), dxfattribs={"layer": "HIDDEN WALLS"})
+    doc.add_xref_def("structure.dxf", "STRUCTURE")
+    space.add_blockref("STRUCTURE", (0, 0))
+    doc.saveas(tmp_path / "plan.dxf")
+    text = (tmp_path / "plan.dxf").read_text().replace("  0\nCIRCLE\n", "  0\nAEC_WALL\n", 1)
+    (tmp_path / "plan.dxf").write_text(text)
+    with pytest.warns(MapWarning, match=r"are not read: AEC_WALL \(1\), STRUCTURE \(1\): explode or bind them"):
+        report = load_map(tmp_path / "plan.dxf").import_report
+    assert report is not None
+    assert [(row.name, row.count) for row in report.used] == [("A-GLAZ", 2), ("A-WALL", 8)]
+    assert [(row.name, row.count, row.reason) for row in report.skipped] == [
+        ("A-DOOR", 1, "major group of no wall (AIA/NCS)"),
+        ("A-WALL-DEMO", 1, "to be demolished"),
+        ("A-WALL-HEAD", 1, "texts, dimensions or door headers"),
+        ("AEC_WALL", 1, "object of another program: explode them"),
+        ("HIDDEN WALLS", 1, "hidden"),
+        ("POINT on A-WALL", 1, "type without lines"),
+        ("STRUCTURE", 1, "external reference: bind it"),
+        ("TEXT on A-WALL", 1, "type without lines"),
+    ]
+
+
+def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Scaled, mirrored and turned blocks within blocks are where ezdxf explodes them; each is read once."""
+    doc = drawing()
+    inner, outer = doc.blocks.new("INNER"), doc.blocks.new("OUTER", base_point=(0.1, 0.2))
+    inner.add_lwpolyline([(0, 0, 0.3), (0.4, 0), (0.4, 0.2)], format="xyb")
+    inner.add_arc((0.2, 0.1), 0.1, 20, 200)
+    outer.add_blockref("INNER", (0.3, 0.1), dxfattribs={"rotation": 30, "xscale": -1, "yscale": 2})
+    outer.add_line((0, 0), (0.5, 0.1), dxfattribs={"layer": "A-FURN"})
+    for x in range(1, 4):
+        placed = doc.modelspace().add_blockref("OUTER", (x, 1.5), dxfattribs={"layer": "A-WALL", "rotation": 50 * x})
+        placed.set_scale(0.7 * x).grid((2, x), (0.9, 0.8))
+    lines = drawing_lines.DrawnLines(tmp_path, doc)
+    read = list[str]()
+    pieces = drawing_lines._pieces
+    monkeypatch.setattr(drawing_lines, "_pieces", lambda entity: read.append(entity.dxftype()) or pieces(entity))
+    found = lines.segments({"a-wall"})[0]
+    assert read.count("ARC") == 1
+
+    def exploded(entities: Any) -> Iterator[Any]:
+        for entity in entities:
+            if entity.dxftype() == "INSERT":
+                for one in entity.multi_insert() if entity.mcount > 1 else [entity]:
+                    yield from exploded(one.virtual_entities())
+            elif entity.dxf.layer in ("0", "A-WALL"):
+                yield from (lines[..., :2] for lines in pieces(entity))
+
+    expected = np.concatenate(list(exploded(doc.modelspace().query("*[layer=='A-WALL']"))))
+    near = shapely.MultiLineString(list(expected)).buffer(0.002)
+    assert near.covers(shapely.MultiLineString(list(found)))
+    assert shapely.length(shapely.multilinestrings(found)) == pytest.approx(
+        shapely.length(shapely.multilinestrings(expected)), rel=0.01
+    )
+    assert lines.line_counts()["a-wall"] == 8 + 2 * 2 * (1 + 2 + 3)
 
 
 @pytest.mark.parametrize("unit_m", [1.0, 0.001])

@@ -3,10 +3,13 @@
 import platform
 from collections.abc import Iterator
 from importlib import metadata
+from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from sionna_partial import info
+from sionna_partial.cli.app import app
 from sionna_partial.info import Finding
 from sionna_partial.llvm import load_llvm
 from sionna_partial.resources import demo_homes
@@ -36,6 +39,14 @@ def test_this_machine_needs_nothing() -> None:
     assert values["predictors"] == "map, paper"
     assert values["demo scenes"] == ", ".join(demo_homes())
     assert values["numpy"] == metadata.version("numpy")
+
+
+@pytest.mark.usefixtures("command_line")
+def test_report_of_a_map() -> None:
+    path = Path(__file__).parent / "reports" / "dxf_layers" / "A-WALL-DEMO.dxf"
+    result = CliRunner().invoke(app, ["info", str(path), "--unit", "0.5", "--wall-layer", "A-WALL*"])
+    assert result.exit_code == 0, result.output
+    assert "unit       0.5 m (unit_m)\nextent     6.05 x 4.05 m\nrooms      2\n" in result.stdout
 
 
 @pytest.mark.usefixtures("fresh_engine")

@@ -551,16 +551,19 @@ class TestContinuousValues:
     def test_thresholds_fit_the_map(self) -> None:
         """The map has 26,480 free cells, 1,520 of wall, and 15,200 unknown ones."""
         path = REPORTS / "continuous_occupancy" / "carto.yaml"
-        with pytest.warns(MapWarning, match=r"26,543 of 28,000 seen cells have an occupancy between 19.6 and 65 %"):
+        with pytest.warns(MapWarning, match=r"95% of the seen cells have an occupancy between 19.6 and 65 %"):
             partial = load_map(path)
         assert np.bincount(partial.state.ravel()).tolist() == [26_480, 1_520, 15_200]
-        assert "walls are the cells from 53.9 % on" in str(partial.import_report)
+        assert "26,543 of 28,000 seen cells have an occupancy between 19.6 and 65 %: walls" in str(
+            partial.import_report
+        )
         shade = np.asarray(Image.open(path.with_suffix(".pgm")))[::-1]
         percent = np.where(shade == 128, -1, np.rint(100 * (1 - shade / 255))).astype(np.int8)
         with pytest.warns(MapWarning, match=r"walls are the cells from 54.0 % on, and other seen cells are free"):
             assert np.array_equal(map_from_occupancy(percent, 0.05).state, partial.state)
         given = map_from_occupancy(percent, 0.05, free_percent=25)
         assert np.bincount(given.state.ravel()).tolist() == [2_854, 1_457, 38_889]
+        assert "skipped    seen cells: 23,689 (an occupancy between 25 and 65 %: unknown)" in str(given.import_report)
         with pytest.warns(MapWarning, match="1,457 wall cells and 0 free ones"):
             load_map(path, strict=True)
 

@@ -112,6 +112,14 @@ class TestFiles:
         with pytest.raises(MapError, match=message):
             sp.load_map(tmp_path / "map.yaml")
 
+    def test_unknown_keys_are_refused(self, tmp_path: Path) -> None:
+        sp.save_map(room(), tmp_path / "map.yaml")
+        sheet = yaml.safe_load((tmp_path / "map.yaml").read_text())
+        sheet["wall_material"]["material"] = ["brick"]
+        (tmp_path / "map.yaml").write_text(yaml.safe_dump(sheet))
+        with pytest.raises(MapError, match=r"wall_material has the unknown keys \['material'\]: give image and materi"):
+            sp.load_map(tmp_path / "map.yaml")
+
     def test_layers_of_a_drawing(self, tmp_path: Path) -> None:
         drawing = ezdxf.new(units=6)
         for layer, corners in {

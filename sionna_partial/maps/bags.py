@@ -284,11 +284,10 @@ def map_of_percent(
         given = f"free_percent = {shown(free_percent)} and occupied_percent = {shown(occupied_percent)}"
         raise MapError(f"{given} are not allowed: give 0 <= free_percent < occupied_percent <= 100, such as 25 and 65.")
     notes = ImportNotes("data", 1.0, "resolution_m")
-    if not is_given:
-        count = np.bincount(values[(values >= 0) & (values <= 100)], minlength=101)
-        remedy = "Give free_percent and occupied_percent to choose others."
-        found = fitted_threshold(np.arange(101.0), count, free, occupied, notes, remedy)
-        free, occupied = (free, occupied) if found is None else (found, found)
+    count = np.bincount(values[(values >= 0) & (values <= 100)], minlength=101)
+    remedy = "" if is_given else "Give free_percent and occupied_percent to choose others."
+    found = fitted_threshold(np.arange(101.0), count, free, occupied, notes, remedy)
+    free, occupied = (free, occupied) if found is None else (found, found)
     state = states_from_percent(values, occupied, free)
     partial = PartialMap(state, resolution_m, origin_m, wall_height_m)
     if yaw:

@@ -1,6 +1,7 @@
 """Lines of a DXF: entities of the model space and of blocks -> pieces of lines by layer."""
 
 import io
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -52,11 +53,12 @@ class DrawnLines:
     """Lines of a drawing by layer. Blocks are read once, however often they are inserted.
 
     `counts` is the number of entities on each layer (in lower case) by type, with those of blocks: entities on layer 0
-    of a block take the layer of their INSERT.
+    of a block take the layer of their INSERT. `names` are the layers as they are written.
     """
 
     def __init__(self, path: Path, drawing: Any) -> None:
         self._path, self._drawing = path, drawing
+        self.names = {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers}
         self._counted: dict[str, Counter[tuple[str, str]]] = {}
         self._read: dict[str, dict[str, Segments]] = {}
         space = drawing.modelspace()
@@ -83,7 +85,9 @@ class DrawnLines:
     def _count(self, entities: Iterable[Any], nesting: int) -> Counter[tuple[str, str]]:
         found = Counter[tuple[str, str]]()
         for entity in entities:
-            layer, kind = entity.dxf.get("layer", "0").lower(), entity.dxftype()
+            name, kind = _layer_of(entity), entity.dxftype()
+            layer = name.lower()
+            self.names.setdefault(layer, name)
             if kind != "INSERT":
                 found[layer, kind] += 1
                 continue
@@ -105,7 +109,7 @@ class DrawnLines:
         parts: dict[str, list[Segments]] = {}
         pieces = 0
         for entity in entities:
-            layer = entity.dxf.get("layer", "0").lower()
+            layer = _layer_of(entity).lower()
             if entity.dxftype() == "INSERT":
                 found = self._inserted(entity, layer, layers, nesting)
             elif layer in layers or layer == "0":
@@ -128,16 +132,38 @@ class DrawnLines:
         if name not in self._read:
             self._read[name] = {}  # a block within itself is empty
             self._read[name] = self._lines(block, layers, nesting - 1)
-        found = []
-        for placed in insert.multi_insert() if insert.mcount > 1 else [insert]:
-            matrix = np.array(list(placed.matrix44())).reshape(4, 4)
-            for own in wanted.keys() & self._read[name].keys():
-                found.append((wanted[own], self._read[name][own] @ matrix[:3, :3] + matrix[3, :3]))
-        return found
+        own = {layer: lines for layer, lines in self._read[name].items() if layer in wanted}
+        shifts = _grid(insert)
+        if sum(map(len, own.values())) * len(shifts) > MAX_PIECES:
+            raise self._too_large()
+        matrix = np.array(list(insert.matrix44())).reshape(4, 4)
+        return [
+            (wanted[layer], (lines @ matrix[:3, :3] + matrix[3, :3] + shifts).reshape(-1, 2, 3))
+            for layer, lines in own.items()
+        ]
 
     def _too_large(self) -> MapError:
         what = f"{MAX_PARTS:,} entities in blocks, or {MAX_PIECES:,} pieces of lines"
         return MapError(f"path = '{self._path}' has more than {what}: save the walls alone, exploded, as a drawing.")
+
+
+def _grid(insert: Any) -> Floats:
+    """Return the shifts (N, 1, 1, 3) of the places of a block that an INSERT places on a grid."""
+    from ezdxf.math import Vec3
+
+    ocs, turned = insert.ocs(), math.radians(insert.dxf.rotation)
+    shifts = np.zeros((1, 3))
+    for count, spacing, angle in (
+        (insert.dxf.column_count, insert.dxf.column_spacing, turned),
+        (insert.dxf.row_count, insert.dxf.row_spacing, turned + math.pi / 2),
+    ):
+        along = np.array(ocs.to_wcs(Vec3.from_angle(angle)).xyz) * spacing
+        shifts = (shifts[:, None] + np.arange(max(count, 1) if spacing else 1)[:, None] * along).reshape(-1, 3)
+    return shifts[:, None, None]
+
+
+def _layer_of(entity: Any) -> str:
+    return str(entity.dxf.layer) if entity.dxf.hasattr("layer") else "0"  # objects of other programs have none
 
 
 def _pieces(entity: Any) -> Iterator[Segments]:

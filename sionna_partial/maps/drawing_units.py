@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.errors import MapError
 from sionna_partial.maps.import_report import MapWarning
 from sionna_partial.maps.mesh.cells import mark_cells
@@ -135,7 +135,7 @@ def _described(lengths: dict[str, float], unit_m: float) -> str:
     return ", ".join(f"{name} of {length * unit_m:.3g} m" for name, length in lengths.items())
 
 
-def _raster(segments: Floats) -> tuple[Floats, float]:
+def _raster(segments: Floats) -> tuple[Bools, float]:
     """Return the cells without lines (ny, nx), with a margin, and their size; the longer side of the plan is 1."""
     cell, margin = 1.0 / RASTER_CELLS, RASTER_CELLS // 10
     corners = np.zeros((len(segments), 5, 2))

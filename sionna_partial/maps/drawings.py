@@ -25,16 +25,20 @@ from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, Ma
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.rooms import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
 """Largest drawing that is read [bytes]."""
 
+FOREIGN = "AEC_", "ACAD_PROXY"
+"""Beginnings of the types of objects that are not in the DXF as lines."""
+
 OPENING_M, SOLID_M = 2.0, 0.5
 """Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both of its faces [m]."""
 
-MAX_ADDED, MAX_GROWTH = 8, 1.5
-"""Most layers that are tried where walls enclose hardly any area; most that one of them may add to the extent."""
+MAX_ADDED, MAX_GROWTH = 8, 2.5
+"""Most layers that are tried where walls enclose hardly any area; largest extent with one of them, in their extents."""
 
 
 def map_from_drawing(
@@ -136,20 +140,19 @@ def map_from_drawing(
 
 
 class _Plan(NamedTuple):
-    """A drawing: its layers (in lower case) and whether they are visible, its lines, and the names of layers."""
+    """A drawing: its layers (in lower case) and whether they are visible, and its lines."""
 
     path: Path
     drawing: Any
     visible: dict[str, bool]
     lines: DrawnLines
-    names: dict[str, str]
 
     @classmethod
     def of(cls, path: Path, drawing: Any) -> "_Plan":
         lines = DrawnLines(path, drawing)
         visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF)}
         visible |= {layer.dxf.name.lower(): layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
-        return cls(path, drawing, visible, lines, {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers})
+        return cls(path, drawing, visible, lines)
 
     def unit(self, segments: Segments) -> tuple[float, str]:
         """Return the length of a unit [m] and where it comes from; see `unit_of`."""
@@ -163,7 +166,7 @@ class _Plan(NamedTuple):
         """Return the names of the layers with their numbers of lines."""
         counts = self.lines.line_counts()
         names = sorted(self.visible, key=lambda layer: (-counts[layer], layer))
-        texts = (f"{self.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
+        texts = (f"{self.lines.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
         return f"{len(names)} layers: {', '.join(texts)}"
 
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
@@ -193,15 +196,23 @@ class _Plan(NamedTuple):
         return segments, on_layer
 
     def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
-        """Note which elements are used, and which are skipped."""
+        """Note which elements are used, and which are skipped; warn of those that may be walls and cannot be read."""
+        lost = dict[str, int]()
         for (name, kind), count in self.lines.counts.items():
-            layer = self.names.get(name, name)
-            if kind == XREF:
-                notes.skip(name, count, "external reference: bind it in the drawing")
+            layer = self.lines.names.get(name, name)
+            if kind == XREF or kind.startswith(FOREIGN):
+                what, remedy = (kind, "explode them") if kind != XREF else (name, "bind it")
+                notes.skip(what, count, f"{'object of another program' if kind != XREF else kind}: {remedy}")
+                lost[what] = lost.get(what, 0) + count
             elif kind in LINE_TYPES:
                 notes.skip(layer, count, reasons.get(name, NO_WALL))
             elif kind != "INSERT" and not reasons.get(name, NO_WALL):
                 notes.skip(f"{kind} on {layer}", count, "type without lines")
+        if lost:
+            texts = ", ".join(f"{name} ({count:,})" for name, count in sorted(lost.items())[:20])
+            what = f"path = '{self.path}' has objects of other programs or external references, which are not read"
+            remedy = "explode or bind them in the program that the drawing comes from, and save it as DXF."
+            warnings.warn(f"{what}: {texts}: {remedy}", MapWarning, stacklevel=4)
 
 
 def _cells(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> tuple[States, PartialMap]:
@@ -223,7 +234,7 @@ def _enclosed(state: States) -> float:
 def _closing_layer(
     plan: _Plan, reasons: dict[str, str], segments: Segments, unit_m: float, resolution_m: float
 ) -> str | None:
-    """Return the other layer with which walls enclose most area, and warn of it; None if none closes the rooms."""
+    """Return the other layer that closes the rooms, and warn of it; of several, the one that encloses least area."""
     counts, found = plan.lines.line_counts(), dict[str, float]()
     others = [layer for layer, reason in reasons.items() if reason == NO_WALL and counts[layer]]
     extent = np.ptp(segments.reshape(-1, 2), axis=0).max()
@@ -235,12 +246,11 @@ def _closing_layer(
                 found[layer] = float((state == CellState.FREE).sum()) * empty.resolution_m**2
     if not found:
         return None
-    best = max(found, key=found.__getitem__)
+    best = min(found, key=found.__getitem__)
     used = shown(sorted(layer for layer, reason in reasons.items() if not reason))
     what = f"path = '{plan.path}' has walls on {used} that enclose hardly any area"
-    what += (
-        f", so layer '{best}' ({counts[best]:,} lines) is read as walls, too, which then enclose {found[best]:.3g} m2"
-    )
+    added = f"layer '{plan.lines.names[best]}' ({counts[best]:,} lines) is read as walls, too"
+    what += f", so {added}, which then enclose {found[best]:.3g} m2"
     warnings.warn(f"{what}: give wall_layers; it has {plan.listed()}.", MapWarning, stacklevel=4)
     return best
 
@@ -355,7 +365,7 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
     area, _ = ndimage.label(to_wall > radius)
     outside = ndimage.distance_transform_edt(area != area[0, 0]) <= radius
     area, count = ndimage.label(~(wall | outside))
-    widest_m = 2 * cell_m * ndimage.maximum(to_wall, area, np.arange(count + 1))
+    widest_m = 2 * cell_m * largest_by_area(to_wall, area, count)
     inside = area > 0
     state = np.full(wall.shape, CellState.UNKNOWN, dtype=np.uint8)
     state[inside] = CellState.FREE

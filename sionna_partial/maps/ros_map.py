@@ -137,7 +137,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     material = _material(path, "material", raw.get("material"))
     pixels = _read_pixels(sheet)
     notes = ImportNotes(path, 1.0, f"resolution of the YAML, {resolution_m:g} m for a cell")
-    state = None if strict else _fitted_state(pixels, sheet, notes)
+    state = _fitted_state(pixels, sheet, notes, strict=strict)
     if state is None:
         state = _classify(pixels, sheet)
         if sheet.mode == "trinary" and not strict:
@@ -164,6 +164,9 @@ def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
     """Return what the shades of the image of a layer count."""
     if not isinstance(given.get(listed), list):
         raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
+    other = sorted(str(key) for key in given if key not in ("image", listed))
+    if other:
+        raise MapError(f"{path}: {name} has the unknown keys {shown(other)}: give image and {listed} alone.")
     values: list[Any] = given[listed]
     return values
 
@@ -324,23 +327,26 @@ def fitted_threshold(
 
     Such a map, as of Cartographer, has many seen cells of many values between the thresholds. The threshold is in the
     valley of the histogram (V,) of seen cells, between two distributions that are well separated, one with a mean below
-    50 percent and one above. Cells between the thresholds are counted in the notes, and warned of.
+    50 percent and one above. Cells between the thresholds are counted in the notes, and warned of. An empty remedy
+    keeps the thresholds, which the caller chose.
     """
     between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
     inside = int(count[between].sum())
     if not inside:
         return None
-    what = f"{inside:,} of {total:,} seen cells have an occupancy between {free_percent:g} and {occupied_percent:g} %"
-    is_spread = inside > SPREAD_FRACTION * total and count[between].max() <= SPREAD_FRACTION * inside
-    threshold = _split(percent, count, between) if is_spread and inside > FEW_CELLS else None
+    where = f"an occupancy between {free_percent:g} and {occupied_percent:g} %"
+    what = f"{notes.file}: {inside / total:.0%} of the seen cells have {where}"
+    is_varied = count[between].max() <= SPREAD_FRACTION * inside
+    is_spread = is_varied and inside > max(FEW_CELLS, SPREAD_FRACTION * total)
+    threshold = _split(percent, count, between) if remedy and is_spread else None
     if threshold is None:
-        notes.skip("seen cells", inside, f"occupancy between {free_percent:g} and {occupied_percent:g} %: unknown")
-        if is_spread and inside > max(ODD_CELLS, REPORTED_FRACTION * total):
-            warnings.warn(f"{notes.file}: {what} and are read as unknown: {remedy}", MapWarning, stacklevel=4)
+        notes.skip("seen cells", inside, f"{where}: unknown")
+        if remedy and is_varied and inside > max(ODD_CELLS, REPORTED_FRACTION * total):
+            warnings.warn(f"{what} and are read as unknown: {remedy}", MapWarning, stacklevel=4)
         return None
     decided = f"walls are the cells from {threshold:.1f} % on, and other seen cells are free"
-    notes.notes.append(f"{what}: {decided}")
-    warnings.warn(f"{notes.file}: {what}, as in a map of probabilities: {decided}. {remedy}", MapWarning, stacklevel=4)
+    notes.notes.append(f"{inside:,} of {total:,} seen cells have {where}: {decided}")
+    warnings.warn(f"{what}, as in a map of probabilities: {decided}. {remedy}", MapWarning, stacklevel=4)
     return threshold
 
 
@@ -523,7 +529,7 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
     return state
 
 
-def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes) -> States | None:
+def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict: bool) -> States | None:
     """Return the states of a map of continuous values, with thresholds that fit it; None for any other map.
 
     Unknown are transparent pixels, and the shade 205, 127 or 128 if it is far more frequent than the shades beside it.
@@ -545,6 +551,7 @@ def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes) -> States 
         unknown[level] = count[level] > 2 * beside.max(initial=0)
     thresholds = 100.0 * sheet.free_thresh, 100.0 * sheet.occupied_thresh
     remedy = "Pass strict=True to read the file to the letter, or set free_thresh and occupied_thresh in it."
+    remedy = "" if strict else remedy
     threshold = fitted_threshold(percent, np.where(unknown, 0, count), *thresholds, notes, remedy)
     if threshold is None:
         return None

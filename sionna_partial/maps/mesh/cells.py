@@ -20,6 +20,7 @@ from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
+from sionna_partial.maps.rooms import largest_by_area
 from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.planar import span_in_strip
 from sionna_partial.process import njit
@@ -161,7 +162,7 @@ def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bo
     """Find the cells (ny, nx) of free areas that are nowhere so wide."""
     area, count = ndimage.label(np.pad(free, 1))
     to_border_m = (ndimage.distance_transform_edt(area > 0) - 0.5) * resolution_m
-    widest_m = 2.0 * ndimage.maximum(to_border_m, area, np.arange(count + 1))
+    widest_m = 2.0 * largest_by_area(to_border_m, area, count)
     narrow: Bools = (widest_m < width_m)[area][1:-1, 1:-1] & free
     return narrow
 
