@@ -102,7 +102,7 @@ def opened(content: bytes) -> Any:
     try:
         encoding = dxf_stream_info(io.StringIO(content.decode("latin-1"))).encoding
         return Drawing.read(io.TextIOWrapper(io.BytesIO(content), encoding, errors="surrogateescape"))
-    except (DXFError, ValueError, LookupError, AttributeError, TypeError):
+    except (DXFError, ArithmeticError, ValueError, LookupError, AttributeError, TypeError):
         return recover.read(io.BytesIO(content))[0]
 
 
