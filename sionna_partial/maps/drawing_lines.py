@@ -35,7 +35,7 @@ WALL_NAMES = re.compile(
     r"window|glaz|fenster|fenetre|fenêtre|ventana|finestra",
     re.IGNORECASE,
 )
-"""What names of layers with walls, columns and windows contain."""
+"""Words in the names of layers with walls, columns and windows."""
 
 NO_WALL_NAMES = {
     reason: re.compile(words, re.IGNORECASE)
@@ -47,7 +47,7 @@ NO_WALL_NAMES = {
         "to be demolished": r"demo(?![a-z])|demol|démol|abbruch|abriss|rückbau|sloop|rivning|wyburz",
     }.items()
 }
-"""What names of layers contain that describe walls, close doors, or hold walls that will not be there."""
+"""Words in the names of layers that describe walls, close doors, or have walls that will be demolished."""
 
 AIA_WALLS = {"WALL", "GLAZ", "COLS", "PRTN"}
 """Major groups of the AIA/NCS standard with walls, windows and columns."""
@@ -59,7 +59,7 @@ AIA_DEMOLITION = {"AD", "ID", "SD"}
 """Disciplines of demolition: of architecture, interiors and structure."""
 
 PARTIAL_HEIGHT = re.compile(r"(?<![a-z])prht(?![a-z])|partial.?height|halbhoch|brüstung", re.IGNORECASE)
-"""What names of layers contain whose walls end below the ceiling."""
+"""Words in the names of layers with walls that end below the ceiling."""
 
 NO_WALL = "name of no wall"
 
