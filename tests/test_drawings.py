@@ -17,7 +17,7 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps import drawing_lines
-from sionna_partial.maps.drawing_layers import skip_reason
+from sionna_partial.maps.drawing_lines import skip_reason
 from sionna_partial.maps.drawings import map_from_drawing
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -185,13 +185,25 @@ def test_heights_of_layers() -> None:
     [
         *[
             (name, "")
-            for name in ("A-WALL", "a-wall-full-e", "S-COLS", "A-GLAZ-SILL", "Wand", "AR_Außenwände", "Mur ext")
+            for name in (
+                "A-WALL",
+                "a-wall-full-e",
+                "S-COLS",
+                "A-GLAZ-SILL",
+                "Wand",
+                "AR_Außenwände",
+                "Wa\u0308nde",
+                "Mur ext",
+            )
         ],
         *[
             (name, "")
             for name in ("A-WALL-FULL-N", "A-WALL-CORE-2", "xref$0$A-WALL", "plan|A-GLAZ", "A-WALL-PRHT", "I-WALL")
         ],
-        *[(name, "to be demolished") for name in ("A-WALL-D", "plan|A-WALL-FULL-D", "Wand Abbruch", "walls_demo")],
+        *[
+            (name, "to be demolished")
+            for name in ("A-WALL-D", "plan|A-WALL-FULL-D", "AD-WALL", "Wand Abbruch", "walls_demo")
+        ],
         *[("A-WALL-F", "future work"), ("A-WALL-MOVE-M", "to be moved"), ("A-GLAZ-T", "temporary")],
         *[("Wandleuchten", "lamps or sockets"), ("WALL LIGHTS", "lamps or sockets"), ("Wandschrank", "furniture")],
         *[

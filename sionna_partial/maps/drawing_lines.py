@@ -1,7 +1,9 @@
-"""Lines of a DXF: entities of the model space and of blocks -> pieces of lines by layer."""
+"""Lines of a DXF by layer, and which layers have walls: in languages of Europe and in the AIA/NCS standard."""
 
 import io
 import math
+import re
+import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -28,6 +30,61 @@ XREF = "external reference"
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
 
+WALL_NAMES = re.compile(
+    r"wall|wand|wänd|mauer|mur(?!al)|pared|parete|vägg|vegg|muur|sciana|ściana|стен|colum|pillar|s-cols|stütze|partition|"
+    r"window|glaz|fenster|fenetre|fenêtre|ventana|finestra",
+    re.IGNORECASE,
+)
+"""Words in the names of layers with walls, columns and windows."""
+
+NO_WALL_NAMES = {
+    reason: re.compile(words, re.IGNORECASE)
+    for reason, words in {
+        "texts, dimensions or door headers": r"head|text|dim|anno|iden|note",
+        "furniture": r"furn|möbel|mobel|schrank",
+        "lamps or sockets": r"-lite|light|lamp|leucht|lumin|sconce|socket|steckdose|outlet",
+        "above the room": r"ovhd|overhead",
+        "to be demolished": r"demo(?![a-z])|demol|démol|abbruch|abriss|rückbau|sloop|rivning|wyburz",
+    }.items()
+}
+"""Words in the names of layers that describe walls, close doors, or have walls that will be demolished."""
+
+AIA_WALLS = {"WALL", "GLAZ", "COLS", "PRTN"}
+"""Major groups of the AIA/NCS standard with walls, windows and columns."""
+
+AIA_STATUS = {"D": "to be demolished", "F": "future work", "M": "to be moved", "T": "temporary"}
+"""Last fields of AIA/NCS names of walls that are not part of the finished building."""
+
+AIA_DEMOLITION = {"AD", "ID", "SD"}
+"""Disciplines of demolition: of architecture, interiors and structure."""
+
+PARTIAL_HEIGHT = re.compile(r"(?<![a-z])prht(?![a-z])|partial.?height|halbhoch|brüstung", re.IGNORECASE)
+"""Words in the names of layers with walls that end below the ceiling."""
+
+NO_WALL = "name of no wall"
+
+_AIA = re.compile(r"([A-Z]{1,2})-([A-Z]{4})((?:-[A-Z0-9]{4})*)(?:-([A-Z1-9]))?", re.IGNORECASE)
+_REFERENCE = re.compile(r"\||\$\d+\$")
+
+
+def skip_reason(name: str) -> str:
+    """Return the reason for which a layer is not read as walls, "" for one with walls.
+
+    Names of the AIA/NCS standard are discipline, major group, minor groups and status: its major group decides whether
+    it has walls. The name of an external reference in front is left out.
+    """
+    name = unicodedata.normalize("NFC", _REFERENCE.split(name)[-1])
+    parts = _AIA.fullmatch(name)
+    if parts and parts[2].upper() not in AIA_WALLS and not WALL_NAMES.search(parts[2]):
+        return "major group of no wall (AIA/NCS)"
+    for reason, words in NO_WALL_NAMES.items():
+        if words.search(name):
+            return reason if WALL_NAMES.search(name) else f"{NO_WALL}: {reason}"
+    if not parts:
+        return "" if WALL_NAMES.search(name) else NO_WALL
+    status = "D" if parts[1].upper() in AIA_DEMOLITION else (parts[4] or "").upper()
+    return AIA_STATUS.get(status, "")
+
 
 def opened(content: bytes) -> Any:
     """Parse a DXF, which has to end as one. The slow reader for damaged files is the second choice."""
@@ -45,7 +102,7 @@ def opened(content: bytes) -> Any:
     try:
         encoding = dxf_stream_info(io.StringIO(content.decode("latin-1"))).encoding
         return Drawing.read(io.TextIOWrapper(io.BytesIO(content), encoding, errors="surrogateescape"))
-    except (DXFError, ValueError, LookupError, AttributeError, TypeError):
+    except (DXFError, ArithmeticError, ValueError, LookupError, AttributeError, TypeError):
         return recover.read(io.BytesIO(content))[0]
 
 

@@ -1,4 +1,4 @@
-"""ImportReport: what a reader used and skipped of a file, and the size of the map that it made."""
+"""ImportReport: elements of a file that a reader used and skipped, and the size of the map that it made."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Elements:
 
 @dataclass(frozen=True)
 class ImportSource:
-    """What a reader knows of a file: see `ImportReport`."""
+    """Facts about a file that its reader reports: see `ImportReport`."""
 
     file: str
     unit_m: float = 1.0
@@ -74,7 +74,7 @@ class ImportReport(ImportSource, Shown):
     used, skipped : tuple of Elements
         Elements of the file by name or type, with their number, and the reason for which they were skipped.
     notes : tuple of str
-        What else the reader decided.
+        Further decisions of the reader.
     extent_m : (float, float)
         Extent of the known cells along x and y [m].
     rooms : int
@@ -113,7 +113,7 @@ class ImportReport(ImportSource, Shown):
         return "\n".join(f"{name:11}{text}" for name, (_, text) in zip(names, rows, strict=True))
 
     def faults(self, size: str, doors: str, area: str) -> Iterable[str]:
-        """Yield what is not plausible about the map, with a remedy for each; those without remedy are not checked."""
+        """Yield the implausible results, each with its remedy; checks without a remedy are left out."""
         (x, y), widths = self.extent_m, self.door_widths_m
         if size and not SIZES_M[0] <= max(x, y) <= SIZES_M[1]:
             yield f"spans {x:.4g} x {y:.4g} m, with {self._unit}: {size}"
@@ -129,7 +129,7 @@ class ImportReport(ImportSource, Shown):
 
 @dataclass
 class ImportNotes:
-    """Notes that a reader takes while it reads a file: what it used, what it skipped and why, and the unit.
+    """Notes of a reader while it reads a file: elements used, elements skipped with the reason, and the unit.
 
     Examples
     --------

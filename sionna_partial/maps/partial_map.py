@@ -88,7 +88,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     obstacle_heights_m : tuple of float
         At most 255 heights that `obstacle` counts [m].
     import_source : ImportSource or None
-        What the reader used of the file, for `import_report`. Maps that differ in it alone are equal.
+        Facts about the file that the map was read from, for `import_report`. Maps that differ in it alone are equal.
 
     Raises
     ------
