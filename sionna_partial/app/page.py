@@ -40,6 +40,9 @@ _TOOLTIPS = (
 )
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 
+_UNSELECT = "points.selection_manager.clear()"
+"""Ends the selection by a click, or the next drag would move what was clicked as well."""
+
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
 const copied = navigator.clipboard ? navigator.clipboard.writeText(area.value) : Promise.reject()
@@ -84,6 +87,9 @@ TEMPLATE = """\
 <input type="file" id="map-file" multiple hidden accept="{{ map_suffixes }}" aria-label="Map files">
 <input type="file" id="csv-file" hidden accept=".csv" aria-label="Measurements">
 <script>
+  try { // a pause before a drag is no long press, which no tool here takes
+    Bokeh.require("core/ui_gestures").UIGestures.press_threshold = 2 ** 30
+  } catch { console.info("A drag begins within 0.3 s.") }
   const labels = {
     "noUi-handle": "Threshold [dBm]", "bk-spin-btn-up": "more", "bk-spin-btn-down": "less",
     "bk-events": "Map; the fields x and y move its transmitters",
@@ -142,7 +148,7 @@ class Page:
     # What is made once
 
     def _make_picture(self) -> None:
-        from bokeh.models import ColumnDataSource, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
+        from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
         from bokeh.plotting import figure
 
         self._ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
@@ -179,9 +185,8 @@ class Page:
         plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
         plot.multi_line("xs", "ys", source=self._aims, line_color="black", line_width=4)
-        points = plot.scatter(
-            "x", "y", source=self._points, marker="star", size=24, fill_color="colour", line_color="black"
-        )
+        look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
+        points = plot.scatter("x", "y", source=self._points, marker="star", **look)
         plot.text("x", "y", text="name", source=self._points, x_offset=13, **_LABEL)
         tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
         hover = HoverTool(
@@ -191,6 +196,7 @@ class Page:
         )
         plot.add_tools(hover, tool)
         plot.toolbar.active_tap = tool
+        plot.js_on_event("tap", CustomJS(args={"points": self._points}, code=_UNSELECT))
         self._points.on_change("data", self._on_points)
         self._points.selected.on_change("indices", self._on_selected)
 
@@ -359,10 +365,9 @@ class Page:
             self._guarded(self.session.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
 
     def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
-        """Choose what is clicked; nothing stays selected, or it would be dragged with the next one."""
+        """Choose the transmitter that is clicked or dragged. To clear the selection here would end a drag."""
         if new and not self._is_showing:
             self._choose(self._points.data["name"][new[-1]])
-            self._points.selected.indices = []
 
     def _open_example(self, name: str) -> None:
         if name:
@@ -436,16 +441,14 @@ class Page:
         names = [*session.transmitters]
         each = [*session.transmitters.values()]
         colours = server_codes(MOST_TRANSMITTERS)
-        rows = {
+        rows: dict[str, Any] = {
             "x": [tx.x_m for tx in each],
             "y": [tx.y_m for tx in each],
             "name": names,
             "colour": colours[: len(names)],
         }
-        self._once(
-            "points", (repr(rows), repr(self._points.data)), functools.partial(setattr, self._points, "data", rows)
-        )
-        self._drawn["points"] = repr(rows), repr(self._points.data)
+        if not _are_drawn(rows, self._points.data):
+            self._points.data = rows
         self.chosen.options, self.chosen.value = [*names], session.chosen
         self.name.value = session.chosen
         chosen = session.transmitters.get(session.chosen)
@@ -551,6 +554,12 @@ _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (
     "a { display: inline-block; padding: 0.25em 0.7em; margin: 0.15em; border: 1px solid #93a1b0; border-radius: 6px }"
 )
+
+
+def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
+    """Return whether the page has these transmitters, up to rounding: to send them again would disturb a drag."""
+    same = all([*drawn[name]] == rows[name] for name in ("name", "colour"))
+    return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=0.006) for axis in "xy")
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
