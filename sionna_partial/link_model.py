@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import (
     Progress,
+    float_array,
     no_progress,
-    real_array,
     require,
     require_choice,
     require_memory,
@@ -37,7 +37,7 @@ from sionna_partial.coverage.dataset import (
     with_posterior,
 )
 from sionna_partial.errors import MemoryLimitError, PositionError
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, require_map, with_height
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
@@ -149,9 +149,6 @@ class LinkModel:
         scene_settings: SceneSettings | None = None,
     ) -> None:
         self.simulation = simulation_of(scene, trace_settings, scene_settings)
-        self._settings = trace_settings, scene_settings
-        if isinstance(scene, Simulation):
-            self._settings = scene.trace_settings, scene.scene_settings
         self.asked = predictor
         self._latest: dict[tuple[bytes, bytes, Antenna], PredictedLinks] = {}
         self._windows: dict[bytes, NDArray[np.uint8]] = {}
@@ -168,7 +165,7 @@ class LinkModel:
         """The predictor, which is read when it is first needed."""
         model = warm_predictor(self.asked)
         if isinstance(model, Predictor) and not self._by_wall_losses:
-            _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
+            _warn_of_other_traces(model, *self.simulation.resolved)
         return model
 
     @property
@@ -186,8 +183,9 @@ class LinkModel:
 
         The predictor and what is compiled are kept. Predictions are those of a new `LinkModel` of the map.
         """
+        require_map("partial", partial)
         if partial != self.partial:
-            self.simulation = Simulation(partial, *self._settings)
+            self.simulation = Simulation(partial, self.simulation.trace_settings, self.simulation.scene_settings)
             for of_map in ("_every_path", "_wall_density"):
                 self.__dict__.pop(of_map, None)
             self._latest.clear()
@@ -248,12 +246,11 @@ class LinkModel:
         self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         complete = np.concatenate([self._complete(*each_m) for each_m in ends_m])
-        traced = self.simulation.trace_settings, self.simulation.scene_settings
         settings, found = None if complete.all() else self.predictor.settings, []
         context = not complete.all() and (settings is None or settings.networks != "paper")
         for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
             windows = self._windows_around(tx_m) if context else None
-            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, traced, windows))
+            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, self.simulation.resolved, windows))
         phi = LinkFeatures.concatenate(found)
         return phi, self.predict_features(phi, complete), complete
 
@@ -374,10 +371,8 @@ def transmitter_positions(
     if tx is None:
         raise PositionError("tx = None: give x, y and z in metres, or measurements that its position is found from.")
     positions = list(tx.values()) if isinstance(tx, Mapping) else tx
-    positions = real_array("tx", positions, PositionError, "give x, y and z in metres, the same for all transmitters.")
-    if positions.shape[-1:] == (2,):
-        positions = np.insert(positions, 2, DEFAULT_HEIGHT_M, axis=-1)
-    tx_m = partial.require_positions("tx", positions)
+    positions = float_array("tx", positions, PositionError, "give x, y and z in metres, the same for all transmitters.")
+    tx_m = partial.require_positions("tx", with_height(positions))
     names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
     require_names("names of tx", names)
     return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)

@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
-from sionna_partial.checks import number_of, real_array, require, require_names, require_number, shown
+from sionna_partial.checks import float_array, number_of, require, require_names, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.coverage.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.display import later, picture_html
@@ -175,7 +175,7 @@ def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None)
 
     No time of day: equal input gives equal files.
     """
-    partial, trace_settings = simulation.partial, simulation.trace_settings
+    partial, (trace_settings, scene_settings) = simulation.partial, simulation.resolved
     return {
         "Conventions": "CF-1.11",
         "title": "Predicted radio coverage of a partially observed environment",
@@ -189,7 +189,7 @@ def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None)
         "map_wall_height_m": partial.wall_height_m,
         "map_observed_fraction": partial.observed_fraction,
         "map_complete": int(model is None),
-        "scene_settings": json.dumps(asdict(simulation.scene_settings), sort_keys=True),
+        "scene_settings": json.dumps(asdict(scene_settings), sort_keys=True),
         "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
         "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
         "predictor_sha256": "" if model is None else model.fingerprint,
@@ -276,7 +276,7 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
         )
     for name, lowest in _LOWEST.items():
         require_number(f"coverage.{name}", coverage.attrs[name], lowest, 1e15, open_low=True)
-    position_m = real_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
+    position_m = float_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
     known = position_m.shape == (3,) and bool(np.isfinite(position_m).all())
     require(known, "coverage.transmitter_m", coverage.attrs["transmitter_m"], remedy)
     _require_values(coverage)
@@ -341,8 +341,13 @@ class CoverageAccessor:
     """
 
     def __init__(self, coverage: xr.Dataset) -> None:
-        inner = ("y", "x") if {"y", "x"} <= coverage.sizes.keys() else ()
-        self._coverage = coverage.transpose(..., *inner)
+        self._given = coverage
+
+    @property
+    def _coverage(self) -> xr.Dataset:
+        """The coverage map as it is now: xarray keeps the accessor when variables are assigned."""
+        inner = ("y", "x") if {"y", "x"} <= self._given.sizes.keys() else ()
+        return self._given.transpose(..., *inner)
 
     def plot(self) -> Any:
         """Return the figure of `plot_coverage`."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import Checked, Within, real_array, require, require_choice
+from sionna_partial.checks import Checked, Within, float_array, require, require_choice
 from sionna_partial.errors import SettingsError
 
 NOISE_DENSITY_DBM_HZ = -174.0
@@ -60,10 +60,10 @@ class LinkBudget(Checked):
 def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power_dbm") -> Floats:
     """Return the powers (count,) of transmitters [dBm], or raise a SettingsError."""
     remedy = f"give one power [dBm], or one for each of the {count} transmitters, from -200 to 200."
-    found = real_array(name, powers_dbm, SettingsError, remedy)
+    found = float_array(name, powers_dbm, SettingsError, remedy)
     allowed = found.shape in ((), (count,)) and bool((np.abs(found) <= 200.0).all())
     require(allowed, name, powers_dbm, remedy)
-    return np.array(np.broadcast_to(found, count), dtype=np.float64)
+    return np.broadcast_to(found, count).copy()
 
 
 class Scheme(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
@@ -104,6 +104,7 @@ NOISY_TRUST = 0.5
 """Weight of the trace against the networks on nearly complete maps of full noise; it is 1 on exact ones."""
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class LinkPrediction(Shown):
     """Predictive distribution of link state and path gain of links; every array is (N,) or (T, N) float64.
