@@ -74,7 +74,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "app": ("session", "page", "server"),
+    "app": ("jobs", "uploads", "session", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, Answer, Session
+from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
@@ -156,6 +156,7 @@ class Page:
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
         self._aims = ColumnDataSource({"xs": [], "ys": []})
         self._routes = ColumnDataSource({"xs": [], "ys": []})
+        self._measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
         self._poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
         plot: Any = figure(
             x_range=DataRange1d(range_padding=0.02),
@@ -175,12 +176,14 @@ class Page:
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
         colours = LinearColorMapper(palette=["#ffffff", "#000000", "#b9bec4", "#e4e6e9"], low=-0.5, high=3.5)
         walls = LinearColorMapper(palette=["#00000000", "#000000", "#00000000", "#ffffff60"], low=-0.5, high=3.5)
-        plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
+        ground = plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
+        plot.x_range.renderers = plot.y_range.renderers = [ground]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self._values, **where}
         self._parts = {
             name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
         }
         plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
+        plot.scatter("x", "y", source=self._measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self._routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
@@ -224,6 +227,7 @@ class Page:
         self.message = Div(
             name="message", sizing_mode="stretch_width", html_attributes={"role": "status", "aria-live": "polite"}
         )
+        self.warnings = Div(name="warnings", sizing_mode="stretch_width", html_attributes={"role": "status"})
         self.summary = Div(name="summary", sizing_mode="stretch_width")
         self.cancel = self._button("Cancel", lambda: self.session.cancel(), button_type="danger", width=90)
 
@@ -281,6 +285,7 @@ class Page:
                 ("spacing_m", "Between receivers [m]", 1.0, 0.05, 0.05, 10),
             )
         }
+        self.measured_text = Div(name="measured_text", sizing_mode="stretch_width")
         self.links = Div(name="links", sizing_mode="stretch_width", stylesheets=[_LINKS])
         self.python = TextAreaInput(title="The same in Python", rows=8, stylesheets=[_CODE], name="python")
 
@@ -306,11 +311,12 @@ class Page:
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
         copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=_COPY))
+        self.forget = self._button("Forget the measurements", lambda: session.forget_measurements())
         self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
         x, y, z, eirp = self.fields.values()
         frequency, bandwidth, height, spacing = self.radio.values()
         return {
-            "status": column(row(self.message, self.cancel, sizing_mode="stretch_width"), sizing_mode="stretch_width"),
+            "status": wide(row(self.message, self.cancel), self.warnings),
             "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth), self.summary),
             "picture": self.plot,
             "map": wide(self.example, upload_map, self.map_text),
@@ -326,7 +332,13 @@ class Page:
                 self._button("Place it for me", lambda: session.place(), button_type="primary"),
             ),
             "radio": wide(pair(frequency, bandwidth), self.walls, pair(height, spacing)),
-            "robot": wide(self.more, self._button("Best next views", lambda: session.find_views()), upload_csv),
+            "robot": wide(
+                self.more,
+                self._button("Best next views", lambda: session.find_views()),
+                upload_csv,
+                self.measured_text,
+                self.forget,
+            ),
             "files": wide(self.links, self.python, copy),
         }
 
@@ -400,6 +412,7 @@ class Page:
             self._show_status()
             self._once("map", (self.session.partial, self.session.title, self.session.steps), self._show_map)
             self._show_transmitters()
+            self._show_measured()
             self._show_answer()
             self._once("views", (self.session.views,), self._show_views)
         finally:
@@ -419,6 +432,8 @@ class Page:
         colour = "#a1232f" if status.is_error else "#1a1a1a"
         self.message.text = f'<span style="color:{colour}">{text}</span>'
         self.cancel.visible = status.fraction is not None
+        self.warnings.text = "<br>".join(f"<b>Note:</b> {html.escape(each)}" for each in self.session.warnings)
+        self.warnings.visible = bool(self.session.warnings)
 
     def _show_map(self) -> None:
         partial, session = self.session.partial, self.session
@@ -473,6 +488,19 @@ class Page:
             self.radio[name].value = getattr(settings, name) / unit
         self.walls.value = {None: "", False: "opaque", True: "through"}[settings.through_walls]
         self.python.value = session.python()
+
+    def _show_measured(self) -> None:
+        session = self.session
+        self.measured_text.visible = self.forget.visible = session.measured is not None
+        key = session.measured, session.partial, repr(session.transmitters), session.settings.frequency_hz
+        self._once("measured", key, self._show_points)
+
+    def _show_points(self) -> None:
+        rx_m, used = self.session.measured_points()
+        colours = [_USED if each else _UNUSED for each in used]
+        self._measured.data = {"x": rx_m[:, 0], "y": rx_m[:, 1], "colour": colours}
+        unused = f", {(~used).sum()} of them not used (white)" if not used.all() else ""
+        self.measured_text.text = f"{len(used)} measured points{unused}"
 
     def _aimed(self) -> dict[str, list[list[float]]]:
         """Return lines from transmitters with a main direction along it [m]."""
@@ -550,6 +578,9 @@ _LABEL: dict[str, Any] = {
     "background_fill_alpha": 0.75,
 }
 _MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
+_USED, _UNUSED = "#ee6677", "#ffffff"
+"""Colours of measured points."""
+
 _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (
     "a { display: inline-block; padding: 0.25em 0.7em; margin: 0.15em; border: 1px solid #93a1b0; border-radius: 6px }"
@@ -559,7 +590,7 @@ _LINKS = (
 def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
     """Return whether the page has these transmitters, up to rounding: to send them again would disturb a drag."""
     same = all([*drawn[name]] == rows[name] for name in ("name", "colour"))
-    return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=0.006) for axis in "xy")
+    return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=ROUNDING_M) for axis in "xy")
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
