@@ -344,6 +344,9 @@ class TestFiles:
         unused, offset = window.session.warnings
         assert unused.startswith("1 of 3 measurements are not used")
         assert "taken for an offset" in offset
+        window.session.learn(b"\xff\x00")
+        window.settle()
+        assert window.session.warnings == [unused, offset]
         window.session.forget_measurements()
         window.settle()
         assert window.session.answer is not None

@@ -208,7 +208,7 @@ class Session:
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings of the map, of what was done last, of the predictor and of the newest job."""
+        """Warnings of the map, of what was done last, of the predictor, and of the answer and what followed it."""
         on_networks = self.partial is not None and not self.partial.is_complete
         of_models = [warning for _, found in [*self._models.values()] for warning in found if on_networks]
         found = [*self._warnings["map"], *self._warnings["act"], *of_models, *self._warnings["job"]]
@@ -561,7 +561,7 @@ class Session:
             with TURNS, collected_warnings(job.warnings):
                 job.report(0.0, "starting")
                 for change in work(job.report):
-                    self.do(functools.partial(self._take, job, change, [*job.warnings]))
+                    self.do(functools.partial(self._take, job, change))
                     job.pass_on()
                 end = functools.partial(self._conclude, Status("Ready."))
         except CancelledError:
@@ -573,17 +573,23 @@ class Session:
         self.do(functools.partial(self._end, job, end))
 
     def _tell(self, job: Job, status: Status) -> None:
-        self.do(functools.partial(self._take, job, functools.partial(setattr, self, "status", status)))
+        def tell() -> None:
+            if job is self._job:
+                self.status = status
+                self._show()
 
-    def _take(self, job: Job, change: Callable[[], None], warnings: list[str] | None = None) -> None:
+        self.do(tell)
+
+    def _take(self, job: Job, change: Callable[[], None]) -> None:
         if job is self._job:
-            self._warnings["job"] = self._warnings["job"] if warnings is None else warnings
             change()
+            self._warnings["job"] += job.warnings
             self._show()
 
     def _end(self, job: Job, end: Callable[[], None]) -> None:
         if job is self._job:
-            self._job, self._warnings["job"] = None, job.warnings
+            self._job = None
+            self._warnings["job"] += job.warnings
             end()
 
     def _fail(self, error: Exception) -> None:
@@ -600,7 +606,7 @@ class Session:
         self._show()
 
     def _take_answer(self, answer: Answer) -> None:
-        self.answer, self._is_outdated = answer, False
+        self.answer, self._is_outdated, self._warnings["job"] = answer, False, []
 
     # Files
 
