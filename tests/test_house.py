@@ -173,7 +173,7 @@ def modules_after(*steps: str) -> list[set[str]]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
     loaded = "[name + '.' * hasattr(each, '__path__') for name, each in sys.modules.items()]"
     code = "\n".join(["import sys, json", *(f"{step}\nprint(json.dumps({loaded}))" for step in steps)])
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     return [set(json.loads(line)) for line in result.stdout.splitlines() if line.startswith("[")]
 

@@ -131,6 +131,7 @@ def _files_handler() -> Any:
 
         def initialize(self, sessions: dict[str, Session]) -> None:
             self._sessions, self._chunks = sessions, list[bytes]()
+            self._receiver: Session | None = None
 
         def prepare(self) -> None:
             """Refuse an upload by its header, before anything of its body is read."""
@@ -151,8 +152,6 @@ def _files_handler() -> Any:
             else:
                 session.is_receiving, self._receiver = True, session
                 self.request.connection.set_max_body_size(MOST_BYTES + _FORM_BYTES)  # type: ignore[union-attr]
-
-        _receiver: Session | None = None
 
         def data_received(self, chunk: bytes) -> None:
             """Keep a part of an upload that `prepare` has accepted."""

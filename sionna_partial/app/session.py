@@ -307,11 +307,11 @@ class Session:
         for name, x_m, y_m in positions:
             old = self.transmitters.get(name)
             name = name if old else self._new_name([*self.transmitters, *found])
-            at = {"x_m": round(float(x_m), 2), "y_m": round(float(y_m), 2)}
+            x_m, y_m = round(float(x_m), 2), round(float(y_m), 2)
             if old is None:
-                self.chosen, found[name] = name, Transmitter(**at, z_m=self._usual_height_m())
-            elif max(abs(at["x_m"] - old.x_m), abs(at["y_m"] - old.y_m)) > ROUNDING_M:
-                self.chosen, found[name] = name, replace(old, **at)
+                self.chosen, found[name] = name, Transmitter(x_m, y_m, self._usual_height_m())
+            elif max(abs(x_m - old.x_m), abs(y_m - old.y_m)) > ROUNDING_M:
+                self.chosen, found[name] = name, replace(old, x_m=x_m, y_m=y_m)
             else:
                 found[name] = old
         if found != self.transmitters:  # a drag of the picture moves none
