@@ -581,6 +581,17 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
             at = tab.run(f"['x', 'y'].map(axis => {_MODEL}('points').data[axis][0])")
             tab.drag(*pixel(tab, *at), *pixel(tab, x_m, y_m), held_s=held_s)
             tab.wait(f"Math.hypot({_MODEL}('points').data.x[0] - {x_m}, {_MODEL}('points').data.y[0] - {y_m}) < 0.1")
+        tab.click(*pixel(tab, 1.0, 1.0))
+        tab.wait(f"{_MODEL}('points').data.name[1] == 'tx2' && {_READY}")
+        tab.click(*pixel(tab, 3.0, 2.0))  # what is clicked does not move with what is dragged next
+        tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 1.0, 2.5))
+        tab.wait(f"Math.abs({_MODEL}('points').data.y[1] - 2.5) < 0.1")
+        assert abs(tab.run(f"{_MODEL}('points').data.x[0]") - 3.0) < 0.1
+        press(tab, "Remove")
+        tab.wait(f"{_MODEL}('points').data.name.length == 1")
+        tab.run(f"{_MODEL}('measured').data = {{x: [99], y: [1], colour: ['white']}}, 0")
+        tab.run("new Promise(done => setTimeout(done, 300))")
+        assert tab.run(f"{_MODEL}('picture').x_range.end") < 6.0  # the axes stay with the map
         tab.wait(f"{_MODEL}('python').value != {json.dumps(before)} && {_READY}")
         assert tab.run(f"{_MODEL}('points').data.name.length") == 1
         links = re.findall('href="([^"]+)"', tab.run(f"{_MODEL}('links').text"))
