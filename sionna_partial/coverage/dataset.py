@@ -1,4 +1,4 @@
-"""Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and what can be asked of one."""
+"""Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and its accessor."""
 
 import json
 import math
@@ -23,7 +23,7 @@ from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor
+from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction
 from sionna_partial.tracing.antennas import MAX_GAIN_DBI
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
@@ -48,7 +48,7 @@ _OF_ALL = ("observed", "cell_state", "wall_parts")
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
-"""Attributes that are needed with the position of the transmitter, and what they are above."""
+"""Required attributes besides the position of the transmitter, and their lower limits."""
 
 _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
 """Values of probabilities, gains, standard deviations and lengths; reflections may take near links past 0 dB."""
@@ -147,7 +147,7 @@ def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
 def link_columns(
     phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Values (N,) of each variable that depends on the links."""
+    """Return the values (N,) of each variable that depends on the links."""
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
     columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
@@ -170,8 +170,8 @@ def _versions() -> str:
     return ", ".join(f"{package} {number}" for package, number in versions.items())
 
 
-def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None) -> dict[str, Any]:
-    """Global attributes on where the numbers come from; without a model the trace predicts.
+def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, Any]:
+    """Return the global attributes on the origin of the numbers; without a model the trace predicts.
 
     No time of day: equal input gives equal files.
     """
@@ -199,7 +199,7 @@ def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None)
 def coverage_map(
     partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
-    """Put the values (N,) of the valid receivers, by name, on their grid, with what the map shows there."""
+    """Put the values (N,) of the valid receivers, by name, on their grid, and add the layers of the map."""
     layers: dict[str, NDArray[Any]] = {
         "observed": receivers.cell_state != CellState.UNKNOWN,
         "valid": receivers.valid,
@@ -325,7 +325,7 @@ def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
 
 @xr.register_dataset_accessor("radio")
 class CoverageAccessor:
-    """What can be asked of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
+    """Methods of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
 
     Every method raises a SettingsError for a Dataset that is no coverage map.
 
@@ -435,7 +435,7 @@ class CoverageAccessor:
             5.1.3.1-1, each from the SNR at which it is 0.6 of the Shannon bound (TR 36.942, annex A), less the overhead
             of TS 38.306.
         bandwidth_hz : float
-            Of the channel; in Wi-Fi 20, 40, 80, 160 and (802.11be) 320 MHz.
+            Channel bandwidth [Hz]; for Wi-Fi 20, 40, 80, 160 and (802.11be) 320 MHz.
 
         Raises
         ------
@@ -502,7 +502,7 @@ class CoverageAccessor:
         return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
 
     def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
-        """Return what is added to path gains, () or (T, 1, 1) [dB]."""
+        """Return the sum of EIRP and receiver gain, () or (T, 1, 1) [dB]."""
         maps = transmitters_of(self._coverage)
         require_number("rx_gain_db", rx_gain_db, -200.0, 200.0)
         offset_db = transmit_powers_dbm(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
@@ -555,7 +555,7 @@ class CoverageAccessor:
 
 
 def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
-    """Say where the transmitter is, or how many there are."""
+    """Return the position of the transmitter, or the number of transmitters, as a text."""
     if len(maps) > 1:
         return f"{len(maps)} transmitters"
     (coverage,) = maps.values()

@@ -28,10 +28,11 @@ from sionna_partial.checks import (
 )
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, probability_above
+from sionna_partial.coverage.job import POSITIONS, transmitter_positions
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
-from sionna_partial.link_model import POSITIONS, LinkModel, link_model_of, transmitter_positions
+from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, unknown_pockets, with_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
