@@ -59,25 +59,26 @@ TEMPLATE = """\
 <meta name="referrer" content="no-referrer">
 <style>
   body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #f6f7f8 }
-  main { display: grid; grid-template-columns: minmax(0, 1fr) 21rem; gap: 1rem; max-width: 90rem;
-    margin: auto; padding: 0.8rem;
-    box-sizing: border-box }
-  h1 { font-size: 1.15rem; margin: 0; grid-column: 1 / -1 }
+  main { display: grid; grid-template: "title title" auto "map status" auto "map controls" 1fr / minmax(0, 1fr) 21rem;
+    gap: 0 1rem; max-width: 90rem; margin: auto; padding: 0.8rem; box-sizing: border-box }
+  #status { grid-area: status } #picture { grid-area: map } #controls { grid-area: controls }
+  h1 { font-size: 1.15rem; margin: 0 0 1rem; grid-area: title }
   h2 { font-size: 0.95rem; margin: 0 0 0.4rem }
   section { background: white; border: 1px solid #d5d9de; border-radius: 8px; padding: 0.7rem; margin-bottom: 0.8rem }
-  @media (max-width: 52rem) { main { grid-template-columns: minmax(0, 1fr); padding: 0.4rem } }
+  @media (max-width: 52rem) { main { padding: 0.4rem;
+    grid-template: "title" auto "status" auto "map" auto "controls" auto / minmax(0, 1fr) } }
 </style>
 {% endblock %}
 {% block contents %}
 <main>
   <h1>Radio coverage of a partly known building</h1>
-  <div>
-    <section aria-label="Status">{{ embed(roots.status) }}</section>
+  <section id="status" aria-label="Status">{{ embed(roots.status) }}</section>
+  <div id="picture">
     <section aria-label="Map with transmitters and coverage">{{ embed(roots.choices) }}
-      {{ embed(roots.picture) }}</section>
+      {{ embed(roots.picture) }}{{ embed(roots.summary) }}</section>
     <section aria-labelledby="files"><h2 id="files">Download and repeat</h2>{{ embed(roots.files) }}</section>
   </div>
-  <div>
+  <div id="controls">
     <section aria-labelledby="map"><h2 id="map">Map</h2>{{ embed(roots.map) }}</section>
     <section aria-labelledby="tx"><h2 id="tx">Transmitters</h2>{{ embed(roots.transmitters) }}</section>
     <section aria-labelledby="radio"><h2 id="radio">Radio</h2>{{ embed(roots.radio) }}</section>
@@ -317,8 +318,9 @@ class Page:
         frequency, bandwidth, height, spacing = self.radio.values()
         return {
             "status": wide(row(self.message, self.cancel), self.warnings),
-            "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth), self.summary),
-            "picture": self.plot,
+            "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth)),
+            "picture": self.plot,  # nothing above it changes its height with an answer: a drag would miss
+            "summary": self.summary,
             "map": wide(self.example, upload_map, self.map_text),
             "transmitters": wide(
                 pair(self.chosen, self.name),
@@ -525,13 +527,13 @@ class Page:
         self._once("answer", (answer, name, threshold_dbm, self.truth.value), self._show_values)
         for layer, parts in self._parts.items():
             for part in parts:
-                part.visible = layer == self.layer.value and answer is not None
+                part.visible = layer == self.layer.value
         title = _LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
         if answer is not None and not answer.is_final:
             title += " (coarse)"
         elif answer is not None and self.truth.value:
             title += ", the whole home" if answer.truth is not None else ", the partial map"
-        self.plot.title.text = "" if answer is None else title
+        self.plot.title.text = "Map" if answer is None else title
 
     def _show_values(self) -> None:
         answer, session = self.session.answer, self.session

@@ -527,8 +527,8 @@ class Session:
             if not self._are_ours(measured).any():
                 position = ", ".join(f"{each:g}" for each in measured.tx[0])
                 raise MeasurementError(
-                    f"the measurements are of no transmitter within {SAME_TX_M:g} m: move one to ({position}), the first "
-                    "position that the measurements name."
+                    f"the measurements are of no transmitter within {SAME_TX_M:g} m: move one to ({position}), "
+                    "the first position in the file."
                 )
             measurements_of_each(partial, [np.array([each_m]) for each_m in all_m.values()], measured, frequency_hz)
             yield functools.partial(take, measured)
